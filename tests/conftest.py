@@ -1,0 +1,25 @@
+"""Shapes and types of every function of the package are checked while the tests run."""
+
+import os
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+# Two test processes share two cores: one thread each, and the same floating-point sums on every machine.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+install_import_hook("tumble", "beartype.beartype")
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+torch.set_num_threads(1)
+
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of real meshes, light maps and clips that lies beside the repository on some machines."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"needs the data folder {SHARED_DATA.parent.name}/{SHARED_DATA.name} beside the repository")
+    return SHARED_DATA

@@ -1,0 +1,283 @@
+// Blending front to back, a block of LANES pixels at a time, and its adjoint, which also walks front to back: with
+// s_i = dL/dw_i, what lies behind Gaussian i contributes rem = dL/dout . out - sum_{j <= i} w_j s_j.
+// Formulas in raster.h. C is the number of features, rounded up to a multiple of 4.
+#pragma once
+#include "raster.h"
+
+struct Block {
+    vf x, y;       // pixel centres
+    vi inside;     // lanes within the image
+    i64 pixel[LANES];
+    int x0, y0;
+};
+
+INLINE Block block_at(const Raster& r, int x0, int y0) {
+    Block b;
+    vi i = lane_index(), x = (i & 3) + x0, y = (i >> 2) + y0;
+    b.x0 = x0, b.y0 = y0;
+    b.x = __builtin_convertvector(x, vf) + 0.5f, b.y = __builtin_convertvector(y, vf) + 0.5f;
+    b.inside = (x < r.width) & (y < r.height);
+    for (int l = 0; l < LANES; l++)
+        b.pixel[l] = (i64)imin2(y0 + (l >> 2), r.height - 1) * r.width + imin2(x0 + (l & 3), r.width - 1);
+    return b;
+}
+
+INLINE vf read(const float* image, const Block& b, int stride, int channel) {
+    float x[LANES];
+    for (int l = 0; l < LANES; l++) x[l] = image[b.pixel[l] * stride + channel];
+    return load(x);
+}
+INLINE void write(float* image, const Block& b, int stride, int channel, vf value) {
+    float x[LANES];
+    u32 inside = bits(b.inside);
+    store(x, value);
+    for (int l = 0; l < LANES; l++)
+        if (inside >> l & 1) image[b.pixel[l] * stride + channel] = x[l];
+}
+
+// A Gaussian at a block's pixels, up to its alpha.
+struct Peak {
+    vf dx, dy, K, l, q, r, G, raw, alpha;
+    vi on;
+};
+
+// False if no pixel of `alive` is reached.
+INLINE bool peak_at(const float* f, const Block& b, vi alive, float alpha_min, float alpha_max, Peak& p) {
+    p.dx = b.x - f[CX], p.dy = b.y - f[CY];
+    vf beta = f[BX] * p.dx + f[BY] * p.dy;
+    p.K = p.dx * (f[KA] * p.dx + f[KB] * p.dy) + f[KC] * p.dy * p.dy;
+    p.l = beta + 1.0f, p.q = p.l * p.l + f[KAPPA] * p.K;
+    p.on = alive & (p.K <= f[CUT] * p.q);
+    if (!any(p.on)) return false;
+    p.r = 1.0f / p.q;
+    p.G = vexp(vmax(-0.5f * p.K * p.r, splat(-80.0f)));
+    p.raw = f[OPACITY] * p.G;
+    p.on &= p.raw >= alpha_min;
+    p.alpha = keep(p.on, vmin(p.raw, splat(alpha_max)));
+    return true;
+}
+// zeta - 1
+INLINE vf lift(const float* f, const Peak& p) { return -(p.l * (p.l - 1.0f) + f[KAPPA] * p.K) * p.r; }
+
+struct Corners {
+    vf u, v, free_u, free_v;   // clamped coordinates; the same before the clamp
+};
+INLINE Corners corners_at(const float* f, const Peak& p, vf zeta, vf zeta_1) {
+    Corners c;
+    c.free_u = 0.5f + zeta_1 * f[EU] + zeta * (f[UX] * p.dx + f[UY] * p.dy);
+    c.free_v = 0.5f + zeta_1 * f[EV] + zeta * (f[VX] * p.dx + f[VY] * p.dy);
+    c.u = vmin(vmax(c.free_u, vf{}), splat(1.0f)), c.v = vmin(vmax(c.free_v, vf{}), splat(1.0f));
+    return c;
+}
+
+// Sums of w over a block's pixels wait here until there are enough for one transposed reduction.
+struct Weights {
+    vf w[LANES];
+    int g[LANES];
+    int count;
+    float* total;
+    METHOD void flush() {
+        for (int i = count; i < LANES; i++) w[i] = vf{}, g[i] = g[0];
+        float s[LANES];
+        store(s, sums_of(w));
+        for (int i = 0; i < count; i++) total[g[i]] += s[i];
+        count = 0;
+    }
+    METHOD void add(int which, vf value) {
+        w[count] = value, g[count] = which;
+        if (++count == LANES) flush();
+    }
+};
+
+template <int C>
+static void composite_block(const Raster& r, const Block& b, const int* list, int count, Weights& weights,
+                            int* touched) {
+    vf T = keep(b.inside, splat(1.0f)), red = {}, green = {}, blue = {}, z = {}, zz = {}, nx = {}, ny = {}, nz = {};
+    vf features[C + 1] = {}, best = {};
+    vi dominant = splat(-1);
+    u32 counted = 0;
+    for (int l = 0; l < LANES; l++)
+        counted |= (u32)(r.mask[r.mask_stride * b.pixel[l]] > 0.5f) << l;
+    for (int i = 0; i < count; i++) {
+        int g = list[i];
+        const float* f = r.record + (i64)g * r.record_size;
+        Peak p;
+        if (!peak_at(f, b, T >= r.T_min, r.alpha_min, r.alpha_max, p)) continue;
+        vf w = p.alpha * T, zeta_1 = lift(f, p), depth = f[DZ] + f[PZ] * zeta_1;
+        red += w * f[RED], green += w * f[GREEN], blue += w * f[BLUE];
+        nx += w * f[NX], ny += w * f[NY], nz += w * f[NZ];
+        vf wz = w * depth;
+        z += wz, zz += wz * depth;
+        if (C) {
+            Corners c = corners_at(f, p, p.l * p.r, zeta_1);
+            vf wu = w * c.u, wv = w * c.v, wuv = wu * c.v;
+            const float* f4 = f + RECORD;
+            for (int ch = 0; ch < C; ch++, f4 += 4)
+                features[ch] += w * f4[0] + wu * f4[1] + wv * f4[2] + wuv * f4[3];
+        }
+        vi better = w > best;
+        best = pick(better, w, best), dominant = better ? splat(g) : dominant;
+        weights.add(g, w);
+        touched[g] += __builtin_popcount(bits(p.on) & counted);
+        T -= w;
+        if (!any(T >= r.T_min)) break;
+    }
+    vf alpha = keep(b.inside, 1.0f - T);
+    vi covered = dominant >= 0;
+    vf inv = keep(covered, 1.0f / alpha), mean = z * inv;
+    write(r.rgb, b, 3, 0, red), write(r.rgb, b, 3, 1, green), write(r.rgb, b, 3, 2, blue);
+    write(r.alpha, b, 1, 0, keep(covered, alpha));
+    write(r.depth, b, 1, 0, keep(covered, r.t[2] + mean));
+    write(r.depth_var, b, 1, 0, zz * inv - mean * mean);
+    write(r.normal, b, 3, 0, nx * inv), write(r.normal, b, 3, 1, ny * inv), write(r.normal, b, 3, 2, nz * inv);
+    for (int ch = 0; ch < r.c; ch++) write(r.features, b, r.c, ch, features[ch] * inv);
+    write((float*)r.dominant, b, 1, 0, (vf)dominant);
+}
+
+// dL/d(sums) at a block's pixels.
+template <int C>
+struct Seeds {
+    vf red, green, blue, nx, ny, nz, alpha, z, zz, rem;
+    vf features[C + 1];
+    // The channels again, one row a pixel: rgb, normal, features.
+    float rows[LANES][(6 + C + LANES - 1) / LANES * LANES];
+};
+
+template <int C>
+INLINE void seed(const Raster& r, const Block& b, Seeds<C>& s) {
+    vf alpha = read(r.alpha, b, 1, 0), inv = keep(b.inside & (alpha > 0.0f), 1.0f / alpha);
+    vi covered = inv > 0.0f;
+    s.red = keep(covered, read(r.v_rgb, b, 3, 0)), s.green = keep(covered, read(r.v_rgb, b, 3, 1));
+    s.blue = keep(covered, read(r.v_rgb, b, 3, 2)), s.alpha = keep(covered, read(r.v_alpha, b, 1, 0));
+    s.rem = s.red * read(r.rgb, b, 3, 0) + s.green * read(r.rgb, b, 3, 1) + s.blue * read(r.rgb, b, 3, 2) +
+            s.alpha * alpha;
+    s.nx = read(r.v_normal, b, 3, 0) * inv, s.ny = read(r.v_normal, b, 3, 1) * inv;
+    s.nz = read(r.v_normal, b, 3, 2) * inv;
+    s.alpha -= s.nx * read(r.normal, b, 3, 0) + s.ny * read(r.normal, b, 3, 1) + s.nz * read(r.normal, b, 3, 2);
+    for (int ch = 0; ch < C; ch++) {
+        if (ch >= r.c) {
+            s.features[ch] = vf{};
+            continue;
+        }
+        s.features[ch] = read(r.v_features, b, r.c, ch) * inv;
+        s.alpha -= s.features[ch] * read(r.features, b, r.c, ch);
+    }
+    vf mean = read(r.depth, b, 1, 0) - r.t[2], v_var = read(r.v_depth_var, b, 1, 0);
+    s.zz = v_var * inv;
+    s.z = (read(r.v_depth, b, 1, 0) - 2.0f * mean * v_var) * inv;
+    s.alpha -= s.z * mean + s.zz * (read(r.depth_var, b, 1, 0) + mean * mean);
+    vf all[6 + C] = {s.red, s.green, s.blue, s.nx, s.ny, s.nz};
+    for (int ch = 0; ch < C; ch++) all[6 + ch] = s.features[ch];
+    clear(s.rows, sizeof s.rows);
+    for (int ch = 0; ch < 6 + C; ch++) {
+        float x[LANES];
+        store(x, all[ch]);
+        for (int l = 0; l < LANES; l++) s.rows[l][ch] = x[l];
+    }
+}
+
+// to[0..] += sum over pixels of w times the row of channels.
+template <int N>
+INLINE void add_channels(float* to, vf w, const float (*rows)[N]) {
+    float x[LANES];
+    store(x, w);
+    for (int j = 0; j < N; j += LANES) {
+        vf even = load(to + j), odd = {};
+        for (int l = 0; l < LANES; l += 2) {
+            even += x[l] * load(rows[l] + j);
+            odd += x[l + 1] * load(rows[l + 1] + j);
+        }
+        store(to + j, even + odd);
+    }
+}
+
+template <int C>
+static void adjoint_block(const Raster& r, const Block& b, const int* list, int count, float* parts) {
+    Seeds<C> s;
+    seed<C>(r, b, s);
+    vf T = keep(b.inside, splat(1.0f)), rem = s.rem;
+    for (int i = 0; i < count; i++) {
+        int g = list[i];
+        const float* f = r.record + (i64)g * r.record_size;
+        Peak p;
+        if (!peak_at(f, b, T >= r.T_min, r.alpha_min, r.alpha_max, p)) continue;
+        float* out = parts + (i64)g * r.gradient_size;
+        vf w = p.alpha * T, zeta = p.l * p.r, zeta_1 = lift(f, p), depth = f[DZ] + f[PZ] * zeta_1;
+        vf value = s.alpha + s.red * f[RED] + s.green * f[GREEN] + s.blue * f[BLUE] + s.nx * f[NX] + s.ny * f[NY] +
+                   s.nz * f[NZ] + depth * (s.z + depth * s.zz);
+        vf v_depth = w * (s.z + 2.0f * depth * s.zz), v_zeta = v_depth * f[PZ], v_dx = {}, v_dy = {};
+        vf x[16];
+        for (int j = G_UX; j <= G_EV; j++) x[j] = vf{};
+        if (C) {
+            Corners c = corners_at(f, p, zeta, zeta_1);
+            const float* f4 = f + RECORD;
+            vf f0 = {}, f1 = {}, f2 = {}, f3 = {};
+            for (int ch = 0; ch < C; ch++, f4 += 4) {
+                f0 += s.features[ch] * f4[0], f1 += s.features[ch] * f4[1];
+                f2 += s.features[ch] * f4[2], f3 += s.features[ch] * f4[3];
+            }
+            value += f0 + c.u * f1 + c.v * (f2 + c.u * f3);
+            vf v_u = keep(c.u == c.free_u, w * (f1 + c.v * f3)), v_v = keep(c.v == c.free_v, w * (f2 + c.u * f3));
+            vf zu = zeta * v_u, zv = zeta * v_v;
+            v_zeta += v_u * (f[EU] + f[UX] * p.dx + f[UY] * p.dy) + v_v * (f[EV] + f[VX] * p.dx + f[VY] * p.dy);
+            v_dx = zu * f[UX] + zv * f[VX], v_dy = zu * f[UY] + zv * f[VY];
+            x[G_UX] = zu * p.dx, x[G_UY] = zu * p.dy, x[G_EU] = v_u * zeta_1;
+            x[G_VX] = zv * p.dx, x[G_VY] = zv * p.dy, x[G_EV] = v_v * zeta_1;
+            vf wu = w * c.u, w1 = w - wu, w11 = wu * c.v, w01 = w1 * c.v;
+            const int step = sizeof s.rows[0] / 4;
+            add_channels(out + GEOMETRY, w1 - w01, s.rows), add_channels(out + GEOMETRY + step, wu - w11, s.rows);
+            add_channels(out + GEOMETRY + 2 * step, w01, s.rows), add_channels(out + GEOMETRY + 3 * step, w11, s.rows);
+        } else {
+            add_channels(out + GEOMETRY, w, s.rows);
+        }
+        rem -= w * value;
+        vf v_alpha = T * value - rem / (1.0f - p.alpha);
+        v_alpha = keep(p.on & (p.raw <= r.alpha_max), v_alpha);
+        vf v_rho = -0.5f * v_alpha * p.raw;
+        vf v_r = v_rho * p.K + v_zeta * p.l, v_q = -v_r * p.r * p.r;
+        vf v_l = v_zeta * p.r + 2.0f * p.l * v_q, v_K = v_rho * p.r + f[KAPPA] * v_q;
+        vf Kx = v_K * p.dx, Ky = v_K * p.dy;
+        x[G_A] = Kx * p.dx, x[G_B] = Kx * p.dy, x[G_C] = Ky * p.dy;
+        x[G_BX] = v_l * p.dx, x[G_BY] = v_l * p.dy;
+        x[G_CX] = -(v_dx + 2.0f * f[KA] * Kx + f[KB] * Ky + v_l * f[BX]);
+        x[G_CY] = -(v_dy + f[KB] * Kx + 2.0f * f[KC] * Ky + v_l * f[BY]);
+        x[G_KAPPA] = v_q * p.K, x[G_OPACITY] = v_alpha * p.G, x[G_PZ] = v_depth * zeta;
+        for (int j = 0; j < GEOMETRY; j += LANES) store(out + j, load(out + j) + sums_of(x + j));
+        T -= w;
+        if (!any(T >= r.T_min)) break;
+    }
+}
+
+// Tiles are dealt out in turn, since the object fills the middle of the picture.
+template <class F>
+INLINE void for_blocks(const Raster& r, int share, F visit) {
+    int across = tiles_x(r), n_tiles = across * tiles_y(r);
+    for (int tile = share; tile < n_tiles; tile += r.threads) {
+        int start = r.tile_start[tile], count = r.tile_start[tile + 1] - start;
+        int x0 = tile % across * TILE, y0 = tile / across * TILE;
+        for (int y = y0; y < imin2(y0 + TILE, r.height); y += BLOCK_H)
+            for (int x = x0; x < imin2(x0 + TILE, r.width); x += BLOCK_W)
+                visit(block_at(r, x, y), r.list + start, count);
+    }
+}
+
+template <int C>
+static void composite_share(Raster& r, int share) {
+    int* touched = r.touched_parts + (i64)share * r.n;
+    Weights weights;
+    weights.count = 0, weights.total = r.weight_parts + (i64)share * r.n;
+    clear(weights.total, (i64)4 * r.n), clear(touched, (i64)4 * r.n);
+    for_blocks(r, share, [&](const Block& b, const int* list, int count) {
+        composite_block<C>(r, b, list, count, weights, touched);
+    });
+    weights.flush();
+}
+
+template <int C>
+static void adjoint_share(Raster& r, int share) {
+    float* parts = r.parts + (i64)share * r.n * r.gradient_size;
+    clear(parts, (i64)4 * r.n * r.gradient_size);
+    for_blocks(r, share, [&](const Block& b, const int* list, int count) {
+        if (count) adjoint_block<C>(r, b, list, count, parts);
+    });
+}

@@ -1,0 +1,70 @@
+"""The pinhole camera: OpenCV axes (x right, y down, z forward), the centre of the first pixel at (0.5, 0.5).
+
+A *pixel position* `uv` counts from the top left corner of the image; `uv[0]` runs along the width.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one pinhole camera; where it stands is the trajectory's business."""
+
+    fx_fy_cx_cy: Float[Tensor, "4"]
+    """Focal lengths and principal point [pixels]."""
+    height: int
+    """[pixels]"""
+    width: int
+    """[pixels]"""
+
+    @staticmethod
+    def from_fov(fov_x: float, height: int, width: int) -> "Camera":
+        """The centred camera with square pixels and horizontal field of view `fov_x` [radians]."""
+        focal = 0.5 * width / math.tan(0.5 * fov_x)
+        return Camera(torch.tensor([focal, focal, width / 2, height / 2]), height, width)
+
+    @property
+    def fov_x(self) -> float:
+        """Horizontal field of view [radians], for a centred principal point."""
+        return 2 * math.atan(0.5 * self.width / float(self.fx_fy_cx_cy[0]))
+
+    @property
+    def matrix(self) -> Float[Tensor, "3 3"]:
+        """K with `[u w, v w, w] = K @ x_cam`."""
+        fx, fy, cx, cy = self.fx_fy_cx_cy
+        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+        return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(3, 3)
+
+    def pixel_centers(self) -> Float[Tensor, "h w 2"]:
+        """Positions of all pixel centres [pixels]."""
+        like = {"dtype": self.fx_fy_cx_cy.dtype, "device": self.fx_fy_cx_cy.device}
+        v, u = torch.meshgrid(torch.arange(self.height, **like), torch.arange(self.width, **like), indexing="ij")
+        return torch.stack([u, v], -1) + 0.5
+
+    def project(self, x_cam: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
+        """Pixel position of points in front of the camera."""
+        return x_cam[..., :2] / x_cam[..., 2:] * self.fx_fy_cx_cy[:2] + self.fx_fy_cx_cy[2:]
+
+    def unproject(self, uv: Float[Tensor, "*b 2"], depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
+        """Points at z-depth `depth` [object radius] seen at pixel positions, camera frame."""
+        xy = (uv - self.fx_fy_cx_cy[2:]) / self.fx_fy_cx_cy[:2]
+        return torch.cat([xy, torch.ones_like(xy[..., :1])], -1) * depth[..., None]
+
+    def directions(self) -> Float[Tensor, "h w 3"]:
+        """Unit directions from the camera through all pixel centres, camera frame."""
+        uv = self.pixel_centers()
+        return torch.nn.functional.normalize(self.unproject(uv, torch.ones_like(uv[..., 0])), dim=-1)
+
+    def resized(self, height: int, width: int) -> "Camera":
+        """The same view sampled by another grid of pixels."""
+        x, y = width / self.width, height / self.height
+        return Camera(self.fx_fy_cx_cy * self.fx_fy_cx_cy.new_tensor([x, y, x, y]), height, width)
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
+        """The part of the view that a window of pixels shows."""
+        return Camera(self.fx_fy_cx_cy - self.fx_fy_cx_cy.new_tensor([0, 0, left, top]), height, width)

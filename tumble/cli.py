@@ -1,0 +1,97 @@
+"""The command line: plain functions, one per command; `tumble --help` is made from what is written here."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+Folder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+
+
+def doctor() -> None:
+    """Say what this machine offers, and the exact fix for what is missing."""
+    from rich.console import Console
+
+    from tumble.doctor import findings
+
+    console = Console(highlight=False)
+    for finding in findings():
+        mark = "[yellow]![/]" if finding.fix else "[green]+[/]"
+        console.print(f" {mark} [bold]{finding.subject:13}[/] {finding.state}", soft_wrap=True)
+        if finding.fix:
+            console.print(f"   {'':13} -> {finding.fix}", markup=False, soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point of the `tumble` command; an error ends with one line and exit code 1, Ctrl-C with 130."""
+    from tumble import __version__
+
+    commands = {"doctor": doctor, "synth": _synth(), "evaluate": evaluate, "demo": demo}
+    if sys.argv[1:] in (["--version"], ["version"]):
+        print(f"tumble {__version__}")
+        return
+    try:
+        tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=__doc__.partition(":")[0])
+    except KeyboardInterrupt:
+        print(
+            "tumble: interrupted; what is finished is kept, the same command goes on from there",
+            file=sys.stderr,
+        )
+        raise SystemExit(130) from None
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        if os.environ.get("TUMBLE_DEBUG"):
+            raise
+        print(f"tumble: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def _synth():
+    from tumble.synthesize import Options, sweep, synthesize
+
+    def synth(
+        model: Positional[Path],
+        /,
+        options: Annotated[Options, arg(name="")],
+        out: Folder,
+        roughness_sweep: tuple[float, ...] = (),
+    ) -> None:
+        """Render a capture with exact truth from a GLB and a light map.
+
+        Args:
+            model: The object, a GLB.
+            options: How the capture is made.
+            out: The capture folder to write; the same command goes on where an interrupted one stopped.
+            roughness_sweep: Several captures, one per constant roughness, as OUT/r0.20 and so on.
+        """
+        made = sweep(model, out, options, roughness_sweep) if roughness_sweep else [synthesize(model, out, options)]
+        for folder in made:
+            print(folder)
+
+    return synth
+
+
+def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: Folder | None = None) -> None:
+    """Score a prediction folder against a capture with truth: report.json and a picture sheet.
+
+    Args:
+        prediction: The prediction folder (docs/prediction.md).
+        capture: The capture folder (docs/format.md).
+        out: Where report.json and sheet.png go; the prediction folder when left out.
+    """
+    from tumble import evaluate as evaluation
+
+    evaluation.run(prediction, capture, out or prediction)
+
+
+def demo(out: Folder = Path("runs/demo")) -> None:
+    """Show the bundled clip: its contact sheet and its truth.
+
+    Args:
+        out: Where the pictures and report.html go.
+    """
+    from tumble.demo import run
+
+    print(run(out))

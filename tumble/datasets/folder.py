@@ -1,0 +1,366 @@
+"""The capture folder: `transforms.json` of the instant-ngp / nerfstudio kind, with masks, and truth where it exists.
+
+The contract is docs/format.md. Every broken rule raises `BadFile`, which names the file, the rule and the fix.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from tumble import files
+from tumble.camera import Camera
+from tumble.capture import BACKGROUND, OBJECT, REGIONS, UNKNOWN, Capture, Truth, no_views
+from tumble.environment import Environment
+from tumble.files import BadFile
+from tumble.images import linear_from_srgb, srgb_from_linear
+from tumble.trajectory import LIGHTS, Light, Trajectory
+
+TRANSFORMS = "transforms.json"
+RIGID_TOLERANCE = 1e-3
+"""Largest deviation of R^T R from the identity: what six printed digits leave, far below a wrong scale or shear."""
+
+
+@dataclass(frozen=True)
+class _Document:
+    """A checked transforms.json."""
+
+    root: Path
+    fields: dict[str, Any]
+    frames: list[dict[str, Any]]
+    light: Light
+
+    @property
+    def path(self) -> Path:
+        return self.root / TRANSFORMS
+
+    def split(self, name: str) -> list[dict[str, Any]]:
+        return [frame for frame in self.frames if frame.get("split", "train") == name]
+
+
+def load(path: Path | str) -> Capture:
+    """The training frames of a capture folder; nothing under `truth/` is read.
+
+    Raises:
+        BadFile: The folder breaks a rule of docs/format.md.
+    """
+    document = _read(Path(path))
+    frames = document.split("train")
+    if not frames:
+        raise BadFile(document.path, "has no training frame", 'at least one frame needs "split": "train" or none')
+    lens = _lens(document, frames[0])
+    images, masks = _photographs(document, frames, lens)
+    names = tuple(_name(frame) for frame in frames)
+    return Capture(images, masks, lens.camera, names, document.light, _poses(document, frames))
+
+
+def load_truth(path: Path | str) -> Truth | None:
+    """The evaluation views of a capture folder, with all truth that it names; None when it has none.
+
+    Raises:
+        BadFile: The folder breaks a rule of docs/format.md.
+    """
+    document = _read(Path(path))
+    frames = document.split("eval")
+    lens = _lens(document, (frames or document.frames)[0])
+    truth = _views(document, frames, lens) if frames else no_views(lens.camera)
+    light, lights, poses = _light(document), _lights(document, frames), _true_poses(document)
+    if not frames and light is None and poses is None:
+        return None
+    return Truth(**{**vars(truth), "light": light, "lights": lights, "poses": poses})
+
+
+# The document ---------------------------------------------------------------------------------------------------------
+
+
+def _read(root: Path) -> _Document:
+    if not root.is_dir():
+        raise BadFile(root, "is not a folder", f"a capture is a folder that holds {TRANSFORMS}")
+    path = root / TRANSFORMS
+    fields = files.read_json(path)
+    if not isinstance(fields, dict) or not isinstance(fields.get("frames"), list) or not fields["frames"]:
+        raise BadFile(path, 'needs a list "frames" with at least one frame')
+    light = fields.get("light", "object")
+    if light not in LIGHTS:
+        raise BadFile(path, f'"light" is {light!r}', f"it is one of {', '.join(LIGHTS)}")
+    seen: set[str] = set()
+    for number, frame in enumerate(fields["frames"]):
+        _check_frame(path, number, frame, seen)
+    return _Document(root, fields, fields["frames"], cast(Light, light))
+
+
+def _check_frame(path: Path, number: int, frame: Any, seen: set[str]) -> None:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise BadFile(path, f'frame {number} has no "file_path"')
+    name = frame["file_path"]
+    if name in seen:
+        raise BadFile(path, f"the frame {name} is there twice", "every frame has its own image")
+    seen.add(name)
+    if frame.get("split", "train") not in ("train", "eval"):
+        raise BadFile(path, f'frame {name}: "split" is {frame["split"]!r}', "it is train or eval")
+    if frame.get("split") == "eval" and frame.get("region", "sphere") not in REGIONS:
+        raise BadFile(path, f'frame {name}: "region" is {frame["region"]!r}', f"it is one of {', '.join(REGIONS)}")
+
+
+def _number(document: _Document, frame: dict[str, Any], name: str) -> float | None:
+    """A number that stands at the document or, as nerfstudio allows, at its first frame."""
+    value = document.fields.get(name, frame.get(name))
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise BadFile(document.path, f'"{name}" is {value!r}, not a number')
+    return float(value)
+
+
+def _name(frame: dict[str, Any]) -> str:
+    return Path(frame["file_path"]).name
+
+
+# The camera -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A pinhole camera and what it takes to make a photograph one."""
+
+    camera: Camera
+    undistort: Callable[[np.ndarray, int], np.ndarray] | None
+    """Maps a picture, by an OpenCV interpolation, to what the pinhole camera sees; None when it is one already."""
+
+
+def _lens(document: _Document, frame: dict[str, Any]) -> _Lens:
+    _same_intrinsics(document)
+    image = _image_path(document, frame)
+    height, width = files.picture_size(image)
+    for name, value in (("w", width), ("h", height)):
+        if (stated := _number(document, frame, name)) is not None and stated != value:
+            raise BadFile(image, f"is {width} x {height} pixels, {TRANSFORMS} says {name} = {stated:g}")
+    focal = _number(document, frame, "fl_x")
+    angle = _number(document, frame, "camera_angle_x")
+    if focal is None and angle is not None:
+        focal = 0.5 * width / math.tan(0.5 * angle)
+    if focal is None or focal <= 0:
+        raise BadFile(document.path, 'needs a positive "fl_x" [pixels] or "camera_angle_x" [radians]')
+    fy = _number(document, frame, "fl_y") or focal
+    cx, cy = _number(document, frame, "cx"), _number(document, frame, "cy")
+    center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    camera = Camera(torch.tensor([focal, fy, *center]), height, width)
+    return _Lens(camera, _undistortion(document, frame, camera))
+
+
+def _same_intrinsics(document: _Document) -> None:
+    for name in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "w", "h"):
+        if len({frame[name] for frame in document.frames if name in frame}) > 1:
+            raise BadFile(document.path, f'frames differ in "{name}"', "one camera took all frames of a capture")
+
+
+def _undistortion(
+    document: _Document, frame: dict[str, Any], camera: Camera
+) -> Callable[[np.ndarray, int], np.ndarray] | None:
+    model = document.fields.get("camera_model", "OPENCV")
+    fisheye = model == "OPENCV_FISHEYE"
+    if model not in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"):
+        raise BadFile(document.path, f'"camera_model" is {model!r}', "known: OPENCV, OPENCV_FISHEYE, PINHOLE")
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    coefficients = np.array([_number(document, frame, name) or 0.0 for name in names])
+    if not coefficients.any() and not fisheye:
+        return None
+    K = camera.matrix.double().numpy().copy()
+    K[:2, 2] -= 0.5  # OpenCV puts the centre of the first pixel at (0, 0)
+    size = (camera.width, camera.height)
+    tables = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    x, y = tables(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
+    return lambda picture, how: cv2.remap(picture, x, y, how, borderMode=cv2.BORDER_CONSTANT)
+
+
+# Pictures -------------------------------------------------------------------------------------------------------------
+
+
+def _image_path(document: _Document, frame: dict[str, Any]) -> Path:
+    path = files.inside(document.root, frame["file_path"])
+    # NeRF's synthetic scenes leave the ending out.
+    return path if path.suffix or path.exists() else path.with_suffix(".png")
+
+
+def _photographs(
+    document: _Document, frames: list[dict[str, Any]], lens: _Lens
+) -> tuple[UInt8[Tensor, "t h w 3"], UInt8[Tensor, "t h w"]]:
+    pairs = [_photograph(document, frame, lens) for frame in frames]
+    images, masks = (torch.from_numpy(np.stack(pictures)) for pictures in zip(*pairs, strict=True))
+    return images, masks
+
+
+def _photograph(document: _Document, frame: dict[str, Any], lens: _Lens) -> tuple[np.ndarray, np.ndarray]:
+    path = _image_path(document, frame)
+    picture = _sized(files.read_picture(path), path, lens.camera)
+    image = np.repeat(picture, 3, 2) if picture.shape[2] == 1 else picture[..., :3]
+    mask = np.full(picture.shape[:2], OBJECT, np.uint8)
+    if picture.shape[2] == 4:
+        image, mask = over_black(picture), mask_from_alpha(picture[..., 3])
+    if "mask_path" in frame:
+        mask_path = files.inside(document.root, frame["mask_path"])
+        mask = three_valued(_sized(files.read_picture(mask_path), mask_path, lens.camera)[..., 0], mask_path)
+    if lens.undistort is not None:
+        image, mask = lens.undistort(image, cv2.INTER_LINEAR), lens.undistort(mask, cv2.INTER_NEAREST)
+    if not (mask == OBJECT).any():
+        named = frame.get("mask_path", frame["file_path"])
+        raise BadFile(document.root / named, "is an empty mask", "a frame must show the object: drop it or mend it")
+    return np.ascontiguousarray(image), np.ascontiguousarray(mask)
+
+
+def _sized(pixels: np.ndarray, path: Path, camera: Camera) -> np.ndarray:
+    if pixels.shape[:2] != (camera.height, camera.width):
+        found = f"{pixels.shape[1]} x {pixels.shape[0]}"
+        raise BadFile(path, f"is {found} pixels, the capture is {camera.width} x {camera.height}")
+    return pixels
+
+
+def over_black(rgba: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Straight sRGB colour with alpha, composited over black in linear light, back to sRGB code values."""
+    linear = linear_from_srgb(torch.from_numpy(rgba[..., :3] / 255.0)) * torch.from_numpy(rgba[..., 3:] / 255.0)
+    return (srgb_from_linear(linear) * 255).round().to(torch.uint8).numpy()
+
+
+def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Opaque pixels are the object, clear ones background, what lies between is unknown."""
+    return np.select([alpha >= 250, alpha <= 5], [OBJECT, BACKGROUND], UNKNOWN).astype(np.uint8)
+
+
+def three_valued(mask: UInt8[np.ndarray, "h w"], path: Path) -> UInt8[np.ndarray, "h w"]:
+    """A mask file's code values as OBJECT, UNKNOWN and BACKGROUND; a file of only 0 and 1 counts as 0 and 255."""
+    if mask.max(initial=0) == 1:
+        return mask * np.uint8(OBJECT)
+    if mask.max(initial=0) == 0:
+        raise BadFile(path, "is an empty mask", "a frame must show the object: drop it or mend it")
+    return mask_from_alpha(mask)
+
+
+# Poses ----------------------------------------------------------------------------------------------------------------
+
+
+def _poses(document: _Document, frames: list[dict[str, Any]]) -> Trajectory | None:
+    with_pose = [frame for frame in frames if "transform_matrix" in frame]
+    if not with_pose:
+        return None
+    if len(with_pose) < len(frames):
+        bare = next(frame for frame in frames if "transform_matrix" not in frame)
+        raise BadFile(document.path, f"the frame {_name(bare)} has no pose, others do", "give all frames one, or none")
+    named = ((_name(frame), frame["transform_matrix"]) for frame in frames)
+    return Trajectory.from_camera_to_object(_rigid(document.path, named), document.light)
+
+
+def _rigid(path: Path, named: Iterable[tuple[str, Any]]) -> Float[Tensor, "t 4 4"]:
+    matrices = []
+    for name, values in named:
+        try:
+            matrix = np.array(values, np.float64)
+        except (TypeError, ValueError):
+            matrix = np.zeros(0)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise BadFile(path, f'frame {name}: "transform_matrix" is not 4 x 4 finite numbers')
+        R = matrix[:3, :3]
+        off = max(np.abs(R.T @ R - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max())
+        if off > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+            raise BadFile(
+                path,
+                f'frame {name}: "transform_matrix" is not a rotation and a translation',
+                f"off {off:.2g}",
+            )
+        matrices.append(matrix)
+    return torch.from_numpy(np.stack(matrices)).float()
+
+
+def read_poses(path: Path, names: Iterable[str]) -> Float[Tensor, "t 4 4"]:
+    """The poses of some frames from `{"0000.png": 4x4}`: camera to object, OpenGL camera axes.
+
+    Raises:
+        BadFile: A frame is missing, or its matrix is not rigid.
+    """
+    document = files.read_json(path)
+    names = list(names)
+    if not isinstance(document, dict) or (missing := [name for name in names if name not in document]):
+        raise BadFile(path, f"has no pose for {', '.join(missing[:3]) if isinstance(document, dict) else names[0]}")
+    return _rigid(path, ((name, document[name]) for name in names))
+
+
+def _true_poses(document: _Document) -> Trajectory | None:
+    frames = document.split("train")
+    path = document.root / "truth" / "poses.json"
+    if not frames or not path.exists():
+        return _poses(document, frames)
+    return Trajectory.from_camera_to_object(read_poses(path, map(_name, frames)), document.light)
+
+
+# Truth ----------------------------------------------------------------------------------------------------------------
+
+
+def _views(document: _Document, frames: list[dict[str, Any]], lens: _Lens) -> Truth:
+    if lens.undistort is not None:
+        raise BadFile(document.path, "has evaluation views and a distorted lens", "truth needs a pinhole camera")
+    images, masks = _photographs(document, frames, lens)
+    trajectory = _poses(document, frames)
+    if trajectory is None:
+        raise BadFile(document.path, 'evaluation frames without "transform_matrix"', "every evaluation view has a pose")
+
+    def linear(key: str, channels: Literal[1, 3]) -> Tensor | None:
+        if not any(key in frame for frame in frames):
+            return None
+        maps = torch.stack([_linear_map(document, frame, key, channels, lens.camera) for frame in frames])
+        return maps[..., 0] if channels == 1 else maps
+
+    normals = linear("normal_path", 3)
+    return Truth(
+        images=images,
+        masks=masks,
+        names=tuple(_name(frame) for frame in frames),
+        regions=tuple(frame.get("region", "sphere") for frame in frames),
+        trajectory=trajectory,
+        albedo=linear("albedo_path", 3),
+        roughness=linear("roughness_path", 1),
+        # Half precision leaves lengths off by 1e-3: enough to invent an angle of 0.4 degrees in an arccos.
+        normals=None if normals is None else torch.nn.functional.normalize(normals, dim=-1),
+        depth=linear("depth_path", 1),
+        relit={light: _relit(document, frames, light, lens.camera) for light in _light_names(frames)},
+    )
+
+
+def _truth_path(document: _Document, frame: dict[str, Any], key: str, name: object) -> Path:
+    if not isinstance(name, str):
+        raise BadFile(document.path, f'the frame {_name(frame)} has no "{key}", others do', "all views, or none")
+    return files.inside(document.root, name)
+
+
+def _linear_map(document: _Document, frame: dict[str, Any], key: str, channels: int, camera: Camera) -> Tensor:
+    path = _truth_path(document, frame, key, frame.get(key))
+    pixels = _sized(files.read_radiance(path), path, camera)
+    if pixels.shape[2] != channels:
+        raise BadFile(path, f"has {pixels.shape[2]} channels, {key} has {channels}")
+    return torch.from_numpy(pixels)
+
+
+def _light_names(frames: list[dict[str, Any]]) -> list[str]:
+    return sorted({name for frame in frames for name in frame.get("relit", {})})
+
+
+def _relit(document: _Document, frames: list[dict[str, Any]], light: str, camera: Camera) -> Tensor:
+    paths = [_truth_path(document, f, f"relit/{light}", f.get("relit", {}).get(light)) for f in frames]
+    return torch.from_numpy(np.stack([_sized(files.read_picture(path), path, camera)[..., :3] for path in paths]))
+
+
+def _light(document: _Document) -> Environment | None:
+    if "light_path" not in document.fields:
+        return None
+    return Environment.read(files.inside(document.root, document.fields["light_path"]))
+
+
+def _lights(document: _Document, frames: list[dict[str, Any]]) -> dict[str, Environment]:
+    return {
+        name: Environment.read(files.inside(document.root, f"truth/lights/{name}.hdr")) for name in _light_names(frames)
+    }

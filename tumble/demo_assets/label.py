@@ -1,0 +1,278 @@
+"""What is printed on the pot: base colour and roughness, painted with Pillow at the same time.
+
+Positions are pixels of a chart, x to the right and y down; an `Ink` has a colour and a roughness.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+FINE = 2
+"""Charts are painted this many times finer than they are stored, and averaged."""
+DARKEST, BRIGHTEST = 57, 236
+"""Code values of the darkest and the brightest ink: 0.04 and 0.84 in linear albedo."""
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Ink:
+    """What one brush leaves behind."""
+
+    rgb: tuple[int, int, int]
+    """sRGB code values, DARKEST to BRIGHTEST."""
+    roughness: float
+    """Perceptual roughness."""
+
+
+CREAM = Ink((234, 223, 198), 0.34)
+PAPER = Ink((236, 229, 212), 0.76)
+NIGHT = Ink((57, 64, 82), 0.55)
+TEAL = Ink((57, 112, 114), 0.30)
+GLOSS = Ink((57, 104, 110), 0.15)
+LEAF = Ink((94, 134, 104), 0.45)
+CORAL = Ink((216, 97, 74), 0.40)
+MUSTARD = Ink((228, 172, 72), 0.45)
+BLUSH = Ink((232, 178, 152), 0.50)
+SKY = Ink((150, 190, 196), 0.60)
+WOOD = Ink((164, 108, 68), 0.58)
+BARK = Ink((120, 74, 57), 0.66)
+BRIGHT = (CORAL, MUSTARD, CREAM, SKY, BLUSH)
+
+
+class Sheet:
+    """A chart being painted: its colour and its roughness, kept in step. Painting is what changes it."""
+
+    def __init__(self, width: int, height: int, ground: Ink) -> None:
+        size = (width * FINE, height * FINE)
+        self.width, self.height = width, height
+        self._layers = (Image.new("RGB", size, ground.rgb), Image.new("L", size, _level(ground)))
+        self._brushes = tuple(ImageDraw.Draw(layer) for layer in self._layers)
+
+    def polygon(self, points: list[Point], ink: Ink) -> None:
+        """A filled polygon."""
+        for brush, fill in zip(self._brushes, (ink.rgb, _level(ink)), strict=True):
+            brush.polygon([(FINE * x, FINE * y) for x, y in points], fill=fill)
+
+    def box(self, left: float, top: float, right: float, bottom: float, ink: Ink, *, corner: float = 0) -> None:
+        """A filled rectangle with rounded corners."""
+        edges = [FINE * left, FINE * top, FINE * right - 1, FINE * bottom - 1]
+        for brush, fill in zip(self._brushes, (ink.rgb, _level(ink)), strict=True):
+            brush.rounded_rectangle(edges, FINE * corner, fill=fill)
+
+    def disc(self, x: float, y: float, radius: float, ink: Ink) -> None:
+        """A filled circle."""
+        self.polygon([(x + radius * math.cos(a), y + radius * math.sin(a)) for a in _angles(48)], ink)
+
+    def star(self, x: float, y: float, radius: float, ink: Ink, *, tips: int = 5, waist: float = 0.45) -> None:
+        """A filled star with one tip upwards."""
+        radii = [radius, waist * radius] * tips
+        corners = zip(radii, _angles(2 * tips), strict=True)
+        self.polygon([(x + r * math.sin(a), y - r * math.cos(a)) for r, a in corners], ink)
+
+    def leaf(self, x: float, y: float, length: float, angle: float, ink: Ink) -> None:
+        """A pointed leaf that grows from (x, y); angle 0 is upwards, growing clockwise [radians]."""
+        sides = [(t, 0.24 * math.sin(math.pi * t) ** 0.8) for t in np.linspace(0, 1, 12)]
+        outline = sides + [(t, -w) for t, w in reversed(sides)]
+        s, c = math.sin(angle), math.cos(angle)
+        self.polygon([(x + length * (t * s + w * c), y - length * (t * c - w * s)) for t, w in outline], ink)
+
+    def text(self, x: float, y: float, words: str, size: float, ink: Ink, *, bold: float = 0, turn: float = 0) -> None:
+        """Words centred on (x, y), drawn with a pen of width `bold`, turned clockwise by `turn` [radians]."""
+        font = ImageFont.load_default(size=size * FINE)
+        left, top, right, bottom = font.getbbox(words, stroke_width=bold * FINE)
+        # The height of a capital, not of these words: lines of text keep their distance.
+        middle = (font.getbbox("H")[1] + font.getbbox("H")[3]) / 2
+        half = math.ceil(max(right - left, bottom - top) / 2 + size * FINE)
+        stencil = Image.new("L", (2 * half, 2 * half))
+        corner = (half - (left + right) / 2, half - middle)
+        ImageDraw.Draw(stencil).text(corner, words, 255, font, stroke_width=bold * FINE)
+        stencil = stencil.rotate(-math.degrees(turn), Image.Resampling.BICUBIC)
+        place = (round(FINE * x) - half, round(FINE * y) - half)
+        for layer, fill in zip(self._layers, (ink.rgb, _level(ink)), strict=True):
+            layer.paste(fill, place, stencil)
+
+    def round_text(self, radius: float, words: str, size: float, ink: Ink, *, bold: float = 0) -> None:
+        """Words around the middle of the sheet, spread over the whole circle, their feet towards the middle."""
+        for letter, angle in zip(words, _angles(len(words)), strict=True):
+            x, y = radius * math.sin(angle), -radius * math.cos(angle)
+            self.text(self.width / 2 + x, self.height / 2 + y, letter, size, ink, bold=bold, turn=angle)
+
+    def textures(self) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 1"]]:
+        """Colour and roughness at the size of the chart."""
+        colour, roughness = (np.asarray(layer.reduce(FINE)) for layer in self._layers)
+        return colour.clip(DARKEST, BRIGHTEST), roughness[..., None]
+
+
+def _level(ink: Ink) -> int:
+    return round(255 * ink.roughness)
+
+
+def _angles(n: int) -> list[float]:
+    return [2 * math.pi * i / n for i in range(n)]
+
+
+def paint(name: str, width: int, height: int) -> Sheet:
+    """The print of one chart of the pot, by the chart's name."""
+    painters = {"body": _body, "lid": _lid, "base": _base, "spout": _spout, "handle": _handle, "knob": _knob}
+    sheet = Sheet(width, height, GLOSS if name == "lid_under" else TEAL)
+    if name in painters:
+        painters[name](sheet)
+    return sheet
+
+
+def _body(sheet: Sheet) -> None:
+    """Around the pot: a landscape on the back, sprigs under the spout, the label in front, marks behind the handle."""
+    sheet.box(0, 0, sheet.width, sheet.height, CREAM)
+    rng = np.random.default_rng(7)
+    _sprigs(sheet, rng)
+    _borders(sheet, rng)
+    _landscape(sheet, 254, 156)
+    _front(sheet, 762, 156)
+
+
+def _borders(sheet: Sheet, rng: np.random.Generator) -> None:
+    """A frieze above and one below, no two stretches of them alike."""
+    sheet.box(0, 0, sheet.width, 46, TEAL)
+    sheet.box(0, 46, sheet.width, 50, MUSTARD)
+    sheet.box(0, 246, sheet.width, 250, CORAL)
+    sheet.box(0, 250, sheet.width, sheet.height, NIGHT)
+    for i in range(32):
+        x, ink = 16 + 31.75 * i, BRIGHT[rng.integers(5)]
+        size = 5 + 4 * rng.random()
+        (sheet.disc if rng.random() < 0.5 else sheet.star)(x, 32, size, ink)
+        height = 10 + 12 * rng.random()
+        sheet.polygon([(x - 13, 278), (x + 13, 278), (x + 8 * rng.random() - 4, 278 - height)], BRIGHT[rng.integers(5)])
+
+
+def _sprigs(sheet: Sheet, rng: np.random.Generator) -> None:
+    """Leaves and berries around the spout and the handle."""
+    for x in [30, 478, 540, 590, 984, 430]:
+        tall, lean = 90 + 80 * rng.random(), 0.5 * rng.random() - 0.25
+        for i in range(9):
+            t = i / 8
+            at = (x + lean * t * tall + 6 * math.sin(4 * t), 244 - t * tall)
+            side = 0.95 if i % 2 else -0.95
+            ink = (TEAL, LEAF, MUSTARD, CORAL)[rng.integers(4)] if i < 8 else CORAL
+            sheet.leaf(*at, 34 - 14 * t, side * (1 - 0.6 * t) + lean, ink)
+    for _ in range(46):
+        x, y = rng.random() * sheet.width, 58 + 180 * rng.random()
+        sheet.disc(x, y, 1.5 + 2.5 * rng.random(), BRIGHT[rng.integers(2)] if rng.random() < 0.7 else NIGHT)
+
+
+def _landscape(sheet: Sheet, x: float, y: float) -> None:
+    """A printed view: sun, two ranges of hills, firs and a tent, on matte ink."""
+    left, top, right, bottom = x - 160, y - 84, x + 160, y + 82
+    sheet.box(left - 5, top - 5, right + 5, bottom + 5, NIGHT, corner=12)
+    sheet.box(left, top, right, bottom, SKY, corner=8)
+    sheet.disc(x + 62, y - 26, 34, Ink(MUSTARD.rgb, 0.20))
+    sheet.disc(x + 62, y - 26, 25, Ink(CORAL.rgb, 0.20))
+    for bumps, ink in (((34, 78, 40, 96, 60, 84, 30), Ink(BLUSH.rgb, 0.7)), ((66, 30, 54, 18, 40, 26, 58), TEAL)):
+        ridge = [(left + 320 * i / 6, bottom - 22 - height) for i, height in enumerate(bumps)]
+        sheet.polygon([(left, bottom), *ridge, (right, bottom)], ink)
+    sheet.box(left, bottom - 32, right, bottom, Ink(LEAF.rgb, 0.8), corner=8)
+    for i, (dx, size) in enumerate([(-138, 62), (-112, 44), (-84, 72), (20, 38), (112, 56), (138, 40)]):
+        for k in range(3):
+            w, base = size * (0.30 - 0.07 * k), bottom - 12 - size * 0.25 * k
+            ink = NIGHT if i % 2 else Ink((57, 86, 78), 0.7)
+            sheet.polygon([(x + dx - w, base), (x + dx + w, base), (x + dx, base - size * 0.5)], ink)
+    sheet.polygon([(x - 52, bottom - 8), (x + 8, bottom - 8), (x - 22, bottom - 50)], CORAL)
+    sheet.polygon([(x - 32, bottom - 8), (x - 12, bottom - 8), (x - 22, bottom - 36)], NIGHT)
+    sheet.text(x - 92, top + 24, "CAMP No 7", 20, NIGHT, bold=1)
+    for i in range(7):
+        sheet.star(left + 16 + 23 * i, top + 46 + 7 * (i % 3), 2.5 + i % 3, PAPER, tips=4, waist=0.3)
+
+
+def _front(sheet: Sheet, x: float, y: float) -> None:
+    """The paper label: name, ornaments, colour bar, small print."""
+    left, top, right, bottom = x - 170, y - 86, x + 170, y + 84
+    sheet.box(left - 4, top - 4, right + 4, bottom + 4, TEAL, corner=16)
+    sheet.box(left, top, right, bottom, PAPER, corner=13)
+    sheet.text(x + 4, y - 32, "tumble", 92, Ink(MUSTARD.rgb, 0.7), bold=4)
+    sheet.text(x, y - 36, "tumble", 92, Ink(CORAL.rgb, 0.25), bold=3)
+    sheet.box(left + 14, y + 16, right - 14, y + 19, NIGHT)
+    sheet.text(x - 50, y + 32, "TURN IT IN THE LIGHT", 17, NIGHT, bold=0.6)
+    for i, ink in enumerate((CORAL, MUSTARD, LEAF, TEAL, SKY, BLUSH, WOOD, NIGHT)):
+        sheet.box(left + 16 + 24 * i, y + 46, left + 38 + 24 * i, y + 70, Ink(ink.rgb, 0.7), corner=3)
+    sheet.star(right - 46, y + 48, 33, Ink(MUSTARD.rgb, 0.3), tips=14, waist=0.78)
+    sheet.text(right - 46, y + 43, "0.33", 19, NIGHT, bold=0.8)
+    sheet.text(right - 46, y + 58, "LITRE", 9, NIGHT, bold=0.4)
+    for dx, dy, size, ink in ((-150, -70, 9, TEAL), (146, -68, 8, MUSTARD), (122, -74, 5, CORAL), (-128, -76, 4, CORAL)):
+        sheet.star(x + dx, y + dy, size, ink)
+    sheet.text(x - 78, y + 77, "shape - motion - material - light", 9.5, NIGHT, bold=0.2)
+
+
+def _lid(sheet: Sheet) -> None:
+    """Glossy enamel with a sun of unequal rays and a motto around it."""
+    cx, cy = sheet.width / 2, sheet.height / 2
+    sheet.box(0, 0, sheet.width, sheet.height, GLOSS)
+    sheet.disc(cx, cy, 67, Ink(NIGHT.rgb, 0.2))
+    for i, angle in enumerate(_angles(18)):
+        reach, ink = 52 + (i * 7) % 12, Ink(BRIGHT[(i * i + i // 5) % 3].rgb, 0.2)
+        spread = [(angle - 0.10, 24), (angle + 0.10, 24), (angle + 0.05, reach), (angle - 0.05, reach)]
+        sheet.polygon([(cx + r * math.sin(a), cy - r * math.cos(a)) for a, r in spread], ink)
+    sheet.disc(cx, cy, 30, Ink(MUSTARD.rgb, 0.2))
+    sheet.round_text(77, "TURN * LOOK * TURN AGAIN * TUMBLE * ", 17, Ink(CREAM.rgb, 0.2), bold=0.7)
+    for i, angle in enumerate(_angles(40)):
+        ink = Ink(BRIGHT[(i * i // 3 + i) % 5].rgb, 0.2)
+        sheet.disc(cx + 94 * math.sin(angle), cy - 94 * math.cos(angle), 2.2 + (i * 5 % 3), ink)
+
+
+def _base(sheet: Sheet) -> None:
+    """The maker's mark underneath."""
+    cx, cy = sheet.width / 2, sheet.height / 2
+    sheet.box(0, 0, sheet.width, sheet.height, NIGHT)
+    sheet.disc(cx, cy, 92, MUSTARD)
+    sheet.disc(cx, cy, 68, Ink(PAPER.rgb, 0.7))
+    sheet.round_text(80, "MADE BY CODE - KEEP TURNING - BATCH 2026 - ", 15, NIGHT, bold=0.7)
+    sheet.text(cx - 26, cy - 24, "7", 64, CORAL, bold=3)
+    sheet.star(cx + 22, cy - 34, 18, TEAL, tips=6)
+    sheet.text(cx + 22, cy - 8, "CODE", 14, NIGHT, bold=0.6)
+    widths = (2, 1, 3, 1, 1, 2, 4, 1, 2, 1, 3, 2, 1, 1, 4, 1, 2, 3)
+    for i, width in enumerate(widths):
+        left = cx - 46 + sum(widths[:i]) + 2.2 * i
+        sheet.box(left, cy + 14, left + width, cy + 40, NIGHT)
+    for i, ink in enumerate((CORAL, MUSTARD, LEAF, TEAL)):
+        sheet.box(cx - 29 + 15 * i, cy + 45, cx - 17 + 15 * i, cy + 57, ink)
+
+
+def _spout(sheet: Sheet) -> None:
+    """Cream enamel, dark inside, a coral mouth, rings and dots further down."""
+    sheet.box(0, 0, sheet.width, 22, Ink(BARK.rgb, 0.5))
+    sheet.box(0, 22, sheet.width, 46, CORAL)
+    sheet.box(0, 46, sheet.width, sheet.height, TEAL)
+    for i in range(7):
+        y, ink = 54 + 22 * i, BRIGHT[(3 * i + i // 2) % 5]
+        if i % 3 == 1:
+            sheet.box(0, y, sheet.width, y + 5, ink)
+            continue
+        for k in range(6):
+            x = (k + 0.5 * (i % 2) + 0.25) * sheet.width / 6
+            (sheet.disc if (k * k + i) % 3 else sheet.star)(x, y + 4, 5 + (k + i) % 3, BRIGHT[(k * 3 + i) % 5])
+
+
+def _handle(sheet: Sheet) -> None:
+    """Wound with tape: slanting bands of changing colour and width."""
+    sheet.box(0, 0, sheet.width, sheet.height, WOOD)
+    y = -sheet.width * 0.5
+    for i in range(16):
+        width = 7 + (i * i) % 9
+        ink = (CORAL, NIGHT, MUSTARD, BARK, CREAM)[(i * 3 + i // 4) % 5]
+        # A band climbs by two whole turns' worth of pitch, so that it closes on itself at the seam.
+        sheet.polygon([(0, y + 50), (sheet.width, y), (sheet.width, y + width), (0, y + 50 + width)], ink)
+        y += 18
+    for i in range(9):
+        sheet.disc((i * 37) % sheet.width, 14 + 22 * i, 3.2, Ink(PAPER.rgb, 0.3))
+
+
+def _knob(sheet: Sheet) -> None:
+    """Turned wood with painted segments."""
+    sheet.box(0, 0, sheet.width, sheet.height, WOOD)
+    for i in range(7):
+        left = i * sheet.width / 7
+        sheet.box(left, 0, left + sheet.width / 9, 44, (CORAL, BARK, CREAM, BARK, MUSTARD, BARK, TEAL)[i])
+    sheet.box(0, 46, sheet.width, 51, BARK)
+    sheet.box(0, 84, sheet.width, sheet.height, MUSTARD)

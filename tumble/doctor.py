@@ -1,0 +1,86 @@
+"""What this machine offers, and the exact fix for what it lacks."""
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+
+from tumble import __version__, pathtracer
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    subject: str
+    state: str
+    fix: str = ""
+    """What to do; empty when all is well."""
+
+
+def findings() -> list[Finding]:
+    """Everything `tumble doctor` prints, in order."""
+    return [*_machine(), _renderer(), _compiler(), _codec(), *_extras()]
+
+
+def _machine() -> Iterator[Finding]:
+    yield Finding(
+        "tumble",
+        f"{__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}",
+    )
+    yield Finding("torch", f"{torch.__version__}, {torch.get_num_threads()} threads")
+    if torch.cuda.is_available():
+        free, total = torch.cuda.mem_get_info()
+        name = torch.cuda.get_device_name()
+        yield Finding("device", f"{name}, {free / 2**30:.0f} of {total / 2**30:.0f} GiB free")
+    else:
+        yield Finding("device", "CPU: all works, slower than on an NVIDIA GPU")
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+        yield Finding(
+            "memory",
+            f"{memory:.0f} GiB",
+            "" if memory >= 4 else "runs need about 4 GiB: close other programs",
+        )
+
+
+def _renderer() -> Finding:
+    if importlib.util.find_spec("mitsuba") is None:
+        return Finding("tumble synth", "not installed", "pip install 'tumble[synth]'")
+    llvm = pathtracer.find_llvm()
+    if llvm is not None:
+        return Finding("tumble synth", f"Mitsuba on LLVM {llvm[1]} ({llvm[0]})")
+    how = {"Darwin": "brew install llvm", "Windows": "install LLVM 17 or newer from llvm.org"}
+    fix = how.get(platform.system(), f"apt install libllvm19 (any libLLVM >= {pathtracer.OLDEST_LLVM} will do)")
+    return Finding("tumble synth", "Mitsuba in its scalar variant: right, but several times slower than with LLVM", fix)
+
+
+def _compiler() -> Finding:
+    found = next((path for name in ("c++", "g++", "clang++") if (path := shutil.which(name))), None)
+    if found:
+        return Finding("compiler", found)
+    return Finding("compiler", "none", "optional: apt install g++ (the CPU kernels are compiled on first use)")
+
+
+def _codec() -> Finding:
+    import av
+
+    known = "libx264" in av.codecs_available
+    return Finding(
+        "film",
+        f"PyAV {av.__version__}, H.264 {'in and out' if known else 'in only'}",
+        "" if known else "pip install -U av",
+    )
+
+
+def _extras() -> Iterator[Finding]:
+    for extra, package in (("viewer", "viser"), ("cluster", "ray")):
+        if importlib.util.find_spec(package) is None:
+            yield Finding(f"extra {extra}", "not installed", f"optional: pip install 'tumble[{extra}]'")
+        else:
+            yield Finding(f"extra {extra}", f"{package} {importlib.metadata.version(package)}")

@@ -1,0 +1,195 @@
+"""Pictures and tables on disk: PNG, OpenEXR, Radiance HDR and JSON, read with the reason of every refusal.
+
+*Code values* are 8-bit numbers as a file stores them (sRGB for photographs); *radiance* is linear and in float32.
+Every writer makes a file that is whole or absent. Every reader raises `BadFile`, which names the file, the rule it
+broke and the fix, and reads a picture's size before its pixels: more than `MAX_PIXELS` are refused.
+"""
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+from jaxtyping import Float32, UInt8
+from PIL import Image
+
+MAX_PIXELS = 1 << 26
+"""Largest picture read: 64 megapixels, an 8k x 8k light map; a larger one is a mistake or an attack."""
+
+
+class BadFile(ValueError):
+    """A file that breaks a rule of its format. The message names the file, the rule and the fix."""
+
+    def __init__(self, path: Path, rule: str, fix: str = "") -> None:
+        super().__init__(f"{path}: {rule}" + (f" ({fix})" if fix else ""))
+
+
+def inside(root: Path, name: str) -> Path:
+    """The file `name` of folder `root`.
+
+    Raises:
+        BadFile: The name leaves the folder (an absolute path, `..`, or a link to outside).
+    """
+    path = root / name
+    if Path(name).is_absolute() or not path.resolve().is_relative_to(root.resolve()):
+        raise BadFile(root, f"the path {name!r} leaves the folder", "use paths relative to the folder, without ..")
+    return path
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Let `write` fill a temporary file beside `path`, then put it in place in one step."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=".partial-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    partial = Path(name)
+    try:
+        write(partial)
+        partial.chmod(0o644)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_json(path: Path) -> Any:
+    """A JSON document. NaN and infinity, which JSON does not know, are refused."""
+
+    def refuse(word: str) -> None:
+        raise BadFile(path, f"holds {word}, which is not a JSON number")
+
+    _exists(path)
+    try:
+        return json.loads(path.read_text("utf-8"), parse_constant=refuse)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadFile(path, f"is not valid JSON: {error}") from None
+
+
+def write_json(path: Path, document: Any) -> None:
+    """A JSON document, indented; NaN is written as null, for JSON has no other word."""
+    text = json.dumps(_without_nan(document), indent=1, allow_nan=False)
+    write_whole(path, lambda partial: partial.write_text(text + "\n", "utf-8"))
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Height and width of an 8-bit picture, without decoding it."""
+    with _open(path) as picture:
+        return picture.height, picture.width
+
+
+def read_picture(path: Path) -> UInt8[np.ndarray, "h w c"]:
+    """Code values of an 8-bit PNG or JPEG: 1, 3 or 4 channels as stored (a palette becomes RGB or RGBA)."""
+    with _open(path) as picture:
+        if picture.mode in ("I", "F") or picture.mode.startswith("I;16"):
+            raise BadFile(path, f"has pixels of kind {picture.mode}, not 8 bits", "convert it to 8-bit sRGB")
+        mode = {"L": "L", "1": "L", "RGB": "RGB", "RGBA": "RGBA", "LA": "RGBA"}.get(picture.mode)
+        if mode is None:
+            mode = "RGBA" if "transparency" in picture.info else "RGB"
+        try:
+            values = np.asarray(picture.convert(mode))
+        except (OSError, SyntaxError) as error:
+            raise BadFile(path, f"cannot be decoded: {error}") from None
+    return values if values.ndim == 3 else values[..., None]
+
+
+def write_png(path: Path, values: UInt8[np.ndarray, "h w c"]) -> None:
+    """Code values as a PNG of 1, 3 or 4 channels."""
+    picture = Image.fromarray(values[..., 0] if values.shape[2] == 1 else values)
+    write_whole(path, lambda partial: picture.save(partial, "PNG"))
+
+
+def read_radiance(path: Path) -> Float32[np.ndarray, "h w c"]:
+    """Linear float pixels of an OpenEXR (.exr) or Radiance (.hdr) file: 1 or 3 channels, all finite."""
+    _exists(path)
+    readers = {".exr": _read_exr, ".hdr": _read_hdr}
+    if path.suffix.lower() not in readers:
+        raise BadFile(path, f"has the ending {path.suffix!r}, not .exr or .hdr")
+    values = readers[path.suffix.lower()](path)
+    if not np.isfinite(values).all():
+        raise BadFile(path, "holds NaN or infinity", "linear pixels must be finite")
+    return np.ascontiguousarray(values, np.float32)
+
+
+def write_exr(path: Path, values: np.ndarray, *, half: bool = False) -> None:
+    """Linear pixels `[h w c]` as OpenEXR: channel Y for c = 1, RGB for c = 3; 16-bit floats when `half`."""
+    pixels = np.ascontiguousarray(values, np.float16 if half else np.float32)
+    channels = {"Y": pixels[..., 0]} if pixels.shape[2] == 1 else {"RGB": pixels}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    write_whole(path, lambda partial: OpenEXR.File(header, channels).write(str(partial)))
+
+
+def write_hdr(path: Path, values: Float32[np.ndarray, "h w 3"]) -> None:
+    """Linear radiance as a Radiance RGBE file; a colour keeps about 8 bits under its shared exponent."""
+
+    def write(partial: Path) -> None:
+        if not cv2.imwrite(str(partial), values[..., ::-1]):
+            raise OSError(f"could not write {path}")
+
+    write_whole(path, write)
+
+
+def _exists(path: Path) -> None:
+    if not path.is_file():
+        raise BadFile(path, "is missing" if not path.exists() else "is not a file")
+
+
+def _open(path: Path) -> Image.Image:
+    _exists(path)
+    try:
+        picture = Image.open(path)
+    except (OSError, Image.DecompressionBombError) as error:
+        raise BadFile(path, f"is not a picture: {error}") from None
+    if picture.width * picture.height > MAX_PIXELS:
+        raise BadFile(path, f"has {picture.width} x {picture.height} pixels, over the limit of {MAX_PIXELS}")
+    return picture
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    try:
+        window = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+        width, height = (int(high - low) + 1 for low, high in zip(*window, strict=True))
+        if not 0 < width * height <= MAX_PIXELS:
+            raise BadFile(path, f"has {width} x {height} pixels, over the limit of {MAX_PIXELS}")
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    except (RuntimeError, OSError, KeyError, ValueError, TypeError) as error:
+        if isinstance(error, BadFile):
+            raise
+        raise BadFile(path, f"is not an OpenEXR file: {error}") from None
+    for names in (("R", "G", "B"), ("Y",), ("V",)):
+        if set(names) <= set(channels):
+            return np.stack([channels[name].pixels.astype(np.float32) for name in names], -1)
+    raise BadFile(path, f"has channels {sorted(channels)}, not R, G, B or Y")
+
+
+def _read_hdr(path: Path) -> np.ndarray:
+    height, width = _hdr_size(path)
+    if not 0 < width * height <= MAX_PIXELS:
+        raise BadFile(path, f"has {width} x {height} pixels, over the limit of {MAX_PIXELS}")
+    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if values is None or values.dtype != np.float32 or values.ndim != 3:
+        raise BadFile(path, "is not a Radiance HDR file")
+    return values[..., ::-1]
+
+
+def _hdr_size(path: Path) -> tuple[int, int]:
+    """Height and width from the resolution line that ends a Radiance header."""
+    with path.open("rb") as file:
+        if not file.readline(64).startswith((b"#?RADIANCE", b"#?RGBE")):
+            raise BadFile(path, "is not a Radiance HDR file")
+        for _ in range(64):
+            words = file.readline(512).split()
+            if len(words) == 4 and words[0] == b"-Y" and words[2] == b"+X":
+                return int(words[1]), int(words[3])
+    raise BadFile(path, "has no resolution line of the form -Y height +X width")
+
+
+def _without_nan(document: Any) -> Any:
+    if isinstance(document, dict):
+        return {key: _without_nan(value) for key, value in document.items()}
+    if isinstance(document, list | tuple):
+        return [_without_nan(value) for value in document]
+    return None if isinstance(document, float) and not math.isfinite(document) else document

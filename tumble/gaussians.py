@@ -1,0 +1,65 @@
+"""3D Gaussians whose opacity is tied to a signed distance (paper section 4.2).
+
+Object frame, object radius = 1. The third local axis is the *normal*, signed outward at birth; its scale is the
+*thickness* (a deviation from the paper's axis of the smallest scale: an argmin flips while training).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tumble.se3 import SO3
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """The geometry and the stage-2 colour of an object; raw parameters, as trained."""
+
+    means: Float[Tensor, "n 3"]
+    """Centres [object radius]."""
+    quats: Float[Tensor, "n 4"]
+    """Local to object rotations, wxyz, not necessarily of unit length."""
+    log_scales: Float[Tensor, "n 3"]
+    """Logarithms of the standard deviations along the local axes [log object radius]."""
+    sdf: Float[Tensor, " n"]
+    """Signed distances to the surface, positive outside [object radius]."""
+    sh: Float[Tensor, "n k 3"]
+    """Linear radiance as spherical harmonics of the object-frame view direction."""
+
+    @property
+    def R_obj_local(self) -> Float[Tensor, "n 3 3"]:
+        """Local to object rotations."""
+        return SO3(torch.nn.functional.normalize(self.quats, dim=-1)).matrix()
+
+    @property
+    def normals(self) -> Float[Tensor, "n 3"]:
+        """Outward unit normals, object frame."""
+        return self.R_obj_local[..., 2]
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the local axes [object radius]."""
+        return self.log_scales.exp()
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+def opacity(sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor, " n"]:
+    """Opacity from signed distance: 1 on the surface, falling off on both sides (eq. 8).
+
+    Equal to the paper's 4 e^{-gamma s} / (1 + e^{-gamma s})^2, in the form that does not overflow for s < 0.
+
+    Args:
+        sdf: Signed distances [object radius].
+        gamma: Sharpness [1 / object radius].
+    """
+    inside = torch.sigmoid(-gamma * sdf)
+    return 4 * inside * (1 - inside)
+
+
+def sdf_from_opacity(opacity: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor, " n"]:
+    """The non-negative signed distance [object radius] with a given opacity in (0, 1]: the inverse of eq. 8."""
+    return 2 / gamma * torch.acosh(opacity.rsqrt())

@@ -1,0 +1,1 @@
+"""Drop a matcher here."""
