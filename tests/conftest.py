@@ -5,9 +5,11 @@ from pathlib import Path
 
 from jaxtyping import install_import_hook
 
+import tests.typechecker  # noqa: F401 (the hook finds it by name)
+
 # Two test processes share two cores: one thread each, and the same floating-point sums on every machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-install_import_hook("tumble", "beartype.beartype")
+install_import_hook("tumble", "tests.typechecker.check")
 
 import pytest  # noqa: E402
 import torch  # noqa: E402

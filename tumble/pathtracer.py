@@ -103,7 +103,7 @@ class Part:
     """glTF texture coordinates: the origin is the top left corner of the texture."""
     albedo: Float[np.ndarray, "h w 3"]
     """Linear base colour."""
-    roughness: Float[np.ndarray, "g v 1"]
+    roughness: Float[np.ndarray, "rows columns 1"]
     """Perceptual roughness."""
 
 
@@ -317,7 +317,7 @@ def _mesh(part: Part, bsdf: dict[str, Any]) -> Any:
     return mesh
 
 
-def _envmap(light: Environment) -> Float[np.ndarray, "g v 3"]:
+def _envmap(light: Environment) -> Float[np.ndarray, "rows columns 3"]:
     """The light on Mitsuba's own grid, where -z is the left edge and row i lies at the polar angle pi i / (h - 1).
 
     The grid is finer than the map's, so that Mitsuba's interpolation between its texels repeats ours between our own.
@@ -354,6 +354,6 @@ def _sensor(T_cam_obj: SE3, camera: Camera) -> Any:
             "near_clip": 1e-2,
             "to_world": mi.ScalarTransform4f(T_obj_cam),
             "film": film,
-            "sampler": {"type": "independent"},
+            "sampler": {"type": "multijitter"},
         }
     )

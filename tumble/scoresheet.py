@@ -36,6 +36,8 @@ CAPTIONS = {
     "roughness": "roughness.rmse_fg",
 }
 """The number under each error picture."""
+SCALES = {"albedo": "0.25", "normal": "30°", "roughness": "0.5", "relit": "0.25"}
+"""How the ends of the colours are written."""
 LIGHT_SIZE = (144, 288)
 
 
@@ -49,27 +51,21 @@ def draw(report: dict[str, Any], predicted: Prediction, truth: Truth) -> UInt8[n
     """
     light = next(iter(sorted({*predicted.relit} & {*truth.relit})), next(iter(sorted(truth.relit)), None))
     parts = [part for part, known in _known(truth, light).items() if known]
-    columns = ("truth", "prediction")
-    headings = {"albedo": "albedo, scaled (sRGB)", "normal": "normal, object frame", "relit": f"relit: {light}"}
-    units = {"normal": "°"}
-    groups = [
-        Group(headings.get(part, part), (*columns, f"error, 0 to {TOPS[part]:g}{units.get(part, '')}"))
-        for part in parts
-    ]
+    groups = [Group(_heading(part, light), ("truth", "prediction", "error"), SCALES[part]) for part in parts]
     rows = []
     for i in _chosen(truth):
         tiles = [tile for part in parts for tile in _tiles(part, i, report, predicted, truth, light)]
         rows.append((f"{truth.names[i]}\n{truth.regions[i]}", tiles))
-    about = report["capture"]
     return sheet.draw(
         Sheet(
-            title=f"{report['prediction']} against {about['name']}",
+            title=f"Prediction {report['prediction']}, capture {report['capture']['name']}",
             subtitle=_subtitle(report),
             table=_table(report),
             groups=groups,
             rows=rows,
             strips=_lights(report, predicted, truth),
-            notes=[*_poses(report), *report["notes"]],
+            remarks=_poses(report),
+            notes=report["notes"],
         )
     )
 
@@ -77,6 +73,12 @@ def draw(report: dict[str, Any], predicted: Prediction, truth: Truth) -> UInt8[n
 def _known(truth: Truth, light: str | None) -> dict[str, bool]:
     maps = {"albedo": truth.albedo, "normal": truth.normals, "roughness": truth.roughness}
     return {**{part: value is not None for part, value in maps.items()}, "relit": light is not None}
+
+
+def _heading(part: str, light: str | None) -> str:
+    return {"albedo": "albedo, scaled (sRGB)", "normal": "normal, object frame", "relit": f"relit, {light}"}.get(
+        part, part
+    )
 
 
 def _chosen(truth: Truth) -> list[int]:
@@ -97,13 +99,25 @@ def _tiles(
     pattern = HEADLINES.get(key, HEADLINES["relit.psnr_fg_srgb"])[1]
     number = report["views"][i].get(key)
     box = crop_box(truth.foreground[i], 4)
-    mask = crop(truth.foreground[i], box).numpy()
 
     def tile(pixels: Tensor | None) -> Tile:
-        return Tile(None if pixels is None else _code_values(crop(pixels, box)))
+        return Tile(None if pixels is None else _code_values(_square(crop(pixels, box))))
 
-    heat = None if error is None else sheet.heat(crop(error, box).numpy(), mask, TOPS[part])
+    if error is None:
+        return tile(true), tile(guess), Tile(None)
+    mask = _square(crop(truth.foreground[i], box)).numpy()
+    heat = sheet.heat(_square(crop(error, box)).numpy(), mask, TOPS[part])
     return tile(true), tile(guess), Tile(heat, "" if number is None else pattern.format(number))
+
+
+def _square(x: Tensor) -> Tensor:
+    """The picture in the middle of the smallest square that holds it, zeros (or False) around it."""
+    h, w = x.shape[:2]
+    side = max(h, w)
+    square = x.new_zeros(side, side, *x.shape[2:])
+    top, left = (side - h) // 2, (side - w) // 2
+    square[top : top + h, left : left + w] = x
+    return square
 
 
 def _pictures(
@@ -183,7 +197,7 @@ def _table(report: dict[str, Any]) -> list[list[str]]:
 def _lights(report: dict[str, Any], predicted: Prediction, truth: Truth) -> Sequence[Tile]:
     if truth.light is None:
         return ()
-    exposure = 0.5 / max(float(truth.light.radiance.mean()), 1e-6)
+    exposure = 0.3 / max(float(truth.light.radiance.mean()), 1e-6)
     tiles = [Tile(_light_picture(truth.light, torch.ones(3), exposure), "true light, capture's env frame")]
     if predicted.light is None:
         return [*tiles, Tile(None, "predicted light")]
@@ -209,12 +223,12 @@ def _poses(report: dict[str, Any]) -> list[str]:
         return "not defined" if value is None else pattern.format(value)
 
     unit = " m" if report["capture"]["units"] == "m" else ""
-    lost = f", {scores['poses.lost_frames']} lost" if scores["poses.lost_frames"] else ""
+    percents = ", ".join(word(f"rotation_below_{d}_percent", "{:.0f} %") for d in (2, 5, 10))
     return [
-        f"poses of {scores['poses.posed_frames']} training frames{lost}:   "
-        f"rotation error median {word('rotation_median_degrees', '{:.2f}°')}, "
-        f"mean {word('rotation_mean_degrees', '{:.2f}°')}   |   "
-        f"ATE {word('ate', '{:.4f}')}{unit}   |   AUC {word('auc_percent', '{:.1f} %')} "
-        f"(to {scores['poses.tolerance']:.3g}{unit})   |   "
-        f"RPE {word('rpe_translation', '{:.4f}')}{unit}, {word('rpe_rotation_degrees', '{:.2f}°')}"
+        f"poses of {scores['poses.posed_frames']} training frames, {scores['poses.lost_frames']} lost",
+        f"rotation error: median {word('rotation_median_degrees', '{:.2f}°')}, "
+        f"mean {word('rotation_mean_degrees', '{:.2f}°')};  below 2°, 5°, 10°: {percents}",
+        f"position error: ATE {word('ate', '{:.4f}')}{unit},  "
+        f"AUC {word('auc_percent', '{:.1f} %')} (to {scores['poses.tolerance']:.3g}{unit})",
+        f"between neighbours: RPE {word('rpe_translation', '{:.4f}')}{unit}, {word('rpe_rotation_degrees', '{:.2f}°')}",
     ]

@@ -32,7 +32,7 @@ SHARED_ELEVATIONS = (math.radians(15), math.radians(35))
 """Every setting has seen what a view between these elevations shows [radians]."""
 TUMBLE_STEP = (math.radians(5), math.radians(12))
 """Smallest and largest turn between two hand-held frames [radians]."""
-CANDIDATES = 256
+CANDIDATES = 1024
 """Random tumbles drawn for one hand-held capture; the one that shows most of the object is taken."""
 GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -80,8 +80,9 @@ def handheld(n: int, distance: float, *, seed: int) -> SE3:
     """
     rng = torch.Generator().manual_seed(seed)
     time = torch.arange(n, dtype=torch.float64)
-    turns = _wander(rng, CANDIDATES, 3, time, period=(12, 40))
-    turns = turns / turns.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    # A turn about the viewing axis shows no new side, so axes lie mostly across it.
+    turns = _wander(rng, CANDIDATES, 3, time, period=(25, 80)) * torch.tensor([1.0, 1.0, 0.4])
+    turns = torch.nn.functional.normalize(turns, dim=-1)
     low, high = TUMBLE_STEP
     pace = 0.5 * (low + high) + 0.5 * (high - low) * torch.sin(_wander(rng, CANDIDATES, 1, time, period=(10, 30)) * 2)
     first = SO3.exp(3 * torch.randn(CANDIDATES, 3, generator=rng, dtype=torch.float64))
@@ -106,11 +107,10 @@ def _wander(
 
 
 def _coverage(wxyz: Float[Tensor, "n t 4"]) -> Float[Tensor, " n"]:
-    """How well tumbles show the object: the mean and the worst, over all sides, of the cosine to the nearest view."""
+    """How well tumbles show the object: the cosine between its worst seen side and the view nearest to that."""
     d_cam = torch.tensor([0.0, 0.0, -1.0], dtype=wxyz.dtype)
     views = SO3(wxyz).inverse() @ d_cam
-    nearest = (views @ fibonacci_sphere(128).to(wxyz).T).amax(1)
-    return nearest.mean(1) + nearest.amin(1)
+    return (views @ fibonacci_sphere(128).to(wxyz).T).amax(1).amin(1)
 
 
 def trajectory(setting: str, n: int, distance: float, *, seed: int) -> SE3:

@@ -36,6 +36,8 @@ class Group:
 
     heading: str
     columns: tuple[str, ...]
+    scale: str = ""
+    """Where the colours of `heat` end, when the last column shows it: a colour bar from 0 to here is drawn."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,10 @@ class Sheet:
     """Each with its label, of which a line break makes two lines, and one tile per column."""
     strips: Sequence[Tile] = ()
     """Wide pictures side by side under the rows, twice as wide as high."""
+    remarks: Sequence[str] = ()
+    """Lines to the right of the strips."""
     notes: Sequence[str] = ()
+    """Lines at the foot."""
 
 
 def heat(error: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], top: float) -> UInt8[np.ndarray, "h w 3"]:
@@ -72,7 +77,7 @@ def draw(sheet: Sheet) -> UInt8[np.ndarray, "h w 3"]:
     y = _draw_head(pen, sheet)
     y = _draw_table(pen, sheet.table, y, width)
     y = _draw_rows(page, pen, sheet, starts, y)
-    y = _draw_strips(page, pen, sheet.strips, y)
+    y = _draw_foot(page, pen, sheet, y)
     for note in sheet.notes:
         pen.text((MARGIN, y), note, FAINT, _font(14))
         y += LINE
@@ -106,10 +111,14 @@ def _draw_table(pen: ImageDraw.ImageDraw, table: Sequence[Sequence[str]], top: i
 def _draw_rows(page: Image.Image, pen: ImageDraw.ImageDraw, sheet: Sheet, starts: list[int], top: int) -> int:
     if not sheet.rows:
         return top
-    names = [(group.heading if i == 0 else "", name) for group in sheet.groups for i, name in enumerate(group.columns)]
-    for x, (heading, name) in zip(starts, names, strict=True):
-        pen.text((x, top), heading, TEXT, _font(17))
-        pen.text((x, top + LINE), name, FAINT, _font(14))
+    column = 0
+    for group in sheet.groups:
+        pen.text((starts[column], top), group.heading, TEXT, _font(17))
+        for name in group.columns:
+            pen.text((starts[column], top + LINE), name, FAINT, _font(14))
+            column += 1
+        if group.scale:
+            _draw_scale(page, pen, group.scale, (starts[column - 1], top + LINE))
     top += 2 * LINE
     for label, tiles in sheet.rows:
         pen.multiline_text((MARGIN, top + SIDE // 2 - 18), label, TEXT, _font(15), spacing=6)
@@ -119,11 +128,25 @@ def _draw_rows(page: Image.Image, pen: ImageDraw.ImageDraw, sheet: Sheet, starts
     return top + 12
 
 
-def _draw_strips(page: Image.Image, pen: ImageDraw.ImageDraw, strips: Sequence[Tile], top: int) -> int:
-    for number, tile in enumerate(strips):
-        x = MARGIN + LABEL + number * (2 * SIDE + GROUP_GAP)
+def _draw_scale(page: Image.Image, pen: ImageDraw.ImageDraw, end: str, corner: tuple[int, int]) -> None:
+    """The colour bar of `heat`, from 0 to `end`, at the right of a column's heading."""
+    x, y = corner
+    left, right = x + 52, x + SIDE - 6 - int(pen.textlength(end, _font(13)))
+    bar = np.tile(np.linspace(0, 1, right - left), (8, 1))
+    page.paste(Image.fromarray(heat(bar, np.full(bar.shape, True), 1.0)), (left, y + 6))
+    pen.text((left - 11, y + 1), "0", FAINT, _font(13))
+    pen.text((right + 4, y + 1), end, FAINT, _font(13))
+
+
+def _draw_foot(page: Image.Image, pen: ImageDraw.ImageDraw, sheet: Sheet, top: int) -> int:
+    x = MARGIN + LABEL
+    for tile in sheet.strips:
         _draw_tile(page, pen, tile, (x, top), (2 * SIDE, SIDE))
-    return top + SIDE + CAPTION + 16 if strips else top
+        x += 2 * SIDE + GROUP_GAP
+    for number, remark in enumerate(sheet.remarks):
+        pen.text((x, top + number * LINE), remark, FAINT if number else TEXT, _font(15))
+    tallest = max(SIDE + CAPTION if sheet.strips else 0, len(sheet.remarks) * LINE)
+    return top + tallest + 16 if tallest else top
 
 
 def _draw_tile(

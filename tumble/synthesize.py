@@ -30,6 +30,8 @@ SATURATED = 0.01
 """Share of the object's pixels that the exposure lets saturate."""
 LIGHT_ROWS = 512
 """Larger light maps are averaged down to this height: a finer sun than a third of a degree costs memory, not truth."""
+MAP_SAMPLES = 256
+"""Samples per pixel of albedo, roughness, normal and depth: they only antialias, no light is involved."""
 NOTE = "synth.json"
 """Says how a folder was made; a second call with the same options goes on where the first one stopped."""
 
@@ -48,9 +50,9 @@ class Options:
     """Height and width [pixels]."""
     fov: float = 30.0
     """Field of view [degrees]; the object fills it."""
-    samples: int = 256
+    samples: int = 400
     """Paths per pixel of a photograph."""
-    truth_samples: int = 1024
+    truth_samples: int = 2048
     """Paths per pixel of a relit picture: a score near 40 dB must not measure the truth's noise."""
     path_depth: int = 5
     """Path segments: 2 is direct light alone, each further one adds a bounce between parts of the object."""
@@ -132,11 +134,13 @@ def synthesize(model: Path, out: Path, options: Options) -> Path:
         ModuleNotFoundError: The extra `synth` is not installed.
     """
     pathtracer.mitsuba()
+    # Everything is read before anything is written.
     note = _note(model, options)
-    resuming = _claim(out, note)
     studio = _studio(model, out, options)
+    sources = _sources(options)
+    resuming = _claim(out, note)
     shots = list(_shots(options))
-    lights = _expose(studio, shots, resuming)
+    lights = _expose(studio, sources, shots, resuming)
     with Progress(transient=True) as progress:
         job = progress.add_task(f"rendering {out.name}", total=len(shots))
         for number, shot in enumerate(shots):
@@ -225,13 +229,15 @@ def _capture_light(options: Options) -> Environment:
     return light if abs(float(R_env_room.angle())) < 1e-9 else light.rotated(R_env_room.matrix().float())
 
 
-def _expose(studio: _Studio, shots: list[_Shot], resuming: bool) -> dict[str, Path]:
+def _sources(options: Options) -> dict[str, Environment]:
+    """The lights before exposure: the capture's under the empty name, in its env frame; those of relit truth."""
+    return {"": _capture_light(options)} | {Path(name).stem: _light(name) for name in options.relight}
+
+
+def _expose(studio: _Studio, sources: dict[str, Environment], shots: list[_Shot], resuming: bool) -> dict[str, Path]:
     """Choose exposures, write the lights as files, and load them from there as scenes: truth is what is on disk."""
     options, truth = studio.options, studio.out / "truth"
-    wanted = {"": truth / "light.hdr"} | {
-        Path(n).stem: truth / "lights" / f"{Path(n).stem}.hdr" for n in options.relight
-    }
-    sources = {"": _capture_light(options)} | {Path(n).stem: _light(n) for n in options.relight}
+    wanted = {name: truth / "lights" / f"{name}.hdr" if name else truth / "light.hdr" for name in sources}
     training = [shot for shot in shots if shot.region is None]
     views = [shot for shot in shots if shot.region is not None]
     for name, path in wanted.items():
@@ -269,20 +275,23 @@ def _render(studio: _Studio, shot: _Shot, number: int) -> None:
     seed = 10_000 * options.seed + number
     pixels, coverage = studio.photograph("", shot, options.samples, seed, LIGHT[options.setting])
     if shot.region is not None:
-        _render_truth(studio, shot, seed)
+        # One coverage decides about mask and truth: every object pixel of a view has truth.
+        coverage = _render_truth(studio, shot, seed)
     mask = np.where(coverage >= 0.5, OBJECT, BACKGROUND).astype(np.uint8)
     files.write_png(out / "masks" / shot.name, mask[..., None])
     files.write_png(out / "images" / shot.name, photograph(pixels))
 
 
-def _render_truth(studio: _Studio, shot: _Shot, seed: int) -> None:
+def _render_truth(studio: _Studio, shot: _Shot, seed: int) -> np.ndarray:
+    """Maps and relit pictures of an evaluation view; returns the object's coverage of its pixels."""
     truth, exr = studio.out / "truth", Path(shot.name).with_suffix(".exr").name
-    view = pathtracer.maps(studio.unlit, shot.T_cam_obj, studio.camera, samples=256)
+    view = pathtracer.maps(studio.unlit, shot.T_cam_obj, studio.camera, samples=MAP_SAMPLES)
     for name in capture_writer.MAPS:
         files.write_exr(truth / name / exr, getattr(view, name), half=name != "depth")
     for light in (name for name in studio.scenes if name not in ("", "probe")):
         pixels, _ = studio.photograph(light, shot, studio.options.truth_samples, seed, "object")
         files.write_png(truth / "relit" / light / shot.name, photograph(pixels))
+    return view.coverage
 
 
 def photograph(radiance: np.ndarray) -> np.ndarray:

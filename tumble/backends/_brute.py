@@ -45,10 +45,7 @@ def trace(
     """See `Backend.trace`."""
     n = bvh.means.shape[0]
     chunk = max(1, PAIRS // max(1, n))
-    parts = [
-        _trace(bvh, o, d, radiance)
-        for o, d in zip(origins.split(chunk), directions.split(chunk), strict=True)
-    ]
+    parts = [_trace(bvh, o, d, radiance) for o, d in zip(origins.split(chunk), directions.split(chunk), strict=True)]
     if n == 0 or not parts:
         r = origins.shape[0]
         none = torch.full((r,), -1, dtype=torch.int32, device=origins.device)
@@ -74,11 +71,7 @@ def _trace(
     w = torch.where(T[:, :-1] >= TRACE_T_MIN, alpha * T[:, :-1], 0)
     total = w.sum(1)
     blocked = 1 - total < TRACE_T_MIN
-    seen = (
-        radiance.new_zeros(len(w), 3)
-        if len(radiance) == 0
-        else torch.einsum("rn,rnc->rc", w, radiance[order])
-    )
+    seen = radiance.new_zeros(len(w), 3) if len(radiance) == 0 else torch.einsum("rn,rnc->rc", w, radiance[order])
     seen = torch.where(blocked[:, None], seen / total[:, None], seen)
     best, which = w.max(1)
     hit = torch.where(best > 0, order.gather(1, which[:, None])[:, 0], -1)

@@ -185,9 +185,7 @@ def _rays(fx_fy_cx_cy: Float[Tensor, "4"], square: tuple[slice, slice]) -> Float
 
 
 @torch.no_grad()
-def _near(
-    view: View, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], rules: Rules
-) -> Bool[Tensor, " v"]:
+def _near(view: View, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], rules: Rules) -> Bool[Tensor, " v"]:
     """A superset of the Gaussians that reach any of the rays: their bounding spheres meet the rays' cone."""
     if rules.alpha_min == 0 or view.index.numel() == 0:
         return torch.ones_like(view.index, dtype=torch.bool)

@@ -83,23 +83,27 @@ class Sheet:
     def text(self, x: float, y: float, words: str, size: float, ink: Ink, *, bold: float = 0, turn: float = 0) -> None:
         """Words centred on (x, y), drawn with a pen of width `bold`, turned clockwise by `turn` [radians]."""
         font = ImageFont.load_default(size=size * FINE)
-        left, top, right, bottom = font.getbbox(words, stroke_width=bold * FINE)
+        pen = round(bold * FINE)
+        left, top, right, bottom = font.getbbox(words, stroke_width=pen)
         # The height of a capital, not of these words: lines of text keep their distance.
         middle = (font.getbbox("H")[1] + font.getbbox("H")[3]) / 2
         half = math.ceil(max(right - left, bottom - top) / 2 + size * FINE)
         stencil = Image.new("L", (2 * half, 2 * half))
         corner = (half - (left + right) / 2, half - middle)
-        ImageDraw.Draw(stencil).text(corner, words, 255, font, stroke_width=bold * FINE)
+        ImageDraw.Draw(stencil).text(corner, words, 255, font, stroke_width=pen)
         stencil = stencil.rotate(-math.degrees(turn), Image.Resampling.BICUBIC)
         place = (round(FINE * x) - half, round(FINE * y) - half)
         for layer, fill in zip(self._layers, (ink.rgb, _level(ink)), strict=True):
             layer.paste(fill, place, stencil)
 
-    def round_text(self, radius: float, words: str, size: float, ink: Ink, *, bold: float = 0) -> None:
-        """Words around the middle of the sheet, spread over the whole circle, their feet towards the middle."""
+    def round_text(
+        self, radius: float, words: str, size: float, ink: Ink, *, bold: float = 0, clockwise: bool = True
+    ) -> None:
+        """Words spread over a whole circle around the middle; clockwise their feet point inwards, else outwards."""
+        sense = 1 if clockwise else -1
         for letter, angle in zip(words, _angles(len(words)), strict=True):
-            x, y = radius * math.sin(angle), -radius * math.cos(angle)
-            self.text(self.width / 2 + x, self.height / 2 + y, letter, size, ink, bold=bold, turn=angle)
+            x, y = radius * math.sin(angle), -sense * radius * math.cos(angle)
+            self.text(self.width / 2 + x, self.height / 2 + y, letter, size, ink, bold=bold, turn=sense * angle)
 
     def textures(self) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 1"]]:
         """Colour and roughness at the size of the chart."""
@@ -130,8 +134,8 @@ def _body(sheet: Sheet) -> None:
     rng = np.random.default_rng(7)
     _sprigs(sheet, rng)
     _borders(sheet, rng)
-    _landscape(sheet, 254, 156)
-    _front(sheet, 762, 156)
+    _landscape(sheet, 254, 149)
+    _front(sheet, 762, 149)
 
 
 def _borders(sheet: Sheet, rng: np.random.Generator) -> None:
@@ -150,7 +154,7 @@ def _borders(sheet: Sheet, rng: np.random.Generator) -> None:
 
 def _sprigs(sheet: Sheet, rng: np.random.Generator) -> None:
     """Leaves and berries around the spout and the handle."""
-    for x in [30, 478, 540, 590, 984, 430]:
+    for x in (32, 466, 508, 548, 984):
         tall, lean = 90 + 80 * rng.random(), 0.5 * rng.random() - 0.25
         for i in range(9):
             t = i / 8
@@ -158,8 +162,10 @@ def _sprigs(sheet: Sheet, rng: np.random.Generator) -> None:
             side = 0.95 if i % 2 else -0.95
             ink = (TEAL, LEAF, MUSTARD, CORAL)[rng.integers(4)] if i < 8 else CORAL
             sheet.leaf(*at, 34 - 14 * t, side * (1 - 0.6 * t) + lean, ink)
-    for _ in range(46):
+    for _ in range(90):
         x, y = rng.random() * sheet.width, 58 + 180 * rng.random()
+        if min(abs(x - 254), abs(x - 762)) < 184:
+            continue
         sheet.disc(x, y, 1.5 + 2.5 * rng.random(), BRIGHT[rng.integers(2)] if rng.random() < 0.7 else NIGHT)
 
 
@@ -191,8 +197,8 @@ def _front(sheet: Sheet, x: float, y: float) -> None:
     left, top, right, bottom = x - 170, y - 86, x + 170, y + 84
     sheet.box(left - 4, top - 4, right + 4, bottom + 4, TEAL, corner=16)
     sheet.box(left, top, right, bottom, PAPER, corner=13)
-    sheet.text(x + 4, y - 32, "tumble", 92, Ink(MUSTARD.rgb, 0.7), bold=4)
-    sheet.text(x, y - 36, "tumble", 92, Ink(CORAL.rgb, 0.25), bold=3)
+    sheet.text(x + 4, y - 29, "tumble", 86, Ink(MUSTARD.rgb, 0.7), bold=4)
+    sheet.text(x, y - 33, "tumble", 86, Ink(CORAL.rgb, 0.25), bold=3)
     sheet.box(left + 14, y + 16, right - 14, y + 19, NIGHT)
     sheet.text(x - 50, y + 32, "TURN IT IN THE LIGHT", 17, NIGHT, bold=0.6)
     for i, ink in enumerate((CORAL, MUSTARD, LEAF, TEAL, SKY, BLUSH, WOOD, NIGHT)):
@@ -200,7 +206,12 @@ def _front(sheet: Sheet, x: float, y: float) -> None:
     sheet.star(right - 46, y + 48, 33, Ink(MUSTARD.rgb, 0.3), tips=14, waist=0.78)
     sheet.text(right - 46, y + 43, "0.33", 19, NIGHT, bold=0.8)
     sheet.text(right - 46, y + 58, "LITRE", 9, NIGHT, bold=0.4)
-    for dx, dy, size, ink in ((-150, -70, 9, TEAL), (146, -68, 8, MUSTARD), (122, -74, 5, CORAL), (-128, -76, 4, CORAL)):
+    for dx, dy, size, ink in (
+        (-154, -72, 7, TEAL),
+        (152, -66, 9, MUSTARD),
+        (138, -76, 5, CORAL),
+        (-155, -52, 4, CORAL),
+    ):
         sheet.star(x + dx, y + dy, size, ink)
     sheet.text(x - 78, y + 77, "shape - motion - material - light", 9.5, NIGHT, bold=0.2)
 
@@ -215,7 +226,7 @@ def _lid(sheet: Sheet) -> None:
         spread = [(angle - 0.10, 24), (angle + 0.10, 24), (angle + 0.05, reach), (angle - 0.05, reach)]
         sheet.polygon([(cx + r * math.sin(a), cy - r * math.cos(a)) for a, r in spread], ink)
     sheet.disc(cx, cy, 30, Ink(MUSTARD.rgb, 0.2))
-    sheet.round_text(77, "TURN * LOOK * TURN AGAIN * TUMBLE * ", 17, Ink(CREAM.rgb, 0.2), bold=0.7)
+    sheet.round_text(76, "TURN * LOOK * TURN AGAIN * TUMBLE * ", 17, Ink(CREAM.rgb, 0.2), bold=0.7, clockwise=False)
     for i, angle in enumerate(_angles(40)):
         ink = Ink(BRIGHT[(i * i // 3 + i) % 5].rgb, 0.2)
         sheet.disc(cx + 94 * math.sin(angle), cy - 94 * math.cos(angle), 2.2 + (i * 5 % 3), ink)
@@ -255,24 +266,27 @@ def _spout(sheet: Sheet) -> None:
 
 
 def _handle(sheet: Sheet) -> None:
-    """Wound with tape: slanting bands of changing colour and width."""
+    """Wound with tape: chevrons of changing colour and width."""
     sheet.box(0, 0, sheet.width, sheet.height, WOOD)
-    y = -sheet.width * 0.5
+    middle, inks = sheet.width / 2, (CORAL, NIGHT, MUSTARD, CREAM, TEAL)
+    y = -24.0
+    for n, choice in enumerate((0, 1, 3, 2, 4, 0, 3, 1, 2, 0, 4, 3, 1, 0, 2, 4, 1, 3, 0, 2)):
+        # A chevron is as high at its left end as at its right: the pattern closes on itself at the seam.
+        thick = 9 + (n * n) % 13
+        tip = [(0, y), (middle, y + 24), (sheet.width, y)]
+        sheet.polygon([*tip, *[(x, below + thick) for x, below in reversed(tip)]], inks[choice])
+        y += thick + 9
     for i in range(16):
-        width = 7 + (i * i) % 9
-        ink = (CORAL, NIGHT, MUSTARD, BARK, CREAM)[(i * 3 + i // 4) % 5]
-        # A band climbs by two whole turns' worth of pitch, so that it closes on itself at the seam.
-        sheet.polygon([(0, y + 50), (sheet.width, y), (sheet.width, y + width), (0, y + 50 + width)], ink)
-        y += 18
-    for i in range(9):
-        sheet.disc((i * 37) % sheet.width, 14 + 22 * i, 3.2, Ink(PAPER.rgb, 0.3))
+        sheet.disc(10 + (i * 29) % (sheet.width - 20), 14 + 27 * i, 3.5, Ink(PAPER.rgb, 0.3))
 
 
 def _knob(sheet: Sheet) -> None:
     """Turned wood with painted segments."""
     sheet.box(0, 0, sheet.width, sheet.height, WOOD)
-    for i in range(7):
-        left = i * sheet.width / 7
-        sheet.box(left, 0, left + sheet.width / 9, 44, (CORAL, BARK, CREAM, BARK, MUSTARD, BARK, TEAL)[i])
-    sheet.box(0, 46, sheet.width, 51, BARK)
-    sheet.box(0, 84, sheet.width, sheet.height, MUSTARD)
+    inks = (CORAL, BARK, CREAM, NIGHT, MUSTARD, BARK, TEAL)
+    for i, ink in enumerate(inks):
+        left = i * sheet.width / len(inks)
+        sheet.box(left, 0, left + sheet.width / 9, 64, ink)
+        sheet.disc(left + sheet.width / 18, 74, 3 + i % 3, ink)
+    sheet.box(0, 84, sheet.width, 90, BARK)
+    sheet.box(0, 108, sheet.width, sheet.height, MUSTARD)

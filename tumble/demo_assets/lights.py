@@ -65,7 +65,14 @@ def _room(d_env: Rays) -> Rays:
 
     # Left, right, floor, ceiling, front, back: a cool and a warm side.
     paint = torch.tensor(
-        [[0.50, 0.58, 0.66], [0.74, 0.46, 0.30], [0.36, 0.24, 0.16], [0.82, 0.80, 0.76], [0.62, 0.60, 0.54], [0.44, 0.50, 0.42]]
+        [
+            [0.50, 0.58, 0.66],
+            [0.74, 0.46, 0.30],
+            [0.36, 0.24, 0.16],
+            [0.82, 0.80, 0.76],
+            [0.62, 0.60, 0.54],
+            [0.44, 0.50, 0.42],
+        ]
     )[wall]
     paint = _furnished(paint, wall, hit)
     window, lamp = _on_walls(WINDOW), 0.85 * _on_walls(LAMP)
@@ -106,8 +113,11 @@ def _furnished(paint: Rays, wall: Tensor, hit: Rays) -> Rays:
     picture = (wall == 1) & _inside(z, y, -1.3, -0.3, -0.1, 0.8)
     paint = torch.where(picture[:, None], torch.tensor([0.10, 0.16, 0.30]), paint)
     shelf = (wall == 5) & _inside(x, y, -0.9, 1.0, -1.1, 0.5)
-    book = torch.sin(57.0 * x.div(0.07).floor() + 13.0 * y.div(0.4).floor())
-    spines = 0.3 + 0.25 * torch.stack([book, torch.sin(5 * book), torch.sin(9 * book)], -1)
+    number = 7 * x.div(0.07).floor() + 3 * y.div(0.4).floor()
+    cloth = torch.tensor(
+        [[0.42, 0.16, 0.12], [0.12, 0.24, 0.30], [0.55, 0.42, 0.22], [0.60, 0.56, 0.48], [0.16, 0.26, 0.18]]
+    )
+    spines = cloth[number.square().div(5).floor().remainder(5).long()]
     return torch.where(shelf[:, None], spines * (y.remainder(0.4) > 0.05)[:, None], paint)
 
 
@@ -130,7 +140,7 @@ def _with_window(radiance: Rays, wall: Tensor, hit: Rays) -> Rays:
     radiance = torch.where(frame[:, None], torch.tensor([0.55, 0.58, 0.62]), radiance)
     pane = frame & (along.add(0.95).remainder(0.65) < 0.58) & (up.add(0.70).remainder(0.72) < 0.66)
     pane = pane & _inside(along, up, -0.95, 0.95, -0.70, 0.70)
-    sky = torch.tensor([5.0, 6.6, 8.6]) * (1 + 0.35 * up)[:, None]
+    sky = torch.tensor([7.5, 9.6, 12.0]) * (1 + 0.35 * up)[:, None]
     hedge = torch.tensor([0.9, 1.3, 0.6])
     above = (up > -0.42 + 0.06 * torch.sin(9 * along))[:, None]
     return torch.where(pane[:, None], torch.where(above, sky, hedge), radiance)
@@ -141,7 +151,7 @@ def _with_lamp(radiance: Rays, d_env: Rays) -> Rays:
     angle = _angle_to(LAMP, d_env)
     glow = 0.5 * torch.exp(-((angle - LAMP_SIZE).clamp_min(0) / 0.16))
     radiance = radiance + glow * torch.tensor([1.0, 0.68, 0.36])
-    globe = (0.7 + 0.3 * (1 - (angle / LAMP_SIZE).square()).clamp_min(0)) * torch.tensor([62.0, 43.0, 23.0])
+    globe = (0.7 + 0.3 * (1 - (angle / LAMP_SIZE).square()).clamp_min(0)) * torch.tensor([52.0, 38.0, 23.0])
     return torch.where(angle < LAMP_SIZE, globe, radiance)
 
 
@@ -149,7 +159,7 @@ def _with_lamp(radiance: Rays, d_env: Rays) -> Rays:
 
 
 def _sunset(d_env: Rays) -> Rays:
-    up = d_env[:, 1:]
+    up = d_env[:, 1:2]
     angle = _angle_to(SUN, d_env)
     toward = torch.exp(-((angle / 0.9).square()))
     height = up.clamp_min(0)
@@ -159,21 +169,31 @@ def _sunset(d_env: Rays) -> Rays:
     sky = sky + 2.2 * torch.exp(-angle / 0.12) * torch.tensor([1.0, 0.62, 0.28])
 
     # Long banks of cloud: waves on a plane high above, lit from the side of the sun.
-    plane = d_env[:, ::2] / (height + 0.12)
-    wave = torch.sin(1.7 * plane[:, :1] + 0.9) + torch.sin(0.8 * plane[:, :1] + 3.1 * plane[:, 1:]) + torch.sin(
-        4.3 * plane[:, 1:] - 1.1 * plane[:, :1]
-    )
-    cloud = ((wave - 0.6) / 1.2).clamp(0, 1) * (height / 0.2).clamp(0, 1)
+    plane = d_env[:, ::2] / (height + 0.12) @ torch.tensor([[0.9, -0.4], [0.4, 0.9]])
+    wave = _waves(plane * torch.tensor([0.45, 1.5])) - 0.25
+    cloud = (wave / 1.1).clamp(0, 1) * (height / 0.15).clamp(0, 1)
     lit = torch.tensor([0.42, 0.30, 0.34]) + 1.3 * toward * torch.tensor([1.0, 0.48, 0.26])
     sky = sky * (1 - 0.8 * cloud) + 0.8 * cloud * lit
     sky = torch.where(angle < SUN_SIZE, torch.tensor([330.0, 200.0, 85.0]), sky)
 
     turn = torch.atan2(d_env[:, :1], -d_env[:, 2:])
     hills = 0.05 + 0.03 * torch.sin(3 * turn + 0.5) + 0.015 * torch.sin(11 * turn)
-    stubble = 1 + 0.25 * torch.sin(6 * d_env[:, :1] / up.abs().clamp_min(0.03))
-    field = (0.10 + 0.30 * toward) * stubble * torch.tensor([0.95, 0.70, 0.32])
+    ground = d_env[:, ::2] / up.abs().clamp_min(0.02)
+    patches = 1 + 0.18 * _waves(0.6 * ground) * (up.abs() / 0.3).clamp_max(1)
+    field = (0.10 + 0.30 * toward) * patches * torch.tensor([0.95, 0.70, 0.32])
     dark = torch.tensor([0.05, 0.055, 0.075])
     return torch.where(up > hills, sky, torch.where(up > 0, dark, field))
+
+
+def _waves(at: Float[Tensor, "n 2"]) -> Float[Tensor, "n 1"]:
+    """A few sine waves across each other, each bent by the one before: about -2 to 2, without visible repeats."""
+    total, bend = torch.zeros_like(at[:, :1]), torch.zeros_like(at[:, :1])
+    for octave, strength in enumerate((1.0, 0.6, 0.4, 0.25)):
+        turn = 1.9 * octave + 0.4
+        across = at @ torch.tensor([[math.cos(turn)], [math.sin(turn)]])
+        bend = torch.sin(1.8**octave * across + 1.3 * bend + octave)
+        total = total + strength * bend
+    return total
 
 
 def _angle_to(direction: Colour, d_env: Rays) -> Float[Tensor, "n 1"]:

@@ -32,8 +32,9 @@ Points = Sequence[tuple[float, float]]
 class Chart:
     """A rectangle of the atlas [pixels] and how a surface is laid on it."""
 
-    kind: Literal["strip", "top", "bottom"]
-    """"top" and "bottom" are discs: with the axis at the first or the last row."""
+    kind: Literal["strip", "lying", "top", "bottom"]
+    """"lying" is a strip turned a quarter to the left; "top" and "bottom" are discs, with the axis at the profile's first
+    or last point."""
     left: int
     top: int
     width: int
@@ -45,14 +46,14 @@ CHARTS = {
     "lid": Chart("top", 4, 304, 204, 204),
     "base": Chart("bottom", 216, 304, 204, 204),
     "spout": Chart("strip", 428, 304, 150, 204),
-    "handle": Chart("strip", 586, 304, 100, 204),
-    "knob": Chart("strip", 694, 304, 160, 100),
-    "lid_under": Chart("bottom", 862, 304, 100, 100),
-    "body_top": Chart("top", 694, 412, 40, 40),
-    "spout_hole": Chart("top", 742, 412, 40, 40),
-    "spout_end": Chart("bottom", 790, 412, 40, 40),
-    "handle_start": Chart("top", 838, 412, 40, 40),
-    "handle_end": Chart("bottom", 886, 412, 40, 40),
+    "handle": Chart("lying", 586, 304, 430, 66),
+    "knob": Chart("strip", 586, 378, 170, 130),
+    "lid_under": Chart("bottom", 764, 378, 130, 130),
+    "body_top": Chart("top", 902, 378, 60, 60),
+    "spout_hole": Chart("top", 970, 378, 46, 46),
+    "spout_end": Chart("bottom", 970, 432, 46, 46),
+    "handle_start": Chart("top", 902, 446, 26, 26),
+    "handle_end": Chart("bottom", 936, 446, 26, 26),
 }
 
 
@@ -91,8 +92,10 @@ def parts() -> dict[str, Mesh]:
     )
     nozzle = [(-0.0960, 0.1080), (-0.0850, 0.0990), (-0.0760, 0.0790), (-0.0660, 0.0540), (-0.0400, 0.0330)]
     outside = [(0.0052, 0.010), (0.0056, 0.001), (0.0068, -0.0012), (0.0082, 0.0006), (0.0080, 0.008)]
-    outside += [(0.0092, 0.035), (0.0128, 0.065), (0.0172, 0.0990)]
+    foot = _lengths(_smooth(nozzle, 200))[-1]
+    outside += [(0.0092, 0.035), (0.0128, 0.065), (0.0165, foot)]
     grip = [(0.0330, 0.0890), (0.0560, 0.1000), (0.0870, 0.0960), (0.0900, 0.0620), (0.0740, 0.0290), (0.0440, 0.0230)]
+    end = _lengths(_smooth(grip, 200))[-1]
     return {
         "body": _solid(upright, [(body[0], 3, "body_top"), (body[1], 32, "body"), (base, 9, "base")], COLUMNS),
         "lid": _solid(upright, [(lid, 22, "lid"), (lid_under, 4, "lid_under")], COLUMNS),
@@ -100,13 +103,13 @@ def parts() -> dict[str, Mesh]:
         "spout": _solid(
             nozzle,
             [([(0, 0.010), (0.0052, 0.010)], 2, "spout_hole"), (outside, 30, "spout")]
-            + [([(0.0172, 0.0990), (0, 0.0990)], 2, "spout_end")],
+            + [([(0.0165, foot), (0, foot)], 2, "spout_end")],
             28,
         ),
         "handle": _solid(
             grip,
-            [([(0, 0), (0.0082, 0)], 2, "handle_start"), ([(0.0082, 0), (0.0082, 0.1320)], 36, "handle")]
-            + [([(0.0082, 0.1320), (0, 0.1320)], 2, "handle_end")],
+            [([(0, 0), (0.0082, 0)], 2, "handle_start"), ([(0.0082, 0), (0.0082, end)], 36, "handle")]
+            + [([(0.0082, end), (0, end)], 2, "handle_end")],
             20,
             flatness=0.62,
         ),
@@ -181,6 +184,9 @@ def _lay(chart: Chart, length: Float[np.ndarray, " r"], columns: int) -> Float[n
     if chart.kind == "strip":
         u, v = np.meshgrid(turn, along)
         return np.stack([chart.left + u * chart.width, chart.top + v * chart.height], -1)
+    if chart.kind == "lying":
+        u, v = np.meshgrid(1 - turn, along)
+        return np.stack([chart.left + v * chart.width, chart.top + u * chart.height], -1)
     angle = 2 * math.pi * (turn - 0.75)
     radius = (along if chart.kind == "top" else 1 - along)[:, None] * (chart.width / 2 - 1)
     # Looking at the pot from above, +z is at the lower edge of the picture; from below, at the upper one.
@@ -220,11 +226,15 @@ def atlas() -> tuple[UInt8[np.ndarray, "512 1024 3"], UInt8[np.ndarray, "512 102
     packed = np.zeros_like(colour)
     packed[..., 1] = 128
     for name, chart in CHARTS.items():
-        printed, roughness = label.paint(name, chart.width, chart.height).textures()
+        lying = chart.kind == "lying"
+        across, along = (chart.height, chart.width) if lying else (chart.width, chart.height)
+        printed, roughness = (
+            np.rot90(_framed(layer), int(lying)) for layer in label.paint(name, across, along).textures()
+        )
         rows = slice(chart.top - GUTTER, chart.top + chart.height + GUTTER)
         columns = slice(chart.left - GUTTER, chart.left + chart.width + GUTTER)
-        colour[rows, columns] = _framed(printed)
-        packed[rows, columns, 1:2] = _framed(roughness)
+        colour[rows, columns] = printed
+        packed[rows, columns, 1:2] = roughness
     return colour, packed
 
 
@@ -251,9 +261,7 @@ def write_object(path: Path) -> None:
         # trimesh counts v upwards.
         uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1)
         visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-        solid = trimesh.Trimesh(
-            mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False
-        )
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False)
         scene.add_geometry(solid, node_name=name, geom_name=name)
     data = scene.export(file_type="glb", include_normals=True)
     files.write_whole(path, lambda partial: partial.write_bytes(data))

@@ -1,14 +1,20 @@
 // The plain C ABI of the CPU backend. One translation unit, no C or C++ library.
 #include "bin.h"
+#include "bvh.h"
 #include "composite.h"
 #include "parallel.h"
 #include "project.h"
+#include "shade.h"
 
 #define API extern "C" __attribute__((visibility("default")))
 
 API int lanes() { return LANES; }
 
-API int raster_size() { return sizeof(Raster); }
+// For the caller to compare with its own.
+API int sizes(int which) {
+    const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(Leaf), sizeof(Node)};
+    return all[which];
+}
 
 // Project, sort and count: how many pairs of a Gaussian and a tile there will be.
 API int raster_prepare(Raster* r) {
@@ -62,4 +68,29 @@ API void raster_adjoint(Raster* r) {
         r->v_camera[j] = 0;
         for (int part = 0; part < r->threads; part++) r->v_camera[j] += r->camera_parts[part * CAMERA + j];
     }
+}
+
+API void bvh_build(Bvh* t, float* W) {
+    leaf_fields(*t, W);
+    sort_along_curve(*t);
+    fill_tree(*t, W);
+}
+
+API void rays_trace(const Rays* r) {
+    parallel(r->threads, [=](int share) { trace_share(*r, share); });
+}
+API void rays_visible(const Rays* r) {
+    parallel(r->threads, [=](int share) { visible_share(*r, share); });
+}
+API void rays_blockers(const Rays* r) {
+    parallel(r->threads, [=](int share) { blockers_share(*r, share); });
+}
+
+API void shade_forward(const Shade* s) {
+    parallel(s->threads, [=](int share) { shade_share(*s, share); });
+}
+API void shade_adjoint(const Shade* s) {
+    parallel(s->threads, [=](int share) { shade_adjoint_share(*s, share); });
+    add_parts(s->v_radiance, s->radiance_parts, (i64)3 * s->stride, s->threads);
+    add_parts(s->v_blocker_radiance, s->blocker_parts, (i64)3 * s->n_blockers, s->threads);
 }

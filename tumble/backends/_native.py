@@ -1,0 +1,118 @@
+"""Compile the kernels of `native/` on first use, keep them in a user cache, and load them.
+
+A *build* is one shared library, named by a hash of everything that decides its machine code: sources, flags, compiler
+and processor. Processes that start at once may compile the same build twice; each puts a whole file in place.
+"""
+
+import contextlib
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+SOURCES = Path(__file__).parent / "native"
+FLAGS = "-std=c++17 -O3 -fPIC -shared -fvisibility=hidden -fno-exceptions -fno-rtti -fno-math-errno -Wno-psabi".split()
+"""Never -ffast-math: it folds the rounding trick of the kernels' exp away."""
+VARIANTS = (("-march=native", "-fopenmp"), ("-march=native",), ("-fopenmp",), ())
+"""Tried in this order: some compilers lack OpenMP, some do not know their own processor."""
+COMPILERS = ("c++", "g++", "clang++")
+
+
+class CannotCompile(RuntimeError):
+    """There is no compiler, or it fails; the message says which and what to do."""
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The compiled kernels of this machine.
+
+    Raises:
+        CannotCompile: There is no working C++ compiler.
+    """
+    compiler = find_compiler()
+    name = f"kernels-{_build_hash(compiler)}.so"
+    for folder in _cache_folders():
+        path = folder / name
+        if path.is_file():
+            return ctypes.CDLL(str(path))
+    path = _writable(_cache_folders()) / name
+    compile_to(path, compiler)
+    return ctypes.CDLL(str(path))
+
+
+def find_compiler() -> str:
+    """Path of the C++ compiler: $CXX if set, else the system's.
+
+    Raises:
+        CannotCompile: There is none.
+    """
+    wanted = [os.environ["CXX"]] if os.environ.get("CXX") else COMPILERS
+    for name in wanted:
+        path = shutil.which(name)
+        if path:
+            return path
+    raise CannotCompile(
+        f"no C++ compiler ({', '.join(wanted)}) on the PATH; install one "
+        "(Debian: apt install g++; macOS: xcode-select --install; conda: conda install cxx-compiler)"
+    )
+
+
+def compile_to(path: Path, compiler: str) -> None:
+    """Compile the kernels to a shared library; the file appears whole or not at all.
+
+    Raises:
+        CannotCompile: No variant of the flags works; the message ends with what the compiler said.
+    """
+    handle, partial = tempfile.mkstemp(prefix=".partial-", suffix=".so", dir=path.parent)
+    os.close(handle)
+    try:
+        said = ""
+        for variant in VARIANTS:
+            command = [compiler, *FLAGS, *variant, str(SOURCES / "kernels.cpp"), "-o", partial]
+            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            if run.returncode == 0:
+                Path(partial).replace(path)
+                return
+            said = run.stderr
+        raise CannotCompile(
+            f"{compiler} cannot compile the kernels; set CXX to another compiler. It says: {said[-400:]}"
+        )
+    finally:
+        Path(partial).unlink(missing_ok=True)
+
+
+def _build_hash(compiler: str) -> str:
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    parts = [version, compiler, *FLAGS, str(VARIANTS), platform.platform(), platform.processor(), _cpu_features()]
+    parts += [path.name + path.read_text() for path in sorted(SOURCES.iterdir()) if path.suffix in (".h", ".cpp")]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+def _cpu_features() -> str:
+    """What -march=native looks at: a home folder may be shared by machines of several kinds."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return "\n".join(sorted({x for x in lines if x.startswith(("flags", "Features", "model name"))}))
+    return ""
+
+
+def _cache_folders() -> list[Path]:
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tumble"
+    return [user, Path(tempfile.gettempdir()) / f"tumble-{os.getuid() if hasattr(os, 'getuid') else 'user'}"]
+
+
+def _writable(folders: list[Path]) -> Path:
+    """The first folder that can be made, is ours and is not open to others: a library is code."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if os.access(folder, os.W_OK):
+                return folder
+    raise CannotCompile(
+        f"none of {', '.join(map(str, folders))} can be written; set XDG_CACHE_HOME to a folder that can"
+    )

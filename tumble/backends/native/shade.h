@@ -1,0 +1,192 @@
+// Lambert + GGX of a point under directions shared by all points, LANES directions at a time, and its adjoint. The
+// formulas are in `Backend.shade`; f below is the specular part. Directions and radiance come as three rows of numbers
+// each, padded with zeros to whole vectors; a padding direction is below every horizon.
+#pragma once
+#include "parallel.h"
+#include "simd.h"
+
+struct Shade {
+    const float *normal, *albedo, *roughness, *view, *directions, *radiance;
+    const int *visibility, *blocker;
+    const float* blocker_radiance;
+    int n_points, n_directions, stride, words, n_blockers, threads;   // stride: n_directions padded
+    int blocker_point_stride, blocker_direction_stride;
+    float f0, roughness_min;
+    float* out;
+    // Gradients: in, per share, out.
+    const float* v_out;
+    float *radiance_parts, *blocker_parts;
+    float *v_normal, *v_albedo, *v_roughness, *v_view, *v_radiance, *v_blocker_radiance;
+};
+
+// One point, lane-independent.
+struct Point {
+    float n[3], v[3], C[3], n_v, r, a, aa, k, g_v, scale;   // C = n x v
+};
+INLINE Point point_at(const Shade& s, i64 p) {
+    Point o;
+    for (int i = 0; i < 3; i++) o.n[i] = s.normal[3 * p + i], o.v[i] = s.view[3 * p + i];
+    o.C[0] = o.n[1] * o.v[2] - o.n[2] * o.v[1], o.C[1] = o.n[2] * o.v[0] - o.n[0] * o.v[2];
+    o.C[2] = o.n[0] * o.v[1] - o.n[1] * o.v[0];
+    o.n_v = o.n[0] * o.v[0] + o.n[1] * o.v[1] + o.n[2] * o.v[2];
+    o.r = fmax2(s.roughness[p], s.roughness_min);
+    o.a = o.r * o.r, o.aa = o.a * o.a, o.k = (o.r + 1) * (o.r + 1) * 0.125f;
+    o.g_v = fmax2(o.n_v, 0) * (1 - o.k) + o.k;
+    o.scale = 12.566370614f / s.n_directions;
+    return o;
+}
+
+// One point under a vector of directions.
+struct Lobe {
+    vf w[3], n_w, HH, C[3], n_H, inv_num, t_num, vh, m, m4, F, g_w, rest, f;   // f = F rest
+    vi exists;
+};
+INLINE vf cosine(const Shade& s, const Point& p, int j, vf* w) {
+    for (int i = 0; i < 3; i++) w[i] = load(s.directions + i * s.stride + j);
+    return p.n[0] * w[0] + p.n[1] * w[1] + p.n[2] * w[2];
+}
+INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
+    o.HH = 2.0f + 2.0f * (p.v[0] * o.w[0] + p.v[1] * o.w[1] + p.v[2] * o.w[2]);
+    o.exists = o.HH > 1e-6f;
+    o.HH = pick(o.exists, o.HH, splat(1.0f));
+    o.C[0] = p.n[1] * o.w[2] - p.n[2] * o.w[1] + p.C[0], o.C[1] = p.n[2] * o.w[0] - p.n[0] * o.w[2] + p.C[1];
+    o.C[2] = p.n[0] * o.w[1] - p.n[1] * o.w[0] + p.C[2];
+    o.n_H = o.n_w + p.n_v;
+    o.t_num = o.C[0] * o.C[0] + o.C[1] * o.C[1] + o.C[2] * o.C[2] + p.aa * o.n_H * o.n_H;   // t |H|^2
+    o.g_w = vmax(o.n_w, vf{}) * (1 - p.k) + p.k;
+    o.vh = 0.5f * vsqrt(o.HH), o.m = 1.0f - o.vh;
+    vf m2 = o.m * o.m;
+    o.m4 = m2 * m2;
+    o.F = s.f0 + (1 - s.f0) * o.m * o.m4;
+    vf x = o.HH / o.t_num;
+    o.rest = keep(o.exists, (p.aa * 0.0795774715f / p.g_v) * x * x / o.g_w);
+    o.f = o.F * o.rest;
+}
+
+// What arrives along a vector of directions, given which are in sight and lit at all.
+INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
+    float lanes[3][LANES];
+    u32 blocked = lit & ~seen;
+    vi in_sight;
+    for (int l = 0; l < LANES; l++) in_sight[l] = -(int)(seen >> l & 1);
+    for (int ch = 0; ch < 3; ch++) L[ch] = keep(in_sight, load(s.radiance + ch * s.stride + j));
+    if (!blocked || !s.n_blockers) return;
+    for (int ch = 0; ch < 3; ch++) store(lanes[ch], L[ch]);
+    for (; blocked; blocked &= blocked - 1) {
+        int l = __builtin_ctz(blocked);
+        int b = s.blocker[p * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
+        for (int ch = 0; ch < 3 && b >= 0; ch++) lanes[ch][l] = s.blocker_radiance[3 * (i64)b + ch];
+    }
+    for (int ch = 0; ch < 3; ch++) L[ch] = load(lanes[ch]);
+}
+
+// Visibility bits of the directions j ..; a vector never straddles two words.
+INLINE u32 seen_at(const Shade& s, i64 p, int j) {
+    return (u32)s.visibility[p * s.words + j / 32] >> j % 32 & ((1ull << LANES) - 1);
+}
+
+static void shade_share(const Shade& s, int share) {
+    for (i64 p = share; p < s.n_points; p += s.threads) {
+        Point o = point_at(s, p);
+        vf diffuse[3] = {}, specular[3] = {};
+        for (int j = 0; j < s.stride; j += LANES) {
+            Lobe b;
+            b.n_w = cosine(s, o, j, b.w);
+            u32 lit = bits(b.n_w > 0.0f), seen = seen_at(s, p, j) & lit;
+            if (!(s.n_blockers ? lit : seen)) continue;
+            lobe_at(s, o, b);
+            vf L[3], cos = vmax(b.n_w, vf{}), f_cos = b.f * cos;
+            arriving(s, p, j, seen, lit, L);
+            for (int ch = 0; ch < 3; ch++) diffuse[ch] += L[ch] * cos, specular[ch] += L[ch] * f_cos;
+        }
+        for (int ch = 0; ch < 3; ch++)
+            s.out[3 * p + ch] = o.scale * (s.albedo[3 * p + ch] * 0.318309886f * sum_of(diffuse[ch]) + sum_of(specular[ch]));
+    }
+}
+
+// Sums over directions that make a point's gradient.
+struct PointSums {
+    vf n[3], v[3], albedo[3], g_v, n_v, k, a;
+};
+
+INLINE void lobe_adjoint(const Shade& s, const Point& p, const Lobe& b, vf v_f, vf v_n_w, PointSums& sum) {
+    vf over_f = v_f * b.f, v_num = -2.0f * over_f / b.t_num;   // d/d(t |H|^2)
+    sum.g_v += over_f;
+    vf v_g_w = -over_f / b.g_w, facing = vmax(b.n_w, vf{});
+    sum.k += v_g_w * (1.0f - facing);
+    v_n_w += v_g_w * (1 - p.k);
+    sum.a += over_f * (2.0f / p.a) + v_num * (2.0f * p.a) * b.n_H * b.n_H;
+    vf v_n_H = v_num * (2.0f * p.aa) * b.n_H;
+    v_n_w += v_n_H, sum.n_v += v_n_H;
+    // f ~ |H|^4 F(|H|); d(v.h)/d|H|^2 = 1 / (8 v.h), and |H|^2 = 2 + 2 v.w.
+    vf v_F = v_f * b.rest, v_HH = 2.0f * over_f / b.HH - v_F * (5.0f * (1 - s.f0)) * b.m4 / (8.0f * b.vh);
+    vf v_vw = keep(b.exists, 2.0f * v_HH), H[3], c[3];
+    for (int i = 0; i < 3; i++) H[i] = b.w[i] + p.v[i], c[i] = 2.0f * v_num * b.C[i];
+    // C = n x H.
+    sum.n[0] += H[1] * c[2] - H[2] * c[1], sum.n[1] += H[2] * c[0] - H[0] * c[2], sum.n[2] += H[0] * c[1] - H[1] * c[0];
+    sum.v[0] += c[1] * p.n[2] - c[2] * p.n[1], sum.v[1] += c[2] * p.n[0] - c[0] * p.n[2];
+    sum.v[2] += c[0] * p.n[1] - c[1] * p.n[0];
+    for (int i = 0; i < 3; i++) sum.n[i] += v_n_w * b.w[i], sum.v[i] += v_vw * b.w[i];
+}
+
+static void shade_adjoint_share(const Shade& s, int share) {
+    float *v_radiance = s.radiance_parts + (i64)share * 3 * s.stride;
+    float *v_blocker = s.blocker_parts + (i64)share * 3 * s.n_blockers;
+    clear(v_radiance, (i64)12 * s.stride), clear(v_blocker, (i64)12 * s.n_blockers);
+    for (i64 p = share; p < s.n_points; p += s.threads) {
+        Point o = point_at(s, p);
+        PointSums sum = {};
+        float seed[3], seed_diffuse[3];
+        for (int ch = 0; ch < 3; ch++) {
+            seed[ch] = s.v_out[3 * p + ch] * o.scale;
+            seed_diffuse[ch] = seed[ch] * s.albedo[3 * p + ch] * 0.318309886f;
+        }
+        for (int j = 0; j < s.stride; j += LANES) {
+            Lobe b;
+            b.n_w = cosine(s, o, j, b.w);
+            u32 lit = bits(b.n_w > 0.0f), seen = seen_at(s, p, j) & lit;
+            if (!(s.n_blockers ? lit : seen)) continue;
+            lobe_at(s, o, b);
+            vf L[3], cos = vmax(b.n_w, vf{}), v_L[3];
+            arriving(s, p, j, seen, lit, L);
+            for (int ch = 0; ch < 3; ch++)
+                v_L[ch] = cos * (seed_diffuse[ch] + seed[ch] * b.f), sum.albedo[ch] += L[ch] * cos;
+            vf specular = seed[0] * L[0] + seed[1] * L[1] + seed[2] * L[2];
+            vf diffuse = seed_diffuse[0] * L[0] + seed_diffuse[1] * L[1] + seed_diffuse[2] * L[2];
+            vf v_n_w = keep(b.n_w > 0.0f, diffuse + b.f * specular);
+            lobe_adjoint(s, o, b, specular * cos, v_n_w, sum);
+            vi in_sight;
+            for (int l = 0; l < LANES; l++) in_sight[l] = -(int)(seen >> l & 1);
+            for (int ch = 0; ch < 3; ch++) {
+                float* to = v_radiance + ch * s.stride + j;
+                store(to, load(to) + keep(in_sight, v_L[ch]));
+            }
+            u32 blocked = s.n_blockers ? lit & ~seen : 0;
+            if (!blocked) continue;
+            float lanes[3][LANES];
+            for (int ch = 0; ch < 3; ch++) store(lanes[ch], v_L[ch]);
+            for (; blocked; blocked &= blocked - 1) {
+                int l = __builtin_ctz(blocked);
+                int at = s.blocker[p * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
+                for (int ch = 0; ch < 3 && at >= 0; ch++) v_blocker[3 * (i64)at + ch] += lanes[ch][l];
+            }
+        }
+        float v_g_v = -sum_of(sum.g_v) / o.g_v, v_n_v = sum_of(sum.n_v) + (o.n_v >= 0 ? v_g_v * (1 - o.k) : 0);
+        float v_k = sum_of(sum.k) + v_g_v * (1 - fmax2(o.n_v, 0));
+        float v_r = sum_of(sum.a) * 2 * o.r + v_k * (o.r + 1) * 0.25f;
+        s.v_roughness[p] = s.roughness[p] >= s.roughness_min ? v_r : 0;
+        for (int i = 0; i < 3; i++) {
+            s.v_normal[3 * p + i] = sum_of(sum.n[i]) + v_n_v * o.v[i];
+            s.v_view[3 * p + i] = sum_of(sum.v[i]) + v_n_v * o.n[i];
+            s.v_albedo[3 * p + i] = s.v_out[3 * p + i] * o.scale * 0.318309886f * sum_of(sum.albedo[i]);
+        }
+    }
+}
+
+INLINE void add_parts(float* to, const float* parts, i64 size, int count) {
+    for (i64 i = 0; i < size; i++) {
+        float sum = 0;
+        for (int part = 0; part < count; part++) sum += parts[part * size + i];
+        to[i] = sum;
+    }
+}
