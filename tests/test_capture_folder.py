@@ -53,7 +53,7 @@ def a_capture() -> tuple[Capture, Truth]:
     return capture, truth
 
 
-@pytest.fixture()
+@pytest.fixture
 def written(tmp_path: Path) -> Path:
     capture_writer.save(tmp_path / "capture", *a_capture(), setting="handheld")
     return tmp_path / "capture"
@@ -196,6 +196,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "matrix with NaN": (lambda d: first(d)["transform_matrix"][0].__setitem__(3, math.nan), "holds NaN"),
     "unknown light": (lambda d: d.update(light="room"), r"\"light\" is 'room' \(it is one of camera, object\)"),
     "duplicate frame": (lambda d: d["frames"].append(dict(first(d))), r"images/a\.png is there twice"),
+    "two frames of one name": (lambda d: first(d).update(file_path="masks/b.png"), r"b\.png is there twice"),
     "path leaving the folder": (lambda d: first(d).update(file_path="../a.png"), "leaves the folder"),
     "absolute path": (lambda d: first(d).update(mask_path="/etc/hostname"), "leaves the folder"),
     "only some poses": (lambda d: first(d).pop("transform_matrix"), r"a\.png has no pose, others do"),

@@ -161,9 +161,12 @@ def test_enlarging_is_bilinear() -> None:
 
 
 def test_shrinking_does_not_alias() -> None:
-    """A checkerboard of single pixels is grey from afar; picking every fourth pixel would give black or white."""
-    checker = (torch.arange(32)[:, None] + torch.arange(32)).remainder(2).to(DOUBLE)[..., None]
-    torch.testing.assert_close(resize(checker, 8, 8)[2:-2, 2:-2], torch.full((4, 4, 1), 0.5, dtype=DOUBLE))
+    """A checkerboard of single pixels is grey from afar; picking every third pixel would give black or white."""
+    checker = (torch.arange(33)[:, None] + torch.arange(33)).remainder(2).to(DOUBLE)[..., None]
+    # A triangle over five pixels gives 5/9 and 4/9 to the two colours of a row: (5/9)^2 + (4/9)^2 = 0.506.
+    torch.testing.assert_close(
+        resize(checker, 11, 11)[1:-1, 1:-1], torch.full((9, 9, 1), 0.5).double(), atol=0.01, rtol=0
+    )
 
 
 @pytest.mark.parametrize(("height", "width"), [(3, 4), (4, 6), (5, 9), (24, 24), (17, 5)])

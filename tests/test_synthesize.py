@@ -437,7 +437,7 @@ def test_old_llvm_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert pathtracer.find_llvm() == (tmp_path / "libLLVM.so.18.1", 18)
 
 
-@pytest.mark.slow()
+@pytest.mark.slow
 def test_a_real_object_has_consistent_truth(shared_data: Path, tmp_path: Path) -> None:
     """A real scan through the whole generator: depth of its evaluation views agrees where they overlap."""
     options = Options(env=str(shared_data / "hdri" / "st_fagans_interior_1k.hdr"), views=4, up="z", samples=64)

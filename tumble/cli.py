@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 Folder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR")]
 
 
 def doctor() -> None:
@@ -34,7 +35,8 @@ def main() -> None:
         print(f"tumble {__version__}")
         return
     try:
-        tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=__doc__.partition(":")[0])
+        about = "From one video of an object turned in the hand to its motion, shape, material and light."
+        tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=about)
     except KeyboardInterrupt:
         print(
             "tumble: interrupted; what is finished is kept, the same command goes on from there",
@@ -73,7 +75,7 @@ def _synth():
     return synth
 
 
-def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: Folder | None = None) -> None:
+def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: OptionalFolder = None) -> None:
     """Score a prediction folder against a capture with truth: report.json and a picture sheet.
 
     Args:
@@ -81,9 +83,31 @@ def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: Fo
         capture: The capture folder (docs/format.md).
         out: Where report.json and sheet.png go; the prediction folder when left out.
     """
+    from rich.console import Console
+    from rich.table import Table
+
     from tumble import evaluate as evaluation
 
-    evaluation.run(prediction, capture, out or prediction)
+    where = out or prediction
+    report = evaluation.run(prediction, capture, where)
+    table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
+    regions = report["regions"]
+    for heading in ("metric", *regions):
+        table.add_column(heading, justify="left" if heading == "metric" else "right")
+    for key in dict.fromkeys(key for scores in regions.values() for key in scores):
+        table.add_row(key, *(_shown(scores.get(key)) for scores in regions.values()))
+    for key, value in {**report["light"], **report["poses"]}.items():
+        if value is None or isinstance(value, int | float):
+            table.add_row(key, _shown(value))
+    console = Console()
+    console.print(table)
+    for note in report["notes"]:
+        console.print(f"note: {note}", markup=False, highlight=False)
+    print(where / "report.json")
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
 
 
 def demo(out: Folder = Path("runs/demo")) -> None:

@@ -1,7 +1,8 @@
 """Light from far away: radiance as a function of direction, on an equirectangular map.
 
-Convention (format.md): for a unit direction d in the env frame `u = atan2(d.x, -d.z) / 2pi + 1/2`, `v = acos(d.y) / pi`;
-the map's centre is -z, its right quarter +x, its top row +y. Texel centres at +0.5. Linear RGB radiance.
+Convention (docs/format.md): for a unit direction d in the env frame
+`u = atan2(d.x, -d.z) / 2pi + 1/2`, `v = acos(d.y) / pi`; the map's centre is -z, its right quarter +x, its top row +y.
+Texel centres at +0.5. Linear RGB radiance.
 """
 
 from dataclasses import dataclass
@@ -76,6 +77,8 @@ class Environment:
     def resampled(self, height: int, width: int) -> "Environment":
         """The map on another grid: bilinear when finer, averaged over the texels' area when coarser."""
         h, w, _ = self.log_radiance.shape
+        if (h, w) == (height, width):
+            return self
         # A coarse texel is the mean of samples at least as dense as the fine map, each weighted by its solid angle.
         down, across = max(1, -(-h // height)), max(1, -(-w // width))
         d_env = texel_directions(height * down, width * across, dtype=self._dtype, device=self._device)

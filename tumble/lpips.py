@@ -82,7 +82,8 @@ def read(path: Path = SHIPPED) -> Network:
     if missing := sorted((wanted | {f"lin{k}.weight" for k in range(5)}) - set(weights)):
         raise BadFile(path, f"lacks {', '.join(missing[:3])} of LPIPS's {name} network")
     flat = {name: value.reshape(-1) for name, value in weights.items() if name.startswith("lin")}
-    return Network(name, {**weights, **flat})
+    # Files keep 16 bits; arithmetic is done in the pictures' precision, which is rarely that.
+    return Network(name, {name: value.float() for name, value in {**weights, **flat}.items()})
 
 
 def distance(network: Network, x: Float[Tensor, "*b h w 3"], y: Float[Tensor, "*b h w 3"]) -> Float[Tensor, "*b"]:
@@ -93,8 +94,9 @@ def distance(network: Network, x: Float[Tensor, "*b h w 3"], y: Float[Tensor, "*
     """
     batch = x.shape[:-3]
     total = x.new_zeros(())
-    for k, (a, b) in enumerate(zip(_features(network, x), _features(network, y), strict=True)):
-        squared = (_unit(a) - _unit(b)).square().mean((2, 3))
+    for k, features in enumerate(_features(network, torch.stack([x, y]))):
+        a, b = _unit(features).chunk(2)
+        squared = (a - b).square().mean((2, 3))
         total = total + squared @ network.weights[f"lin{k}.weight"].to(x)
     return total.reshape(batch)
 

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -164,7 +164,7 @@ def _part(mesh: Any, T: Float[np.ndarray, "4 4"]) -> Part:
 
 def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray]:
     """Base colour and roughness textures, each multiplied by its factor (glTF 2.0, section 3.9.2)."""
-    material = getattr(visual, "material", None)
+    material: Any = getattr(visual, "material", None)
     material = material.to_pbr() if hasattr(material, "to_pbr") else material
     factor = np.ones(3) if getattr(material, "baseColorFactor", None) is None else _unit(material.baseColorFactor)
     albedo, roughness = np.ones((1, 1, 3)), np.ones((1, 1, 1))
@@ -192,7 +192,7 @@ def write_model(source: Path, model: Model, path: Path) -> None:
 
     scene = trimesh.load_scene(source, process=False)
     scene.apply_transform(model.T_obj_file)
-    path.write_bytes(scene.export(file_type="glb"))
+    path.write_bytes(cast(bytes, scene.export(file_type="glb")))
 
 
 # The scene ------------------------------------------------------------------------------------------------------------
@@ -287,8 +287,12 @@ def maps(unlit: tuple[Any, Any], T_cam_obj: SE3, camera: Camera, *, samples: int
     side = np.sign((first[..., 6:9] * to_camera).sum(-1, keepdims=True))
     normal = side * first[..., 3:6]
     normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-6)
-    found = (first[..., :3] / share, coded[..., :1] / share, normal, depth)
-    return Maps(*(np.where(inside[..., None], values, 0).astype(np.float32) for values in found), coverage)
+
+    def within(values: np.ndarray) -> np.ndarray:
+        return np.where(inside[..., None], values, 0).astype(np.float32)
+
+    albedo, roughness = first[..., :3] / share, coded[..., :1] / share
+    return Maps(within(albedo), within(roughness), within(normal), within(depth), coverage)
 
 
 def _bitmap(pixels: np.ndarray) -> dict[str, Any]:

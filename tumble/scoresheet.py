@@ -20,8 +20,8 @@ VIEWS = 4
 TOPS = {"albedo": 0.25, "normal": 30.0, "roughness": 0.5, "relit": 0.25}
 """Error at the bright end of the colours [sRGB, degrees, roughness, sRGB]."""
 HEADLINES = {
-    "albedo.psnr_fg_srgb": ("albedo PSNR fg", "{:.2f} dB"),
-    "albedo.lpips_full_srgb_alex": ("albedo LPIPS", "{:.4f}"),
+    "albedo.psnr_fg_srgb": ("albedo PSNR fg, sRGB", "{:.2f} dB"),
+    "albedo.lpips_full_srgb_alex": ("albedo LPIPS, full", "{:.4f}"),
     "relit.psnr_fg_srgb": ("relit PSNR fg", "{:.2f} dB"),
     "relit.psnr_full_srgb": ("relit PSNR full", "{:.2f} dB"),
     "image.psnr_fg_srgb": ("image PSNR fg", "{:.2f} dB"),

@@ -61,7 +61,7 @@ def _from_angles(azimuth: Tensor, elevation: Tensor, distance: float) -> Float[T
 
 
 def dome(n: int, distance: float) -> SE3:
-    """`n` cameras spread evenly over the upper hemisphere, in the order of a golden-angle spiral from the horizon up."""
+    """`n` cameras spread evenly over the upper hemisphere, on a golden-angle spiral from the horizon up."""
     i = torch.arange(n, dtype=torch.float64)
     return look_at_object(_from_angles(i * 2 * math.pi * GOLDEN, torch.asin((i + 0.5) / n), distance))
 
@@ -124,7 +124,7 @@ def trajectory(setting: str, n: int, distance: float, *, seed: int) -> SE3:
 
 
 def shared_views(n: int, distance: float) -> SE3:
-    """Evaluation views of region "shared": all around, 15 to 35 degrees above the horizon; the same for all settings."""
+    """Evaluation views of region "shared": all around, 15 to 35 degrees above the horizon, in every setting."""
     i = torch.arange(n, dtype=torch.float64)
     low, high = SHARED_ELEVATIONS
     return look_at_object(

@@ -330,7 +330,7 @@ def _matrix(shot: _Shot) -> list[list[float]]:
 
 
 def sweep(model: Path, out: Path, options: Options, roughnesses: tuple[float, ...]) -> list[Path]:
-    """One capture per constant roughness, `out/r0.20`, `out/r0.40`, ...: alike in all but the roughness (paper section 5.2)."""
+    """One capture per constant roughness, `out/r0.20`, `out/r0.40`, ...: alike in all else (paper section 5.2)."""
     return [
         synthesize(model, out / f"r{value:.2f}", dataclasses.replace(options, roughness=value)) for value in roughnesses
     ]

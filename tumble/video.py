@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import av
+import av.error
 import numpy as np
 from jaxtyping import UInt8
 
@@ -47,5 +48,5 @@ def read_clip(path: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         with av.open(str(path)) as film:
             for frame in film.decode(video=0):
                 yield frame.to_ndarray(format="rgb24")
-    except (av.FFmpegError, IndexError) as error:
+    except (av.error.FFmpegError, IndexError) as error:
         raise BadFile(path, f"is not a readable film: {error}") from None

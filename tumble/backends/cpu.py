@@ -195,7 +195,7 @@ class _Bvh(ctypes.Structure):
         *((name, ctypes.c_int) for name in "n n_leaves n_levels".split()),
         ("first_node", ctypes.c_int * LEVELS),
         *((name, ctypes.c_float) for name in "sigmas alpha_max alpha_min T_min visible".split()),
-        *((name, ctypes.c_void_p) for name in "leaves nodes boxes normals keys order order_2".split()),
+        *((name, ctypes.c_void_p) for name in "leaves nodes boxes normals order".split()),
     ]
 
 
@@ -244,8 +244,7 @@ def build(
     inputs = [x.contiguous() for x in (means, quats, scales, opacity)]
     _point(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
     memory = _point(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
-    work = _point(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), keys=_int32(n))
-    work += _point(t, order=_int32(n), order_2=_int32(n))
+    work = _point(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
     W = torch.empty(n * 9)
     _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(W.data_ptr()))
     del work

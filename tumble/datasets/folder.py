@@ -100,9 +100,9 @@ def _check_frame(path: Path, number: int, frame: Any, seen: set[str]) -> None:
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise BadFile(path, f'frame {number} has no "file_path"')
     name = frame["file_path"]
-    if name in seen:
-        raise BadFile(path, f"the frame {name} is there twice", "every frame has its own image")
-    seen.add(name)
+    if name in seen or Path(name).name in seen:
+        raise BadFile(path, f"the frame {name} is there twice", "every frame has its own image with its own name")
+    seen |= {name, Path(name).name}
     if frame.get("split", "train") not in ("train", "eval"):
         raise BadFile(path, f'frame {name}: "split" is {frame["split"]!r}', "it is train or eval")
     if frame.get("split") == "eval" and frame.get("region", "sphere") not in REGIONS:

@@ -43,8 +43,8 @@ BARK = Ink((120, 74, 57), 0.66)
 BRIGHT = (CORAL, MUSTARD, CREAM, SKY, BLUSH)
 
 
-class Sheet:
-    """A chart being painted: its colour and its roughness, kept in step. Painting is what changes it."""
+class Canvas:
+    """A chart being painted, its colour and its roughness in step. Its state is the paint, as in Pillow's images."""
 
     def __init__(self, width: int, height: int, ground: Ink) -> None:
         size = (width * FINE, height * FINE)
@@ -119,40 +119,42 @@ def _angles(n: int) -> list[float]:
     return [2 * math.pi * i / n for i in range(n)]
 
 
-def paint(name: str, width: int, height: int) -> Sheet:
+def paint(name: str, width: int, height: int) -> Canvas:
     """The print of one chart of the pot, by the chart's name."""
     painters = {"body": _body, "lid": _lid, "base": _base, "spout": _spout, "handle": _handle, "knob": _knob}
-    sheet = Sheet(width, height, GLOSS if name == "lid_under" else TEAL)
+    canvas = Canvas(width, height, GLOSS if name == "lid_under" else TEAL)
     if name in painters:
-        painters[name](sheet)
-    return sheet
+        painters[name](canvas)
+    return canvas
 
 
-def _body(sheet: Sheet) -> None:
+def _body(canvas: Canvas) -> None:
     """Around the pot: a landscape on the back, sprigs under the spout, the label in front, marks behind the handle."""
-    sheet.box(0, 0, sheet.width, sheet.height, CREAM)
+    canvas.box(0, 0, canvas.width, canvas.height, CREAM)
     rng = np.random.default_rng(7)
-    _sprigs(sheet, rng)
-    _borders(sheet, rng)
-    _landscape(sheet, 254, 149)
-    _front(sheet, 762, 149)
+    _sprigs(canvas, rng)
+    _borders(canvas, rng)
+    _landscape(canvas, 254, 149)
+    _front(canvas, 762, 149)
 
 
-def _borders(sheet: Sheet, rng: np.random.Generator) -> None:
+def _borders(canvas: Canvas, rng: np.random.Generator) -> None:
     """A frieze above and one below, no two stretches of them alike."""
-    sheet.box(0, 0, sheet.width, 46, TEAL)
-    sheet.box(0, 46, sheet.width, 50, MUSTARD)
-    sheet.box(0, 246, sheet.width, 250, CORAL)
-    sheet.box(0, 250, sheet.width, sheet.height, NIGHT)
+    canvas.box(0, 0, canvas.width, 46, TEAL)
+    canvas.box(0, 46, canvas.width, 50, MUSTARD)
+    canvas.box(0, 246, canvas.width, 250, CORAL)
+    canvas.box(0, 250, canvas.width, canvas.height, NIGHT)
     for i in range(32):
         x, ink = 16 + 31.75 * i, BRIGHT[rng.integers(5)]
         size = 5 + 4 * rng.random()
-        (sheet.disc if rng.random() < 0.5 else sheet.star)(x, 32, size, ink)
+        (canvas.disc if rng.random() < 0.5 else canvas.star)(x, 32, size, ink)
         height = 10 + 12 * rng.random()
-        sheet.polygon([(x - 13, 278), (x + 13, 278), (x + 8 * rng.random() - 4, 278 - height)], BRIGHT[rng.integers(5)])
+        canvas.polygon(
+            [(x - 13, 278), (x + 13, 278), (x + 8 * rng.random() - 4, 278 - height)], BRIGHT[rng.integers(5)]
+        )
 
 
-def _sprigs(sheet: Sheet, rng: np.random.Generator) -> None:
+def _sprigs(canvas: Canvas, rng: np.random.Generator) -> None:
     """Leaves and berries around the spout and the handle."""
     for x in (32, 466, 508, 548, 984):
         tall, lean = 90 + 80 * rng.random(), 0.5 * rng.random() - 0.25
@@ -161,132 +163,132 @@ def _sprigs(sheet: Sheet, rng: np.random.Generator) -> None:
             at = (x + lean * t * tall + 6 * math.sin(4 * t), 244 - t * tall)
             side = 0.95 if i % 2 else -0.95
             ink = (TEAL, LEAF, MUSTARD, CORAL)[rng.integers(4)] if i < 8 else CORAL
-            sheet.leaf(*at, 34 - 14 * t, side * (1 - 0.6 * t) + lean, ink)
+            canvas.leaf(*at, 34 - 14 * t, side * (1 - 0.6 * t) + lean, ink)
     for _ in range(90):
-        x, y = rng.random() * sheet.width, 58 + 180 * rng.random()
+        x, y = rng.random() * canvas.width, 58 + 180 * rng.random()
         if min(abs(x - 254), abs(x - 762)) < 184:
             continue
-        sheet.disc(x, y, 1.5 + 2.5 * rng.random(), BRIGHT[rng.integers(2)] if rng.random() < 0.7 else NIGHT)
+        canvas.disc(x, y, 1.5 + 2.5 * rng.random(), BRIGHT[rng.integers(2)] if rng.random() < 0.7 else NIGHT)
 
 
-def _landscape(sheet: Sheet, x: float, y: float) -> None:
+def _landscape(canvas: Canvas, x: float, y: float) -> None:
     """A printed view: sun, two ranges of hills, firs and a tent, on matte ink."""
     left, top, right, bottom = x - 160, y - 84, x + 160, y + 82
-    sheet.box(left - 5, top - 5, right + 5, bottom + 5, NIGHT, corner=12)
-    sheet.box(left, top, right, bottom, SKY, corner=8)
-    sheet.disc(x + 62, y - 26, 34, Ink(MUSTARD.rgb, 0.20))
-    sheet.disc(x + 62, y - 26, 25, Ink(CORAL.rgb, 0.20))
+    canvas.box(left - 5, top - 5, right + 5, bottom + 5, NIGHT, corner=12)
+    canvas.box(left, top, right, bottom, SKY, corner=8)
+    canvas.disc(x + 62, y - 26, 34, Ink(MUSTARD.rgb, 0.20))
+    canvas.disc(x + 62, y - 26, 25, Ink(CORAL.rgb, 0.20))
     for bumps, ink in (((34, 78, 40, 96, 60, 84, 30), Ink(BLUSH.rgb, 0.7)), ((66, 30, 54, 18, 40, 26, 58), TEAL)):
         ridge = [(left + 320 * i / 6, bottom - 22 - height) for i, height in enumerate(bumps)]
-        sheet.polygon([(left, bottom), *ridge, (right, bottom)], ink)
-    sheet.box(left, bottom - 32, right, bottom, Ink(LEAF.rgb, 0.8), corner=8)
+        canvas.polygon([(left, bottom), *ridge, (right, bottom)], ink)
+    canvas.box(left, bottom - 32, right, bottom, Ink(LEAF.rgb, 0.8), corner=8)
     for i, (dx, size) in enumerate([(-138, 62), (-112, 44), (-84, 72), (20, 38), (112, 56), (138, 40)]):
         for k in range(3):
             w, base = size * (0.30 - 0.07 * k), bottom - 12 - size * 0.25 * k
             ink = NIGHT if i % 2 else Ink((57, 86, 78), 0.7)
-            sheet.polygon([(x + dx - w, base), (x + dx + w, base), (x + dx, base - size * 0.5)], ink)
-    sheet.polygon([(x - 52, bottom - 8), (x + 8, bottom - 8), (x - 22, bottom - 50)], CORAL)
-    sheet.polygon([(x - 32, bottom - 8), (x - 12, bottom - 8), (x - 22, bottom - 36)], NIGHT)
-    sheet.text(x - 92, top + 24, "CAMP No 7", 20, NIGHT, bold=1)
+            canvas.polygon([(x + dx - w, base), (x + dx + w, base), (x + dx, base - size * 0.5)], ink)
+    canvas.polygon([(x - 52, bottom - 8), (x + 8, bottom - 8), (x - 22, bottom - 50)], CORAL)
+    canvas.polygon([(x - 32, bottom - 8), (x - 12, bottom - 8), (x - 22, bottom - 36)], NIGHT)
+    canvas.text(x - 92, top + 24, "CAMP No 7", 20, NIGHT, bold=1)
     for i in range(7):
-        sheet.star(left + 16 + 23 * i, top + 46 + 7 * (i % 3), 2.5 + i % 3, PAPER, tips=4, waist=0.3)
+        canvas.star(left + 16 + 23 * i, top + 46 + 7 * (i % 3), 2.5 + i % 3, PAPER, tips=4, waist=0.3)
 
 
-def _front(sheet: Sheet, x: float, y: float) -> None:
+def _front(canvas: Canvas, x: float, y: float) -> None:
     """The paper label: name, ornaments, colour bar, small print."""
     left, top, right, bottom = x - 170, y - 86, x + 170, y + 84
-    sheet.box(left - 4, top - 4, right + 4, bottom + 4, TEAL, corner=16)
-    sheet.box(left, top, right, bottom, PAPER, corner=13)
-    sheet.text(x + 4, y - 29, "tumble", 86, Ink(MUSTARD.rgb, 0.7), bold=4)
-    sheet.text(x, y - 33, "tumble", 86, Ink(CORAL.rgb, 0.25), bold=3)
-    sheet.box(left + 14, y + 16, right - 14, y + 19, NIGHT)
-    sheet.text(x - 50, y + 32, "TURN IT IN THE LIGHT", 17, NIGHT, bold=0.6)
+    canvas.box(left - 4, top - 4, right + 4, bottom + 4, TEAL, corner=16)
+    canvas.box(left, top, right, bottom, PAPER, corner=13)
+    canvas.text(x + 4, y - 29, "tumble", 86, Ink(MUSTARD.rgb, 0.7), bold=4)
+    canvas.text(x, y - 33, "tumble", 86, Ink(CORAL.rgb, 0.25), bold=3)
+    canvas.box(left + 14, y + 16, right - 14, y + 19, NIGHT)
+    canvas.text(x - 50, y + 32, "TURN IT IN THE LIGHT", 17, NIGHT, bold=0.6)
     for i, ink in enumerate((CORAL, MUSTARD, LEAF, TEAL, SKY, BLUSH, WOOD, NIGHT)):
-        sheet.box(left + 16 + 24 * i, y + 46, left + 38 + 24 * i, y + 70, Ink(ink.rgb, 0.7), corner=3)
-    sheet.star(right - 46, y + 48, 33, Ink(MUSTARD.rgb, 0.3), tips=14, waist=0.78)
-    sheet.text(right - 46, y + 43, "0.33", 19, NIGHT, bold=0.8)
-    sheet.text(right - 46, y + 58, "LITRE", 9, NIGHT, bold=0.4)
+        canvas.box(left + 16 + 24 * i, y + 46, left + 38 + 24 * i, y + 70, Ink(ink.rgb, 0.7), corner=3)
+    canvas.star(right - 46, y + 48, 33, Ink(MUSTARD.rgb, 0.3), tips=14, waist=0.78)
+    canvas.text(right - 46, y + 43, "0.33", 19, NIGHT, bold=0.8)
+    canvas.text(right - 46, y + 58, "LITRE", 9, NIGHT, bold=0.4)
     for dx, dy, size, ink in (
         (-154, -72, 7, TEAL),
         (152, -66, 9, MUSTARD),
         (138, -76, 5, CORAL),
         (-155, -52, 4, CORAL),
     ):
-        sheet.star(x + dx, y + dy, size, ink)
-    sheet.text(x - 78, y + 77, "shape - motion - material - light", 9.5, NIGHT, bold=0.2)
+        canvas.star(x + dx, y + dy, size, ink)
+    canvas.text(x - 78, y + 77, "shape - motion - material - light", 9.5, NIGHT, bold=0.2)
 
 
-def _lid(sheet: Sheet) -> None:
+def _lid(canvas: Canvas) -> None:
     """Glossy enamel with a sun of unequal rays and a motto around it."""
-    cx, cy = sheet.width / 2, sheet.height / 2
-    sheet.box(0, 0, sheet.width, sheet.height, GLOSS)
-    sheet.disc(cx, cy, 67, Ink(NIGHT.rgb, 0.2))
+    cx, cy = canvas.width / 2, canvas.height / 2
+    canvas.box(0, 0, canvas.width, canvas.height, GLOSS)
+    canvas.disc(cx, cy, 67, Ink(NIGHT.rgb, 0.2))
     for i, angle in enumerate(_angles(18)):
         reach, ink = 52 + (i * 7) % 12, Ink(BRIGHT[(i * i + i // 5) % 3].rgb, 0.2)
         spread = [(angle - 0.10, 24), (angle + 0.10, 24), (angle + 0.05, reach), (angle - 0.05, reach)]
-        sheet.polygon([(cx + r * math.sin(a), cy - r * math.cos(a)) for a, r in spread], ink)
-    sheet.disc(cx, cy, 30, Ink(MUSTARD.rgb, 0.2))
-    sheet.round_text(76, "TURN * LOOK * TURN AGAIN * TUMBLE * ", 17, Ink(CREAM.rgb, 0.2), bold=0.7, clockwise=False)
+        canvas.polygon([(cx + r * math.sin(a), cy - r * math.cos(a)) for a, r in spread], ink)
+    canvas.disc(cx, cy, 30, Ink(MUSTARD.rgb, 0.2))
+    canvas.round_text(76, "TURN * LOOK * TURN AGAIN * TUMBLE * ", 17, Ink(CREAM.rgb, 0.2), bold=0.7, clockwise=False)
     for i, angle in enumerate(_angles(40)):
         ink = Ink(BRIGHT[(i * i // 3 + i) % 5].rgb, 0.2)
-        sheet.disc(cx + 94 * math.sin(angle), cy - 94 * math.cos(angle), 2.2 + (i * 5 % 3), ink)
+        canvas.disc(cx + 94 * math.sin(angle), cy - 94 * math.cos(angle), 2.2 + (i * 5 % 3), ink)
 
 
-def _base(sheet: Sheet) -> None:
+def _base(canvas: Canvas) -> None:
     """The maker's mark underneath."""
-    cx, cy = sheet.width / 2, sheet.height / 2
-    sheet.box(0, 0, sheet.width, sheet.height, NIGHT)
-    sheet.disc(cx, cy, 92, MUSTARD)
-    sheet.disc(cx, cy, 68, Ink(PAPER.rgb, 0.7))
-    sheet.round_text(80, "MADE BY CODE - KEEP TURNING - BATCH 2026 - ", 15, NIGHT, bold=0.7)
-    sheet.text(cx - 26, cy - 24, "7", 64, CORAL, bold=3)
-    sheet.star(cx + 22, cy - 34, 18, TEAL, tips=6)
-    sheet.text(cx + 22, cy - 8, "CODE", 14, NIGHT, bold=0.6)
+    cx, cy = canvas.width / 2, canvas.height / 2
+    canvas.box(0, 0, canvas.width, canvas.height, NIGHT)
+    canvas.disc(cx, cy, 92, MUSTARD)
+    canvas.disc(cx, cy, 68, Ink(PAPER.rgb, 0.7))
+    canvas.round_text(80, "MADE BY CODE - KEEP TURNING - BATCH 2026 - ", 15, NIGHT, bold=0.7)
+    canvas.text(cx - 26, cy - 24, "7", 64, CORAL, bold=3)
+    canvas.star(cx + 22, cy - 34, 18, TEAL, tips=6)
+    canvas.text(cx + 22, cy - 8, "CODE", 14, NIGHT, bold=0.6)
     widths = (2, 1, 3, 1, 1, 2, 4, 1, 2, 1, 3, 2, 1, 1, 4, 1, 2, 3)
     for i, width in enumerate(widths):
         left = cx - 46 + sum(widths[:i]) + 2.2 * i
-        sheet.box(left, cy + 14, left + width, cy + 40, NIGHT)
+        canvas.box(left, cy + 14, left + width, cy + 40, NIGHT)
     for i, ink in enumerate((CORAL, MUSTARD, LEAF, TEAL)):
-        sheet.box(cx - 29 + 15 * i, cy + 45, cx - 17 + 15 * i, cy + 57, ink)
+        canvas.box(cx - 29 + 15 * i, cy + 45, cx - 17 + 15 * i, cy + 57, ink)
 
 
-def _spout(sheet: Sheet) -> None:
+def _spout(canvas: Canvas) -> None:
     """Cream enamel, dark inside, a coral mouth, rings and dots further down."""
-    sheet.box(0, 0, sheet.width, 22, Ink(BARK.rgb, 0.5))
-    sheet.box(0, 22, sheet.width, 46, CORAL)
-    sheet.box(0, 46, sheet.width, sheet.height, TEAL)
+    canvas.box(0, 0, canvas.width, 22, Ink(BARK.rgb, 0.5))
+    canvas.box(0, 22, canvas.width, 46, CORAL)
+    canvas.box(0, 46, canvas.width, canvas.height, TEAL)
     for i in range(7):
         y, ink = 54 + 22 * i, BRIGHT[(3 * i + i // 2) % 5]
         if i % 3 == 1:
-            sheet.box(0, y, sheet.width, y + 5, ink)
+            canvas.box(0, y, canvas.width, y + 5, ink)
             continue
         for k in range(6):
-            x = (k + 0.5 * (i % 2) + 0.25) * sheet.width / 6
-            (sheet.disc if (k * k + i) % 3 else sheet.star)(x, y + 4, 5 + (k + i) % 3, BRIGHT[(k * 3 + i) % 5])
+            x = (k + 0.5 * (i % 2) + 0.25) * canvas.width / 6
+            (canvas.disc if (k * k + i) % 3 else canvas.star)(x, y + 4, 5 + (k + i) % 3, BRIGHT[(k * 3 + i) % 5])
 
 
-def _handle(sheet: Sheet) -> None:
+def _handle(canvas: Canvas) -> None:
     """Wound with tape: chevrons of changing colour and width."""
-    sheet.box(0, 0, sheet.width, sheet.height, WOOD)
-    middle, inks = sheet.width / 2, (CORAL, NIGHT, MUSTARD, CREAM, TEAL)
+    canvas.box(0, 0, canvas.width, canvas.height, WOOD)
+    middle, inks = canvas.width / 2, (CORAL, NIGHT, MUSTARD, CREAM, TEAL)
     y = -24.0
     for n, choice in enumerate((0, 1, 3, 2, 4, 0, 3, 1, 2, 0, 4, 3, 1, 0, 2, 4, 1, 3, 0, 2)):
         # A chevron is as high at its left end as at its right: the pattern closes on itself at the seam.
         thick = 9 + (n * n) % 13
-        tip = [(0, y), (middle, y + 24), (sheet.width, y)]
-        sheet.polygon([*tip, *[(x, below + thick) for x, below in reversed(tip)]], inks[choice])
+        tip = [(0, y), (middle, y + 24), (canvas.width, y)]
+        canvas.polygon([*tip, *[(x, below + thick) for x, below in reversed(tip)]], inks[choice])
         y += thick + 9
     for i in range(16):
-        sheet.disc(10 + (i * 29) % (sheet.width - 20), 14 + 27 * i, 3.5, Ink(PAPER.rgb, 0.3))
+        canvas.disc(10 + (i * 29) % (canvas.width - 20), 14 + 27 * i, 3.5, Ink(PAPER.rgb, 0.3))
 
 
-def _knob(sheet: Sheet) -> None:
+def _knob(canvas: Canvas) -> None:
     """Turned wood with painted segments."""
-    sheet.box(0, 0, sheet.width, sheet.height, WOOD)
+    canvas.box(0, 0, canvas.width, canvas.height, WOOD)
     inks = (CORAL, BARK, CREAM, NIGHT, MUSTARD, BARK, TEAL)
     for i, ink in enumerate(inks):
-        left = i * sheet.width / len(inks)
-        sheet.box(left, 0, left + sheet.width / 9, 64, ink)
-        sheet.disc(left + sheet.width / 18, 74, 3 + i % 3, ink)
-    sheet.box(0, 84, sheet.width, 90, BARK)
-    sheet.box(0, 108, sheet.width, sheet.height, MUSTARD)
+        left = i * canvas.width / len(inks)
+        canvas.box(left, 0, left + canvas.width / 9, 64, ink)
+        canvas.disc(left + canvas.width / 18, 74, 3 + i % 3, ink)
+    canvas.box(0, 84, canvas.width, 90, BARK)
+    canvas.box(0, 108, canvas.width, canvas.height, MUSTARD)

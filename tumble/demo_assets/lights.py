@@ -5,6 +5,7 @@ lies behind it, near the map's left and right edges. Linear radiance.
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
@@ -43,7 +44,7 @@ def other_environment(height: int = 128) -> Environment:
     return _rendered(_sunset, height)
 
 
-def _rendered(radiance, height: int) -> Environment:
+def _rendered(radiance: Callable[[Rays], Rays], height: int) -> Environment:
     """Averages of FINE x FINE rays per texel."""
     d_env = texel_directions(FINE * height, FINE * 2 * height).reshape(-1, 3)
     fine = radiance(d_env).reshape(height, FINE, 2 * height, FINE, 3)

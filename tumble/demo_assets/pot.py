@@ -33,8 +33,7 @@ class Chart:
     """A rectangle of the atlas [pixels] and how a surface is laid on it."""
 
     kind: Literal["strip", "lying", "top", "bottom"]
-    """"lying" is a strip turned a quarter to the left; "top" and "bottom" are discs, with the axis at the profile's first
-    or last point."""
+    """A lying strip is turned a quarter to the left; a disc's middle is a profile's first ("top") or last point."""
     left: int
     top: int
     width: int
@@ -58,6 +57,17 @@ CHARTS = {
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """A part of a solid's profile, and the chart that it is printed from."""
+
+    profile: Points
+    """Control points (r, s) [metres]."""
+    rows: int
+    """Number of rings."""
+    chart: str
+
+
+@dataclass(frozen=True)
 class Mesh:
     """Triangles with a normal and a place on the atlas per vertex; y up, metres."""
 
@@ -68,65 +78,82 @@ class Mesh:
     faces: Int[np.ndarray, "f 3"]
 
 
+PROFILES: dict[str, Points] = {
+    "body_top": [(0, 0.1042), (0.0300, 0.1042)],
+    "body": [
+        *[(0.0300, 0.1042), (0.0350, 0.1046), (0.0375, 0.1050), (0.0395, 0.1030), (0.0390, 0.1000), (0.0372, 0.0985)],
+        *[(0.0385, 0.0920), (0.0440, 0.0680), (0.0485, 0.0360), (0.0500, 0.0120), (0.0500, 0.0030), (0.0480, 0.0)],
+        (0.0440, 0.0),
+    ],
+    "base": [(0.0440, 0.0), (0.0420, 0.0), (0.0400, 0.0026), (0.0360, 0.0028), (0, 0.0028)],
+    "lid": [
+        *[(0, 0.1240), (0.0140, 0.1236), (0.0240, 0.1212), (0.0285, 0.1180), (0.0290, 0.1150), (0.0320, 0.1142)],
+        *[(0.0390, 0.1125), (0.0422, 0.1095), (0.0422, 0.1060), (0.0405, 0.1050), (0.0385, 0.1056)],
+    ],
+    "lid_under": [(0.0385, 0.1056), (0.0360, 0.1056), (0, 0.1056)],
+    "knob": [
+        *[(0, 0.1480), (0.0070, 0.1478), (0.0118, 0.1440), (0.0125, 0.1380), (0.0095, 0.1325), (0.0052, 0.1295)],
+        *[(0.0050, 0.1265), (0.0085, 0.1235), (0.0090, 0.1215), (0, 0.1215)],
+    ],
+}
+"""(r, height above the table) of what is turned on the upright axis, from above to below [metres]."""
+NOZZLE: Points = [(-0.0960, 0.1080), (-0.0850, 0.0990), (-0.0760, 0.0790), (-0.0660, 0.0540), (-0.0240, 0.0290)]
+"""Axis of the spout, (x, y) from its mouth into the body [metres]."""
+MOUTH: Points = [
+    (0.0052, 0.010),
+    (0.0056, 0.001),
+    (0.0068, -0.0012),
+    (0.0082, 0.0006),
+    (0.0080, 0.008),
+    (0.0092, 0.035),
+]
+"""Profile of the spout's upper end, (r, s) from inside over the lip [metres]."""
+GRIP: Points = [(0.033, 0.089), (0.056, 0.100), (0.087, 0.096), (0.090, 0.062), (0.074, 0.029), (0.044, 0.023)]
+"""Axis of the handle, (x, y) from body to body [metres]."""
+
+
 def parts() -> dict[str, Mesh]:
     """The solids of the pot, each closed: body, lid, knob, spout and handle."""
-    upright = [(0.0, 0.16), (0.0, 0.0)]
-    # Heights above the table are easier to write than distances from the axis's upper end.
-    body = (
-        _turned([(0, 0.1042), (0.030, 0.1042)]),
-        _turned(
-            [(0.030, 0.1042), (0.0350, 0.1046), (0.0375, 0.1050), (0.0395, 0.1030), (0.0390, 0.1000), (0.0372, 0.0985)]
-            + [(0.0385, 0.0920), (0.0440, 0.0680), (0.0485, 0.0360), (0.0500, 0.0120), (0.0500, 0.0030), (0.0480, 0.0)]
-            + [(0.0440, 0.0)]
-        ),
-    )
-    base = _turned([(0.0440, 0.0), (0.0420, 0.0), (0.0400, 0.0026), (0.036, 0.0028), (0, 0.0028)])
-    lid = _turned(
-        [(0, 0.1240), (0.014, 0.1236), (0.024, 0.1212), (0.0285, 0.1180), (0.0290, 0.1150), (0.0320, 0.1142)]
-        + [(0.0390, 0.1125), (0.0422, 0.1095), (0.0422, 0.1060), (0.0405, 0.1050), (0.0385, 0.1056)]
-    )
-    lid_under = _turned([(0.0385, 0.1056), (0.036, 0.1056), (0, 0.1056)])
-    knob = _turned(
-        [(0, 0.1480), (0.007, 0.1478), (0.0118, 0.1440), (0.0125, 0.1380), (0.0095, 0.1325), (0.0052, 0.1295)]
-        + [(0.0050, 0.1265), (0.0085, 0.1235), (0.0090, 0.1215), (0, 0.1215)]
-    )
-    nozzle = [(-0.0960, 0.1080), (-0.0850, 0.0990), (-0.0760, 0.0790), (-0.0660, 0.0540), (-0.0400, 0.0330)]
-    outside = [(0.0052, 0.010), (0.0056, 0.001), (0.0068, -0.0012), (0.0082, 0.0006), (0.0080, 0.008)]
-    foot = _lengths(_smooth(nozzle, 200))[-1]
-    outside += [(0.0092, 0.035), (0.0128, 0.065), (0.0165, foot)]
-    grip = [(0.0330, 0.0890), (0.0560, 0.1000), (0.0870, 0.0960), (0.0900, 0.0620), (0.0740, 0.0290), (0.0440, 0.0230)]
-    end = _lengths(_smooth(grip, 200))[-1]
+    below_mouth, grip = _lengths(_smooth(NOZZLE, 200))[-1], _lengths(_smooth(GRIP, 200))[-1]
     return {
-        "body": _solid(upright, [(body[0], 3, "body_top"), (body[1], 32, "body"), (base, 9, "base")], COLUMNS),
-        "lid": _solid(upright, [(lid, 22, "lid"), (lid_under, 4, "lid_under")], COLUMNS),
-        "knob": _solid(upright, [(knob, 20, "knob")], 32),
+        "body": _turned({"body_top": 3, "body": 32, "base": 9}, COLUMNS),
+        "lid": _turned({"lid": 22, "lid_under": 4}, COLUMNS),
+        "knob": _turned({"knob": 20}, 32),
         "spout": _solid(
-            nozzle,
-            [([(0, 0.010), (0.0052, 0.010)], 2, "spout_hole"), (outside, 30, "spout")]
-            + [([(0.0165, foot), (0, foot)], 2, "spout_end")],
+            NOZZLE,
+            [
+                Stretch([(0, 0.010), (0.0052, 0.010)], 2, "spout_hole"),
+                Stretch([*MOUTH, (0.0128, 0.065), (0.0165, below_mouth)], 30, "spout"),
+                Stretch([(0.0165, below_mouth), (0, below_mouth)], 2, "spout_end"),
+            ],
             28,
         ),
         "handle": _solid(
-            grip,
-            [([(0, 0), (0.0082, 0)], 2, "handle_start"), ([(0.0082, 0), (0.0082, end)], 36, "handle")]
-            + [([(0.0082, end), (0, end)], 2, "handle_end")],
+            GRIP,
+            [
+                Stretch([(0, 0), (0.0082, 0)], 2, "handle_start"),
+                Stretch([(0.0082, 0), (0.0082, grip)], 36, "handle"),
+                Stretch([(0.0082, grip), (0, grip)], 2, "handle_end"),
+            ],
             20,
             flatness=0.62,
         ),
     }
 
 
-def _turned(points: Points) -> list[tuple[float, float]]:
-    """Profile (r, s) of points (r, height) around the upright axis."""
-    return [(r, 0.16 - height) for r, height in points]
+def _turned(rows: dict[str, int], columns: int) -> Mesh:
+    """A closed surface around the upright axis from PROFILES, by their names and numbers of rings."""
+    tallest = 0.16
+    stretches = [Stretch([(r, tallest - y) for r, y in PROFILES[name]], n, name) for name, n in rows.items()]
+    return _solid([(0.0, tallest), (0.0, 0.0)], stretches, columns)
 
 
-def _solid(axis: Points, stretches: list[tuple[Points, int, str]], columns: int, *, flatness: float = 1.0) -> Mesh:
+def _solid(axis: Points, stretches: list[Stretch], columns: int, *, flatness: float = 1.0) -> Mesh:
     """A closed surface around an axis in the plane z = 0.
 
     Args:
         axis: Control points (x, y) from the upper end to the lower one [metres].
-        stretches: Profile (r, s) [metres], number of rings, chart; each begins where the one before ends.
+        stretches: From the upper end to the lower one; each begins where the one before ends.
         flatness: Thickness in the plane of the axis over that across it.
     """
     spine = _smooth(axis, 200)
@@ -135,8 +162,8 @@ def _solid(axis: Points, stretches: list[tuple[Points, int, str]], columns: int,
     angle = np.linspace(-1.5 * math.pi, 0.5 * math.pi, columns + 1)
     angle[-1] = angle[0]  # exactly the same points on both sides of the seam
     vertices, uv, faces, count = [], [], [], 0
-    for points, rows, chart in stretches:
-        r, s = _smooth(points, rows).T
+    for stretch in stretches:
+        r, s = _smooth(stretch.profile, stretch.rows).T
         x, y = (_linear_extend(s, along, spine[:, i]) for i in (0, 1))
         tx, ty = (np.interp(s, along, tangents[:, i]) for i in (0, 1))
         length = np.hypot(tx, ty)
@@ -145,9 +172,9 @@ def _solid(axis: Points, stretches: list[tuple[Points, int, str]], columns: int,
         ahead = np.array([0.0, 0.0, 1.0]) * np.cos(angle)[:, None]
         ring = np.stack([x, y, 0 * x], -1)[:, None] + r[:, None, None] * (across + ahead)
         vertices.append(ring.reshape(-1, 3))
-        uv.append(_lay(CHARTS[chart], _lengths(np.stack([r, s], -1)), columns).reshape(-1, 2) / ATLAS)
-        faces.append(_grid_faces(rows, columns + 1) + count)
-        count += rows * (columns + 1)
+        uv.append(_lay(CHARTS[stretch.chart], _lengths(np.stack([r, s], -1)), columns).reshape(-1, 2) / ATLAS)
+        faces.append(_grid_faces(stretch.rows, columns + 1) + count)
+        count += stretch.rows * (columns + 1)
     return _welded(np.concatenate(vertices), np.concatenate(uv), np.concatenate(faces))
 
 
@@ -245,11 +272,14 @@ def _framed(printed: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "g v c"]:
 
 
 def write_object(path: Path) -> None:
-    """The pot as a GLB: metres, y up, spout to -x, handle to +x, label to +z. The same bytes every time."""
+    """The pot as a GLB: metres, y up, spout to -x, handle to +x, label to +z; on one machine always the same bytes."""
     import trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     colour, packed = (Image.fromarray(texture) for texture in atlas())
-    material = trimesh.visual.material.PBRMaterial(
+    material = PBRMaterial(
         name="enamel",
         baseColorTexture=colour,
         metallicRoughnessTexture=packed,
@@ -260,8 +290,8 @@ def write_object(path: Path) -> None:
     for name, mesh in parts().items():
         # trimesh counts v upwards.
         uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1)
-        visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+        visual = TextureVisuals(uv=uv, material=material)
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False)
         scene.add_geometry(solid, node_name=name, geom_name=name)
-    data = scene.export(file_type="glb", include_normals=True)
+    data = bytes(export_glb(scene, include_normals=True))
     files.write_whole(path, lambda partial: partial.write_bytes(data))

@@ -1,6 +1,6 @@
 // A 16-wide tree over Gaussians in the object frame, and the rays that search it.
 //
-// Gaussians are sorted along a space-filling curve; sixteen in a row are a leaf, sixteen leaves in a row a node, and so
+// Gaussians are sorted by halving space; sixteen in a row are a leaf, sixteen leaves in a row a node, and so
 // on: child c of node i is node 16 i + c of the level below, so the tree holds no pointers. A node knows the boxes of its
 // sixteen children and a cone around the normals in each: a child whose every normal faces along the ray is passed by.
 #pragma once
@@ -24,8 +24,7 @@ struct Bvh {
     Node* nodes;
     // Workspace of the build.
     float *boxes, *normals;   // low and high [n 6] and normals [n 3], later in tree order
-    u32* keys;
-    int *order, *order_2;
+    int* order;
 };
 
 struct Rays {
@@ -35,13 +34,6 @@ struct Rays {
     float *transmittance, *out;
     int *hit, *bits;
 };
-
-// Ten bits, two gaps after each.
-INLINE u32 spread(u32 x) {
-    x = (x | x << 16) & 0x30000ff, x = (x | x << 8) & 0x300f00f;
-    x = (x | x << 4) & 0x30c30c3;
-    return (x | x << 2) & 0x9249249;
-}
 
 static void leaf_fields(Bvh& t, float* W) {
     for (int first = 0; first < t.n; first += LANES) {
@@ -65,32 +57,56 @@ static void leaf_fields(Bvh& t, float* W) {
     }
 }
 
-static void sort_along_curve(Bvh& t) {
-    float low[3] = {1e30f, 1e30f, 1e30f}, high[3] = {-1e30f, -1e30f, -1e30f};
-    for (int i = 0; i < t.n; i++)
-        for (int a = 0; a < 3; a++)
-            low[a] = fmin2(low[a], t.means[3 * i + a]), high[a] = fmax2(high[a], t.means[3 * i + a]);
-    float side = 1e-20f;
-    for (int a = 0; a < 3; a++) side = fmax2(side, high[a] - low[a]);
-    for (int i = 0; i < t.n; i++) {
-        u32 x[3];
-        for (int a = 0; a < 3; a++) x[a] = (u32)fmin2((t.means[3 * i + a] - low[a]) / side * 1023, 1023);
-        t.keys[i] = spread(x[0]) << 2 | spread(x[1]) << 1 | spread(x[2]), t.order[i] = i;
-    }
-    int *from = t.order, *to = t.order_2;
-    for (int pass = 0; pass < 3; pass++) {
-        int histogram[DIGIT], start = 0;
-        clear(histogram, sizeof histogram);
-        for (int i = 0; i < t.n; i++) histogram[t.keys[i] >> 11 * pass & 2047]++;
-        for (int d = 0; d < DIGIT; d++) {
-            int count = histogram[d];
-            histogram[d] = start, start += count;
+// Move the Gaussians that come first along an axis to order[from, middle).
+static void split_at(Bvh& t, int axis, int from, int middle, int to) {
+    auto key = [&](int i) { return t.means[3 * (i64)t.order[i] + axis]; };
+    auto swap = [&](int i, int j) {
+        int other = t.order[i];
+        t.order[i] = t.order[j], t.order[j] = other;
+    };
+    while (to - from > 1) {
+        float a = key(from), b = key(from + (to - from) / 2), c = key(to - 1);
+        float pivot = fmax2(fmin2(a, b), fmin2(fmax2(a, b), c));
+        int i = from, j = to - 1;
+        while (i <= j) {
+            while (key(i) < pivot) i++;
+            while (key(j) > pivot) j--;
+            if (i <= j) swap(i++, j--);
         }
-        for (int i = 0; i < t.n; i++) to[histogram[t.keys[from[i]] >> 11 * pass & 2047]++] = from[i];
-        int* other = from;
-        from = to, to = other;
+        if (middle <= j)
+            to = j + 1;
+        else if (middle >= i)
+            from = i;
+        else
+            return;
     }
-    t.order = from, t.order_2 = to;
+}
+
+// Halve again and again across the longest side, at whole leaves and powers of two of them: so any 16^k in a row from a
+// multiple of 16^k lie together.
+static void sort_by_halving(Bvh& t) {
+    struct Range {
+        int from, to;
+    } stack[64];
+    int top = 0;
+    for (int i = 0; i < t.n; i++) t.order[i] = i;
+    stack[0] = {0, t.n};
+    while (top >= 0) {
+        Range r = stack[top--];
+        if (r.to - r.from <= WIDE) continue;
+        float low[3] = {1e30f, 1e30f, 1e30f}, high[3] = {-1e30f, -1e30f, -1e30f};
+        for (int i = r.from; i < r.to; i++)
+            for (int a = 0; a < 3; a++) {
+                float x = t.means[3 * (i64)t.order[i] + a];
+                low[a] = fmin2(low[a], x), high[a] = fmax2(high[a], x);
+            }
+        int axis = 0, half = WIDE;
+        for (int a = 1; a < 3; a++)
+            if (high[a] - low[a] > high[axis] - low[axis]) axis = a;
+        while (2 * half < r.to - r.from) half *= 2;
+        split_at(t, axis, r.from, r.from + half, r.to);
+        stack[++top] = {r.from, r.from + half}, stack[++top] = {r.from + half, r.to};
+    }
 }
 
 // Child c of a node from the Gaussians [from, to) of the sorted order.
@@ -233,59 +249,80 @@ INLINE bool is_visible(const Bvh& t, const Ray& ray) {
     return T >= t.visible;
 }
 
-struct Hit {
-    float z, alpha;
-    int id;
-};
-INLINE bool before(const Hit& a, const Hit& b) { return a.z < b.z || (a.z == b.z && a.id < b.id); }
+// Hits of a ray.
+struct Hits {
+    float z[BUFFER + LANES], alpha[BUFFER];
+    int id[BUFFER], order[BUFFER], count;
 
-// The nearest hits behind `after`, sorted, at most BUFFER - LANES; false in `all` if there are more.
-static int nearest_hits(const Bvh& t, const Ray& ray, const Hit& after, Hit* hits, bool& all) {
-    int count = 0;
-    Hit last = {1e30f, 0, 0};
-    all = true;
-    auto sort = [&] {
-        for (int i = 1; i < count; i++) {
-            Hit h = hits[i];
-            int j = i;
-            for (; j > 0 && before(h, hits[j - 1]); j--) hits[j] = hits[j - 1];
-            hits[j] = h;
+    // Into `order`, nearest first: a hit's place is the number of nearer ones. Equal distances (exact duplicates) are
+    // told apart by id.
+    METHOD void sort() {
+        store(z + count, splat(2e30f));
+        for (int i = 0; i < count; i++) {
+            vf z_i = splat(z[i]);
+            int place = 0, same = 0;
+            for (int c = 0; c < count; c += LANES) {
+                vf x = load(z + c);
+                place += __builtin_popcount(bits(x < z_i)), same += __builtin_popcount(bits(x == z_i));
+            }
+            for (int c = 0; same > 1 && c < count; c++) place += z[c] == z[i] && id[c] < id[i];
+            order[place] = i;
         }
-    };
+    }
+
+    // Keep the nearer half; returns the farthest kept.
+    inline int halve() {
+        float z_kept[BUFFER / 2], alpha_kept[BUFFER / 2];
+        int id_kept[BUFFER / 2];
+        sort();
+        count = BUFFER / 2;
+        for (int i = 0; i < count; i++)
+            z_kept[i] = z[order[i]], alpha_kept[i] = alpha[order[i]], id_kept[i] = id[order[i]];
+        for (int i = 0; i < count; i++) z[i] = z_kept[i], alpha[i] = alpha_kept[i], id[i] = id_kept[i];
+        return count - 1;
+    }
+};
+
+// Hits behind (z, id) = after, the nearest if there is no room for all; then `all` is false.
+static void collect(const Bvh& t, const Ray& ray, float after_z, int after_id, Hits& hits, bool& all) {
+    float limit_z = 1e30f;
+    int limit_id = 0;
+    hits.count = 0, all = true;
     search(t, ray, [&](vf alpha, vf z, const int* id, vi on) {
         float alphas[LANES], depths[LANES];
         store(alphas, alpha), store(depths, z);
+        on &= (z >= after_z) & (z <= limit_z);
         for (u32 b = bits(on); b; b &= b - 1) {
             int i = __builtin_ctz(b);
-            Hit h = {depths[i], alphas[i], id[i]};
-            if (before(after, h) && before(h, last)) hits[count++] = h;
+            if (depths[i] == after_z && id[i] <= after_id) continue;
+            if (depths[i] == limit_z && id[i] > limit_id) continue;
+            hits.z[hits.count] = depths[i], hits.alpha[hits.count] = alphas[i], hits.id[hits.count++] = id[i];
         }
-        if (count > BUFFER - LANES) {
-            sort(), all = false;
-            count = BUFFER / 2, last = hits[count - 1];
-        }
+        if (hits.count <= BUFFER - 2 * LANES) return true;
+        int farthest = hits.halve();
+        limit_z = hits.z[farthest], limit_id = hits.id[farthest], all = false;
         return true;
     });
-    sort();
-    return count;
+    hits.sort();
 }
 
 // Front to back along a ray; returns the dominant Gaussian.
 static int trace_ray(const Bvh& t, const Ray& ray, const float* radiance, float* transmittance, float* out) {
-    float T = 1, best = 0, sum[3] = {};
-    int dominant = -1;
+    float T = 1, best = 0, sum[3] = {}, z = -1;
+    int dominant = -1, id = 0;
     bool all = false;
-    Hit hits[BUFFER], after = {-1, 0, 0};
+    Hits hits;
     while (!all && T >= t.T_min) {
-        int count = nearest_hits(t, ray, after, hits, all);
-        for (int i = 0; i < count && T >= t.T_min; i++) {
-            float w = T * hits[i].alpha;
-            if (w > best) best = w, dominant = hits[i].id;
+        collect(t, ray, z, id, hits, all);
+        for (int place = 0; place < hits.count && T >= t.T_min; place++) {
+            int i = hits.order[place];
+            float w = T * hits.alpha[i];
+            z = hits.z[i], id = hits.id[i];
+            if (w > best) best = w, dominant = id;
             if (radiance)
-                for (int ch = 0; ch < 3; ch++) sum[ch] += w * radiance[3 * (i64)hits[i].id + ch];
+                for (int ch = 0; ch < 3; ch++) sum[ch] += w * radiance[3 * (i64)id + ch];
             T -= w;
         }
-        if (count) after = hits[count - 1];
     }
     float scale = T < t.T_min ? 1 / (1 - T) : 1;
     if (out)

@@ -72,7 +72,7 @@ API void raster_adjoint(Raster* r) {
 
 API void bvh_build(Bvh* t, float* W) {
     leaf_fields(*t, W);
-    sort_along_curve(*t);
+    sort_by_halving(*t);
     fill_tree(*t, W);
 }
 

@@ -1,0 +1,75 @@
+"""The command line: help is there, errors are one line with exit code 1, nothing needs a display."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tumble import cli
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """Exit code of the command, run inside this process."""
+    monkeypatch.setattr(sys, "argv", ["tumble", *words])
+    try:
+        cli.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+@pytest.mark.parametrize("command", ["doctor", "synth", "evaluate", "demo"])
+def test_every_command_explains_itself(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, command, "--help") == 0
+    assert f"tumble {command}" in capsys.readouterr().out
+
+
+def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "doctor") == 0
+    out = capsys.readouterr().out
+    assert "tumble synth" in out
+    assert "torch" in out
+    for line in out.splitlines():
+        if line.strip().startswith("->"):
+            assert any(word in line for word in ("install", "pip", "close", "optional")), line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["synth", "nowhere.glb", "--env", "white", "-o", "OUT"], "nowhere.glb: is missing"),
+        (["synth", "nowhere.glb", "--env", "white", "-o", "OUT", "--fov", "500"], "fov is out of range: 500"),
+        (["evaluate", "nowhere", "nowhere-either"], "nowhere-either: is not a folder"),
+    ],
+)
+def test_an_error_is_one_line_that_names_the_file_and_ends_with_code_1(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delenv("TUMBLE_DEBUG", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *(str(tmp_path / "out") if word == "OUT" else word for word in words)) == 1
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_command_ends_with_code_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "juggle") == 2
+    assert "juggle" in capsys.readouterr().err
+
+
+def test_the_installed_command_answers() -> None:
+    answer = subprocess.run([sys.executable, "-m", "tumble", "--version"], check=True, capture_output=True, text=True)
+    assert answer.stdout.startswith("tumble ")
