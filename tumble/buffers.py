@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 
@@ -20,7 +20,11 @@ class Buffers:
     """Mean outward normal, object frame; not of unit length."""
     rgb: Float[Tensor, "h w 3"]
     """Linear radiance over black (not divided by alpha)."""
-    features: dict[str, Float[Tensor, "h w ?c"]]
+    features: dict[str, Float[Tensor, "h w _"]]
     """Images of the features handed to `rasterize`, under the same names."""
     weight: Float[Tensor, " n"]
     """Blending weight of every Gaussian, summed over the view's pixels."""
+    touched: Int32[Tensor, " n"]
+    """Number of pixels under the mask that every Gaussian contributes to."""
+    dominant: Int32[Tensor, "h w"]
+    """The Gaussian of largest weight in each pixel, -1 where there is none."""

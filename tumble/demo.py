@@ -73,7 +73,7 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
             views=96,
             resolution=192,
             eval_shared=8,
-            eval_sphere=4,
+            eval_sphere=2,
             pose_free=True,
             video=True,
         )
@@ -122,7 +122,7 @@ _HEAD = """<!doctype html><html lang="en"><meta charset="utf-8"><title>tumble: t
 main { max-width: 76rem; margin: auto; padding: 2rem 1.5rem 4rem; } h1 { font-weight: 650; letter-spacing: -.02em; }
 h1 small { font-weight: 400; color: #9aa0a6; margin-left: .5rem; } h2 { margin: 2.5rem 0 0; font-weight: 600; }
 p { margin: .2rem 0 1rem; color: #9aa0a6; } img { display: block; width: 100%; height: auto; image-rendering: auto; }
-.film { display: grid; grid-template-columns: repeat(auto-fill, minmax(7rem, 1fr)); gap: 2px;
+.film { display: grid; grid-template-columns: repeat(8, 1fr); gap: 2px;
   background: #000; border-radius: 10px; overflow: hidden; }
 table { border-collapse: collapse; width: 100%; background: #000; border-radius: 10px; overflow: hidden; }
 th { text-align: right; font-weight: 500; padding: 0 .8rem; color: #b9bec4; width: 7rem; } td { padding: 1px; }

@@ -4,6 +4,7 @@ Object frame, object radius = 1. The third local axis is the *normal*, signed ou
 *thickness* (a deviation from the paper's axis of the smallest scale: an argmin flips while training).
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -63,3 +64,11 @@ def opacity(sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor,
 def sdf_from_opacity(opacity: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor, " n"]:
     """The non-negative signed distance [object radius] with a given opacity in (0, 1]: the inverse of eq. 8."""
     return 2 / gamma * torch.acosh(opacity.rsqrt())
+
+
+def constant_sh(radiance: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
+    """Harmonics of degree 0 that look the same from everywhere: linear radiance computed elsewhere, as a colour.
+
+    What a rasterizer reads back is `max(0, radiance)`.
+    """
+    return radiance[:, None] * math.sqrt(4 * math.pi)

@@ -284,14 +284,19 @@ def _render(studio: _Studio, shot: _Shot, number: int) -> None:
 
 def _render_truth(studio: _Studio, shot: _Shot, seed: int) -> np.ndarray:
     """Maps and relit pictures of an evaluation view; returns the object's coverage of its pixels."""
-    truth, exr = studio.out / "truth", Path(shot.name).with_suffix(".exr").name
+    options, truth, exr = studio.options, studio.out / "truth", Path(shot.name).with_suffix(".exr").name
     view = pathtracer.maps(studio.unlit, shot.T_cam_obj, studio.camera, samples=MAP_SAMPLES)
-    for name in capture_writer.MAPS:
+    for name in _maps(options):
         files.write_exr(truth / name / exr, getattr(view, name), half=name != "depth")
     for light in (name for name in studio.scenes if name not in ("", "probe")):
-        pixels, _ = studio.photograph(light, shot, studio.options.truth_samples, seed, "object")
+        pixels, _ = studio.photograph(light, shot, options.truth_samples, seed, "object")
         files.write_png(truth / "relit" / light / shot.name, photograph(pixels))
     return view.coverage
+
+
+def _maps(options: Options) -> tuple[str, ...]:
+    """A Lambertian surface has no roughness to speak of."""
+    return tuple(name for name in capture_writer.MAPS if options.material == "original" or name != "roughness")
 
 
 def photograph(radiance: np.ndarray) -> np.ndarray:
@@ -310,9 +315,7 @@ def _write_documents(studio: _Studio, shots: list[_Shot], lights: dict[str, Path
     files.write_json(studio.out / "truth" / "poses.json", {shot.name: _matrix(shot) for shot in training})
     frames = [capture_writer.training_frame(s.name, None if options.pose_free else _matrix(s)) for s in training]
     frames += [
-        capture_writer.evaluation_frame(
-            s.name, _matrix(s), s.region, maps=capture_writer.MAPS, lights=filter(None, lights)
-        )
+        capture_writer.evaluation_frame(s.name, _matrix(s), s.region, maps=_maps(options), lights=filter(None, lights))
         for s in shots
         if s.region is not None
     ]

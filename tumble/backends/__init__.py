@@ -23,7 +23,7 @@ import importlib
 import pkgutil
 import warnings
 from functools import cache
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int32
@@ -88,6 +88,7 @@ class Hits(NamedTuple):
     """The Gaussian of largest w_i, -1 if the ray meets none."""
 
 
+@runtime_checkable
 class Backend(Protocol):
     """A module of this folder. All float tensors of a call share one device and dtype; sizes may be zero."""
 

@@ -43,13 +43,12 @@ def trace(
     radiance: Float[Tensor, "m 3"],
 ) -> Hits:
     """See `Backend.trace`."""
-    n = bvh.means.shape[0]
-    chunk = max(1, PAIRS // max(1, n))
-    parts = [_trace(bvh, o, d, radiance) for o, d in zip(origins.split(chunk), directions.split(chunk), strict=True)]
-    if n == 0 or not parts:
-        r = origins.shape[0]
+    n, r = len(bvh.means), len(origins)
+    if n == 0 or r == 0:
         none = torch.full((r,), -1, dtype=torch.int32, device=origins.device)
         return Hits(origins.new_ones(r), origins.new_zeros(r, 3), none)
+    chunk = max(1, PAIRS // n)
+    parts = [_trace(bvh, o, d, radiance) for o, d in zip(origins.split(chunk), directions.split(chunk), strict=True)]
     return Hits(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
 

@@ -15,11 +15,16 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from tumble.backends._structs import STRUCTURES
+
 SOURCES = Path(__file__).parent / "native"
-FLAGS = "-std=c++17 -O3 -fPIC -shared -fvisibility=hidden -fno-exceptions -fno-rtti -fno-math-errno -Wno-psabi".split()
+FLAGS = (
+    *("-std=c++17", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-Wno-psabi"),
+    *("-fno-exceptions", "-fno-rtti", "-fno-math-errno", "-pthread"),
+)
 """Never -ffast-math: it folds the rounding trick of the kernels' exp away."""
-VARIANTS = (("-march=native", "-fopenmp"), ("-march=native",), ("-fopenmp",), ())
-"""Tried in this order: some compilers lack OpenMP, some do not know their own processor."""
+VARIANTS = (("-march=native",), ("-mcpu=native",), ())
+"""Tried in this order: not every compiler knows its own processor, nor by the same word."""
 COMPILERS = ("c++", "g++", "clang++")
 
 
@@ -36,13 +41,13 @@ def library() -> ctypes.CDLL:
     """
     compiler = find_compiler()
     name = f"kernels-{_build_hash(compiler)}.so"
-    for folder in _cache_folders():
-        path = folder / name
-        if path.is_file():
-            return ctypes.CDLL(str(path))
-    path = _writable(_cache_folders()) / name
-    compile_to(path, compiler)
-    return ctypes.CDLL(str(path))
+    path = next((folder / name for folder in _cache_folders() if (folder / name).is_file()), None)
+    if path is None:
+        path = _writable(_cache_folders()) / name
+        compile_to(path, compiler)
+    kernels = ctypes.CDLL(str(path))
+    assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), "layouts differ"
+    return kernels
 
 
 def find_compiler() -> str:

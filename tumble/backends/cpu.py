@@ -1,9 +1,10 @@
-"""The contract of this folder on the processor: float32, SIMD and OpenMP, through a plain C ABI (see `native/`).
+"""The contract of this folder on the processor: float32, SIMD and threads, through a plain C ABI (see `native/`).
 
 `autograd.Function`s around the kernels: save, launch, return. The number of threads is torch's.
 """
 
 import ctypes
+import threading
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +27,7 @@ from tumble.backends import (
     Rendering,
     _native,
 )
+from tumble.backends._structs import Bvh, Raster, Rays, Shade, point
 
 TILE, RECORD, GEOMETRY, SPAN, CAMERA = 8, 32, 16, 5, 16
 """Sizes in `native/raster.h`."""
@@ -62,29 +64,13 @@ def rasterize(
     """One view of the Gaussians; see `Backend.rasterize`."""
     geometry = (means, quats, scales, opacity, sh)
     camera = (R_cam_obj, t_cam_obj, fx_fy_cx_cy, height, width, mask)
-    groups = corners.split(FEATURES_AT_ONCE, 2)
-    first, *rest = (Rendering(*_Rasterize.apply(*geometry, group, *camera)) for group in groups)
-    if not rest:
+    # A slice of everything would cost its backward pass a copy.
+    group = corners if corners.shape[2] <= FEATURES_AT_ONCE else corners[..., :FEATURES_AT_ONCE]
+    first = Rendering(*_Rasterize.apply(*geometry, group, *camera))
+    if corners.shape[2] <= FEATURES_AT_ONCE:
         return first
-    return first._replace(features=torch.cat([first.features, *(view.features for view in rest)], -1))
-
-
-class _Raster(ctypes.Structure):
-    """`struct Raster` of `native/raster.h`, field by field."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in "means quats scales opacity sh corners R t focal mask".split()),
-        *((name, ctypes.c_int) for name in "n k c height width threads".split()),
-        *((name, ctypes.c_float) for name in "alpha_max alpha_min T_min facing near near_sigmas corner".split()),
-        *((name, ctypes.c_int) for name in "record_size gradient_size channel_vectors mask_stride".split()),
-        *((name, ctypes.c_void_p) for name in "record span keys ranks ranks_2 counts tile_start list".split()),
-        *((name, ctypes.c_int) for name in "n_drawn n_pairs".split()),
-        *((name, ctypes.c_void_p) for name in "rgb alpha depth depth_var normal features weight".split()),
-        *((name, ctypes.c_void_p) for name in "touched dominant weight_parts touched_parts".split()),
-        *((name, ctypes.c_void_p) for name in "v_rgb v_alpha v_depth v_depth_var v_normal v_features".split()),
-        *((name, ctypes.c_void_p) for name in "parts camera_parts v_means v_quats v_scales v_opacity".split()),
-        *((name, ctypes.c_void_p) for name in "v_sh v_corners v_camera".split()),
-    ]
+    rest = rasterize(*geometry, corners[..., FEATURES_AT_ONCE:], *camera)
+    return first._replace(features=torch.cat([first.features, rest.features], -1))
 
 
 class _Rasterize(torch.autograd.Function):
@@ -95,9 +81,9 @@ class _Rasterize(torch.autograd.Function):
         n, k, c = len(inputs[0]), inputs[4].shape[1], inputs[5].shape[2]
         mask = (mask if mask.numel() == 1 else mask.expand(height, width)).contiguous()
         r = _raster(n, k, c, height, width, mask.numel() > 1)
-        kept = _point(r, dict(zip(_INPUTS, inputs, strict=True)), mask=mask)
+        kept = point(r, dict(zip(_INPUTS, inputs, strict=True)), mask=mask)
         n_tiles = -(-height // TILE) * -(-width // TILE)
-        kept += _point(
+        kept += point(
             r,
             record=torch.empty(n * r.record_size),
             span=torch.empty(n * SPAN),
@@ -118,27 +104,28 @@ class _Rasterize(torch.autograd.Function):
             "touched": _int32(n),
             "dominant": _int32(height, width),
         }
-        parts = _point(r, weight_parts=torch.empty(r.threads * n), touched_parts=_int32(r.threads * n))
-        kept += _point(r, list=_int32(_native.library().raster_prepare(ctypes.byref(r))))
-        _point(r, results)
+        parts = point(r, weight_parts=torch.empty(r.threads * n), touched_parts=_int32(r.threads * n))
+        kept += point(r, list=_int32(_native.library().raster_prepare(ctypes.byref(r))))
+        point(r, results)
         _native.library().raster_forward(ctypes.byref(r))
         del parts
         ctx.raster, ctx.kept, ctx.n_inputs = r, kept, len(args)
         ctx.save_for_backward(*inputs, *(results[name] for name in _SEEDED))
+        ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(results["weight"], results["touched"], results["dominant"])
         return tuple(results.values())
 
     @staticmethod
     def backward(ctx: Any, *v_results: Any) -> tuple[Tensor | None, ...]:
         r, inputs = ctx.raster, ctx.saved_tensors[: len(_INPUTS)]
-        seeds = [v.contiguous() for v in v_results[: len(_SEEDED)]]
+        seeds = [None if v is None else v.contiguous() for v in v_results[: len(_SEEDED)]]
         gradients = [torch.empty_like(x) for x in inputs[:6]]
         camera = torch.empty(CAMERA)
-        kept = _point(r, dict(zip((f"v_{name}" for name in _SEEDED), seeds, strict=True)), v_camera=camera)
-        kept += _point(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
-        kept += _point(
+        kept = point(r, dict(zip((f"v_{name}" for name in _SEEDED), seeds, strict=True)), v_camera=camera)
+        kept += point(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
+        kept += point(
             r,
-            parts=torch.empty(r.threads * r.n * r.gradient_size),
+            parts=_scratch(r.threads * r.n * r.gradient_size),
             camera_parts=torch.empty(r.threads * CAMERA),
         )
         _native.library().raster_adjoint(ctypes.byref(r))
@@ -151,11 +138,12 @@ _SEEDED = ("rgb", "alpha", "depth", "depth_var", "normal", "features")
 """The results that have a gradient."""
 
 
-def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> _Raster:
+def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Raster:
     """Sizes and constants of one view."""
     lanes = _native.library().lanes()
-    vectors = -(-(6 + -(-c // 4) * 4) // lanes)
-    return _Raster(
+    c_drawn = -(-c // 4) * 4
+    fixed_width, corner_width = (-(-x // lanes) * lanes for x in (6, c_drawn))
+    return Raster(
         n=n,
         k=k,
         c=c,
@@ -169,50 +157,33 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> _R
         near=NEAR,
         near_sigmas=NEAR_SIGMAS,
         corner=CORNER,
-        record_size=RECORD + -(-c // 4) * 16,
-        gradient_size=GEOMETRY + vectors * lanes * (4 if c else 1),
-        channel_vectors=vectors,
+        record_size=RECORD + 4 * c_drawn,
+        gradient_size=GEOMETRY + fixed_width + 4 * corner_width,
+        fixed_width=fixed_width,
+        corner_width=corner_width,
         mask_stride=int(masked),
     )
 
 
-def _point(struct: ctypes.Structure, tensors: dict[str, Tensor] | None = None, **more: Tensor) -> list[Tensor]:
-    """Set pointer fields to tensors; these must outlive the call, so they are handed back."""
-    for name, tensor in {**(tensors or {}), **more}.items():
-        setattr(struct, name, tensor.data_ptr())
-    return [*(tensors or {}).values(), *more.values()]
+def _scratch(n: int) -> Tensor:
+    """Room for n numbers until the next call in this thread: fresh pages would cost as much as a small picture."""
+    room = getattr(_kept, "room", None)
+    if room is None or len(room) < n:
+        _kept.room = room = torch.empty(n)
+    return room
+
+
+_kept = threading.local()
 
 
 def _int32(*shape: int) -> Int32[Tensor, "..."]:
     return torch.empty(shape, dtype=torch.int32)
 
 
-class _Bvh(ctypes.Structure):
-    """`struct Bvh` of `native/bvh.h`, field by field."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in "means quats scales opacity".split()),
-        *((name, ctypes.c_int) for name in "n n_leaves n_levels".split()),
-        ("first_node", ctypes.c_int * LEVELS),
-        *((name, ctypes.c_float) for name in "sigmas alpha_max alpha_min T_min visible".split()),
-        *((name, ctypes.c_void_p) for name in "leaves nodes boxes normals order".split()),
-    ]
-
-
-class _Rays(ctypes.Structure):
-    """`struct Rays` of `native/bvh.h`, field by field."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in "bvh origins directions radiance normals".split()),
-        *((name, ctypes.c_int) for name in "n_rays n_directions words threads has_radiance".split()),
-        *((name, ctypes.c_void_p) for name in "transmittance out hit bits".split()),
-    ]
-
-
 class Tree(NamedTuple):
     """What `build` hands to the tracing functions."""
 
-    bvh: _Bvh
+    bvh: Bvh
     memory: list[Tensor]
     """Leaves and nodes, to which the former points."""
 
@@ -230,7 +201,7 @@ def build(
     while len(counts) < 2 or counts[-1] > 1:
         counts.append(max(1, -(-counts[-1] // WIDE)))
     first_node = [sum(counts[1:level]) for level in range(1, len(counts))]
-    t = _Bvh(
+    t = Bvh(
         n=n,
         n_leaves=counts[0],
         n_levels=len(first_node),
@@ -242,9 +213,9 @@ def build(
         visible=VISIBLE,
     )
     inputs = [x.contiguous() for x in (means, quats, scales, opacity)]
-    _point(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
-    memory = _point(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
-    work = _point(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
+    point(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
+    memory = point(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
+    work = point(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
     W = torch.empty(n * 9)
     _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(W.data_ptr()))
     del work
@@ -262,7 +233,7 @@ def trace(
     r = len(origins)
     hits = Hits(torch.empty(r), torch.empty(r, 3), _int32(r))
     rays = _rays(bvh, origins, directions, radiance=radiance)
-    _point(rays.struct, transmittance=hits.transmittance, out=hits.radiance, hit=hits.hit)
+    point(rays.struct, transmittance=hits.transmittance, out=hits.radiance, hit=hits.hit)
     _native.library().rays_trace(ctypes.byref(rays.struct))
     return hits
 
@@ -277,7 +248,7 @@ def visible(
     """See `Backend.visible`."""
     rays = _rays(bvh, points, directions, normals=normals)
     bits = _int32(len(points), rays.struct.words)
-    _point(rays.struct, bits=bits)
+    point(rays.struct, bits=bits)
     _native.library().rays_visible(ctypes.byref(rays.struct))
     return bits
 
@@ -293,19 +264,19 @@ def blockers(
     """See `Backend.blockers`."""
     rays = _rays(bvh, points, directions, normals=normals, bits=visibility)
     hit = _int32(len(points), len(directions))
-    _point(rays.struct, hit=hit)
+    point(rays.struct, hit=hit)
     _native.library().rays_blockers(ctypes.byref(rays.struct))
     return hit
 
 
 class _Launch(NamedTuple):
-    struct: _Rays
+    struct: Rays
     kept: list[Tensor]
 
 
 def _rays(bvh: Tree, origins: Tensor, directions: Tensor, **more: Tensor) -> _Launch:
     """Arguments of a search, and the tensors they point to."""
-    struct = _Rays(
+    struct = Rays(
         bvh=ctypes.addressof(bvh.bvh),
         n_rays=len(origins),
         n_directions=len(directions),
@@ -314,22 +285,7 @@ def _rays(bvh: Tree, origins: Tensor, directions: Tensor, **more: Tensor) -> _La
         has_radiance=int("radiance" in more and len(more["radiance"]) > 0),
     )
     tensors = {"origins": origins, "directions": directions, **more}
-    return _Launch(struct, _point(struct, {name: x.contiguous() for name, x in tensors.items()}))
-
-
-class _Shade(ctypes.Structure):
-    """`struct Shade` of `native/shade.h`, field by field."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in "normal albedo roughness view directions radiance".split()),
-        *((name, ctypes.c_void_p) for name in "visibility blocker blocker_radiance".split()),
-        *((name, ctypes.c_int) for name in "n_points n_directions stride words n_blockers threads".split()),
-        *((name, ctypes.c_int) for name in "blocker_point_stride blocker_direction_stride".split()),
-        *((name, ctypes.c_float) for name in "f0 roughness_min".split()),
-        *((name, ctypes.c_void_p) for name in "out v_out radiance_parts blocker_parts".split()),
-        *((name, ctypes.c_void_p) for name in "v_normal v_albedo v_roughness v_view".split()),
-        *((name, ctypes.c_void_p) for name in "v_radiance v_blocker_radiance".split()),
-    ]
+    return _Launch(struct, point(struct, {name: x.contiguous() for name, x in tensors.items()}))
 
 
 def shade(
@@ -356,8 +312,9 @@ class _ShadeFunction(torch.autograd.Function):
         tensors = [x.contiguous() for x in tensors]
         out = torch.empty_like(tensors[0])
         struct, kept = _shade_launch(tensors, f0)
-        _point(struct, out=out)
+        point(struct, out=out)
         _native.library().shade_forward(ctypes.byref(struct))
+        del kept
         ctx.f0 = f0
         ctx.save_for_backward(*tensors)
         return out
@@ -368,8 +325,8 @@ class _ShadeFunction(torch.autograd.Function):
         struct, kept = _shade_launch(tensors, ctx.f0)
         *v_surface, v_radiance, v_blocker = (torch.empty_like(x) for x in tensors[:6])
         v_rows = torch.empty(3, struct.stride)
-        kept += _point(struct, dict(zip(("v_normal", "v_albedo", "v_roughness", "v_view"), v_surface, strict=True)))
-        kept += _point(
+        kept += point(struct, dict(zip(("v_normal", "v_albedo", "v_roughness", "v_view"), v_surface, strict=True)))
+        kept += point(
             struct,
             v_out=v_out.contiguous(),
             v_radiance=v_rows,
@@ -382,14 +339,14 @@ class _ShadeFunction(torch.autograd.Function):
         return (*v_surface, v_radiance, v_blocker, None, None, None, None)
 
 
-def _shade_launch(tensors: Any, f0: float) -> tuple[_Shade, list[Tensor]]:
+def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
     """Arguments of a shading, and the tensors they point to. Directions and radiance become padded rows."""
     normal, albedo, roughness, view, radiance, blocker_radiance, directions, visibility, blocker = tensors
     lanes = _native.library().lanes()
     padding = -len(directions) % lanes
     rows = {"directions": directions, "radiance": radiance}
-    rows = {name: torch.nn.functional.pad(x.T, (0, padding)) for name, x in rows.items()}
-    struct = _Shade(
+    rows = {name: torch.nn.functional.pad(x.T, (0, padding)).contiguous() for name, x in rows.items()}
+    struct = Shade(
         n_points=len(normal),
         n_directions=len(directions),
         stride=len(directions) + padding,
@@ -402,5 +359,5 @@ def _shade_launch(tensors: Any, f0: float) -> tuple[_Shade, list[Tensor]]:
         roughness_min=ROUGHNESS_MIN,
     )
     rest = {"normal": normal, "albedo": albedo, "roughness": roughness, "view": view, "visibility": visibility}
-    kept = _point(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
+    kept = point(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
     return struct, kept

@@ -146,7 +146,7 @@ static void fill_tree(Bvh& t, const float* W) {
     i64 reach = WIDE;   // Gaussians below a child
     int below = t.n_leaves;
     for (int level = 0; level < t.n_levels; level++, reach *= WIDE) {
-        int count = (below + WIDE - 1) / WIDE;
+        int count = imax2(1, (below + WIDE - 1) / WIDE);
         for (int i = 0; i < count; i++)
             for (int c = 0; c < WIDE; c++) {
                 i64 from = (i64)(i * WIDE + c) * reach, to = from + reach;

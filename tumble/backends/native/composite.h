@@ -22,8 +22,10 @@ INLINE Block block_at(const Raster& r, int x0, int y0) {
     return b;
 }
 
+// Zero where there is no image.
 INLINE vf read(const float* image, const Block& b, int stride, int channel) {
     float x[LANES];
+    if (!image) return vf{};
     for (int l = 0; l < LANES; l++) x[l] = image[b.pixel[l] * stride + channel];
     return load(x);
 }
@@ -134,14 +136,29 @@ static void composite_block(const Raster& r, const Block& b, const int* list, in
     write((float*)r.dominant, b, 1, 0, (vf)dominant);
 }
 
+// Numbers in whole vectors.
+template <int N>
+constexpr int PADDED = (N + LANES - 1) / LANES * LANES;
+
 // dL/d(sums) at a block's pixels.
 template <int C>
 struct Seeds {
     vf red, green, blue, nx, ny, nz, alpha, z, zz, rem;
     vf features[C + 1];
-    // The channels again, one row a pixel: rgb, normal, features.
-    float rows[LANES][(6 + C + LANES - 1) / LANES * LANES];
+    // The channels again, one row a pixel: rgb and normal; features.
+    float fixed_rows[LANES][PADDED<6>], feature_rows[LANES][PADDED<C + !C>];
 };
+
+// Channels of a block's pixels as one row a pixel.
+template <int C, int N>
+INLINE void lay_out(const vf* channels, float (*rows)[N]) {
+    clear(rows, 4 * LANES * N);
+    for (int ch = 0; ch < C; ch++) {
+        float x[LANES];
+        store(x, channels[ch]);
+        for (int l = 0; l < LANES; l++) rows[l][ch] = x[l];
+    }
+}
 
 template <int C>
 INLINE void seed(const Raster& r, const Block& b, Seeds<C>& s) {
@@ -166,28 +183,23 @@ INLINE void seed(const Raster& r, const Block& b, Seeds<C>& s) {
     s.zz = v_var * inv;
     s.z = (read(r.v_depth, b, 1, 0) - 2.0f * mean * v_var) * inv;
     s.alpha -= s.z * mean + s.zz * (read(r.depth_var, b, 1, 0) + mean * mean);
-    vf all[6 + C] = {s.red, s.green, s.blue, s.nx, s.ny, s.nz};
-    for (int ch = 0; ch < C; ch++) all[6 + ch] = s.features[ch];
-    clear(s.rows, sizeof s.rows);
-    for (int ch = 0; ch < 6 + C; ch++) {
-        float x[LANES];
-        store(x, all[ch]);
-        for (int l = 0; l < LANES; l++) s.rows[l][ch] = x[l];
-    }
+    vf fixed[6] = {s.red, s.green, s.blue, s.nx, s.ny, s.nz};
+    lay_out<6>(fixed, s.fixed_rows), lay_out<C>(s.features, s.feature_rows);
 }
 
-// to[0..] += sum over pixels of w times the row of channels.
-template <int N>
-INLINE void add_channels(float* to, vf w, const float (*rows)[N]) {
-    float x[LANES];
-    store(x, w);
+// to[k][0..] += sum over pixels of w[k] times the row of channels, for M weightings k.
+template <int M, int N>
+INLINE void add_channels(float* to, const vf* w, const float (*rows)[N]) {
+    float x[M][LANES];
+    for (int k = 0; k < M; k++) store(x[k], w[k]);
     for (int j = 0; j < N; j += LANES) {
-        vf even = load(to + j), odd = {};
+        vf even[M], odd[M] = {};
+        for (int k = 0; k < M; k++) even[k] = load(to + k * N + j);
         for (int l = 0; l < LANES; l += 2) {
-            even += x[l] * load(rows[l] + j);
-            odd += x[l + 1] * load(rows[l + 1] + j);
+            vf row = load(rows[l] + j), next = load(rows[l + 1] + j);
+            for (int k = 0; k < M; k++) even[k] += x[k][l] * row, odd[k] += x[k][l + 1] * next;
         }
-        store(to + j, even + odd);
+        for (int k = 0; k < M; k++) store(to + k * N + j, even[k] + odd[k]);
     }
 }
 
@@ -224,12 +236,10 @@ static void adjoint_block(const Raster& r, const Block& b, const int* list, int 
             x[G_UX] = zu * p.dx, x[G_UY] = zu * p.dy, x[G_EU] = v_u * zeta_1;
             x[G_VX] = zv * p.dx, x[G_VY] = zv * p.dy, x[G_EV] = v_v * zeta_1;
             vf wu = w * c.u, w1 = w - wu, w11 = wu * c.v, w01 = w1 * c.v;
-            const int step = sizeof s.rows[0] / 4;
-            add_channels(out + GEOMETRY, w1 - w01, s.rows), add_channels(out + GEOMETRY + step, wu - w11, s.rows);
-            add_channels(out + GEOMETRY + 2 * step, w01, s.rows), add_channels(out + GEOMETRY + 3 * step, w11, s.rows);
-        } else {
-            add_channels(out + GEOMETRY, w, s.rows);
+            const vf parts_of_w[4] = {w1 - w01, wu - w11, w01, w11};
+            add_channels<4>(out + GEOMETRY + PADDED<6>, parts_of_w, s.feature_rows);
         }
+        add_channels<1>(out + GEOMETRY, &w, s.fixed_rows);
         rem -= w * value;
         vf v_alpha = T * value - rem / (1.0f - p.alpha);
         v_alpha = keep(p.on & (p.raw <= r.alpha_max), v_alpha);

@@ -1,12 +1,113 @@
-// Static shares: share i of n of a phase is the same work whoever runs it, so results repeat bit for bit for a fixed
-// number of shares.
+// Threads that wait between phases. Share i of n of a phase is the same work whoever runs it, so results repeat bit for
+// bit for a fixed number of shares.
+//
+// A pool of our own, not OpenMP: some compilers lack that, and its threads spin while they wait, which on a busy machine
+// takes the very core that the others wait for. These spin for microseconds, then sleep.
 #pragma once
 #include "simd.h"
 
+#if defined(__unix__) || defined(__APPLE__)
+extern "C" {
+int pthread_create(void*, const void*, void* (*)(void*), void*);
+int pthread_mutex_init(void*, const void*);
+int pthread_mutex_lock(void*);
+int pthread_mutex_unlock(void*);
+int pthread_cond_init(void*, const void*);
+int pthread_cond_wait(void*, void*);
+int pthread_cond_broadcast(void*);
+int getpid();
+}
+
+enum { MAX_WORKERS = 255, SPINS = 2000 };
+
+struct Pool {
+    // Larger than any system's mutex or condition.
+    alignas(64) char mutex[256], wake[256], done[256];
+    int n_workers, pid, busy;
+    int generation, left;   // of the phase at hand: its number, and the workers still on it
+    void (*phase)(void*, int);
+    void* context;
+    int shares;
+    struct Start {
+        int worker, generation;
+    } starts[MAX_WORKERS + 1];
+};
+static Pool pool;
+
+INLINE int peek(const int* x) { return __atomic_load_n(x, __ATOMIC_ACQUIRE); }
+INLINE void pause_briefly() {
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#endif
+}
+
+INLINE void run_shares(int first) {
+    for (int share = first; share < pool.shares; share += pool.n_workers + 1) pool.phase(pool.context, share);
+}
+
+static void* work(void* argument) {
+    Pool::Start start = *(Pool::Start*)argument;
+    for (int seen = start.generation;; seen++) {
+        for (int i = 0; i < SPINS && peek(&pool.generation) == seen; i++) pause_briefly();
+        if (peek(&pool.generation) == seen) {
+            pthread_mutex_lock(pool.mutex);
+            while (peek(&pool.generation) == seen) pthread_cond_wait(pool.wake, pool.mutex);
+            pthread_mutex_unlock(pool.mutex);
+        }
+        run_shares(start.worker);
+        if (__atomic_sub_fetch(&pool.left, 1, __ATOMIC_ACQ_REL)) continue;
+        pthread_mutex_lock(pool.mutex);
+        pthread_cond_broadcast(pool.done);
+        pthread_mutex_unlock(pool.mutex);
+    }
+    return nullptr;
+}
+
+// As many workers as asked for, or as the system gives. A child of fork() has none of its parent's.
+static void hire(int wanted) {
+    if (pool.pid != getpid()) {
+        pthread_mutex_init(pool.mutex, nullptr);
+        pthread_cond_init(pool.wake, nullptr), pthread_cond_init(pool.done, nullptr);
+        pool.n_workers = 0, pool.pid = getpid();
+    }
+    while (pool.n_workers < imin2(wanted, MAX_WORKERS)) {
+        int next = pool.n_workers + 1;
+        alignas(16) char thread[64];
+        pool.starts[next] = {next, pool.generation};
+        if (pthread_create(thread, nullptr, work, &pool.starts[next])) return;
+        pool.n_workers = next;
+    }
+}
+
+static void run_phase(int shares, void (*phase)(void*, int), void* context) {
+    pool.shares = shares, pool.phase = phase, pool.context = context;
+    hire(shares - 1);
+    __atomic_store_n(&pool.left, pool.n_workers, __ATOMIC_RELEASE);
+    pthread_mutex_lock(pool.mutex);
+    __atomic_add_fetch(&pool.generation, 1, __ATOMIC_ACQ_REL);
+    pthread_cond_broadcast(pool.wake);
+    pthread_mutex_unlock(pool.mutex);
+    run_shares(0);
+    for (int i = 0; i < SPINS && peek(&pool.left); i++) pause_briefly();
+    pthread_mutex_lock(pool.mutex);
+    while (peek(&pool.left)) pthread_cond_wait(pool.done, pool.mutex);
+    pthread_mutex_unlock(pool.mutex);
+}
+
+// Calls phase(share) for every share. Without a free pool (one share, or another thread at it) one after the other.
 template <class F>
 INLINE void parallel(int shares, F phase) {
-#if defined(_OPENMP)
-#pragma omp parallel for schedule(static, 1) num_threads(shares) if (shares > 1)
-#endif
+    auto call = [](void* f, int share) { (*(F*)f)(share); };
+    if (shares > 1 && !__atomic_exchange_n(&pool.busy, 1, __ATOMIC_ACQUIRE)) {
+        run_phase(shares, call, &phase);
+        __atomic_store_n(&pool.busy, 0, __ATOMIC_RELEASE);
+        return;
+    }
     for (int share = 0; share < shares; share++) phase(share);
 }
+#else
+template <class F>
+INLINE void parallel(int shares, F phase) {
+    for (int share = 0; share < shares; share++) phase(share);
+}
+#endif

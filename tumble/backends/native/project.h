@@ -13,6 +13,14 @@ INLINE V3 cross(V3 a, V3 b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
+struct V2 {
+    vf x, y;
+};
+INLINE V2 operator+(V2 a, V2 b) { return {a.x + b.x, a.y + b.y}; }
+INLINE V2 operator*(V2 a, vf s) { return {a.x * s, a.y * s}; }
+INLINE vf dot(V2 a, V2 b) { return a.x * b.x + a.y * b.y; }
+INLINE vf cross(V2 a, V2 b) { return a.x * b.y - a.y * b.x; }
+
 // Row-major 3x3, either of vectors or (splatted) of the camera.
 struct M3 {
     vf m[9];
@@ -120,9 +128,13 @@ struct Projected {
     vf q[4], q_scale;        // unit quaternion, 1 / length of the given one
     M3 R_obj_local, M;       // M: local to camera
     V3 mu, mu_cam, p, s, inv_s;   // mu_cam = R mu, p = mu_cam + t
-    V3 P, E1, E2, C1, C2;    // whitened centre, whitened pixel steps, their cross products
-    vf N, inv_N, inv_z;      // N = |P|^2
-    vf a, b, c, bx, by;      // b is half of raster.h's
+    // Whitened centre and pixel steps: their first two parts, and the third as n = normal.p, e = step / centre and
+    // tau = (s_3 / n)^2, so that the thickness comes in through tau alone and nothing cancels when it is small.
+    V2 P, E1, E2;
+    vf n, e1, e2, tau;
+    // F = E - e P, g = P x E, w = P.E, h = 1 / (1 + tau P.P), S = F.F + tau g g.
+    V2 F1, F2;
+    vf g1, g2, w1, w2, PP, h, S11, S12, S22, inv_n, inv_z;
     V3 dir_p, dir;           // object-frame direction, before and after normalisation
     vf dir_scale;
     vf Y[16], raw[3];        // colour before the clamp
@@ -146,14 +158,19 @@ INLINE Projected project(const Raster& r, const Camera& cam, int first, int coun
     o.mu_cam = mul(cam.R, o.mu);
     o.p = o.mu_cam + cam.t;
     o.inv_z = 1.0f / o.p.z;
-    o.P = mul_T(o.M, o.p) * o.inv_s;
-    o.E1 = row(o.M, 0) * o.inv_s * (1.0f / cam.fx);
-    o.E2 = row(o.M, 1) * o.inv_s * (1.0f / cam.fy);
-    o.C1 = cross(o.P, o.E1), o.C2 = cross(o.P, o.E2);
-    o.N = dot(o.P, o.P), o.inv_N = 1.0f / o.N;
-    vf f = o.p.z * o.p.z * o.inv_N, g = o.p.z * o.inv_N;
-    o.a = f * dot(o.C1, o.C1), o.b = f * dot(o.C1, o.C2), o.c = f * dot(o.C2, o.C2);
-    o.bx = g * dot(o.P, o.E1), o.by = g * dot(o.P, o.E2);
+    V3 P = mul_T(o.M, o.p);
+    vf inv_fx = 1.0f / cam.fx, inv_fy = 1.0f / cam.fy;
+    o.P = {P.x * o.inv_s.x, P.y * o.inv_s.y};
+    o.E1 = {o.M(0, 0) * o.inv_s.x * inv_fx, o.M(0, 1) * o.inv_s.y * inv_fx};
+    o.E2 = {o.M(1, 0) * o.inv_s.x * inv_fy, o.M(1, 1) * o.inv_s.y * inv_fy};
+    o.n = P.z, o.inv_n = 1.0f / o.n;
+    o.e1 = o.M(0, 2) * inv_fx * o.inv_n, o.e2 = o.M(1, 2) * inv_fy * o.inv_n;
+    o.tau = o.s.z * o.inv_n * (o.s.z * o.inv_n);
+    o.F1 = o.E1 + o.P * -o.e1, o.F2 = o.E2 + o.P * -o.e2;
+    o.g1 = cross(o.P, o.E1), o.g2 = cross(o.P, o.E2), o.w1 = dot(o.P, o.E1), o.w2 = dot(o.P, o.E2);
+    o.PP = dot(o.P, o.P), o.h = 1.0f / (1.0f + o.tau * o.PP);
+    o.S11 = dot(o.F1, o.F1) + o.tau * o.g1 * o.g1, o.S22 = dot(o.F2, o.F2) + o.tau * o.g2 * o.g2;
+    o.S12 = dot(o.F1, o.F2) + o.tau * o.g1 * o.g2;
     o.dir_p = mul_T(cam.R, o.p);
     o.dir_scale = 1.0f / vsqrt(dot(o.dir_p, o.dir_p));
     o.dir = o.dir_p * o.dir_scale;
@@ -197,7 +214,9 @@ static void project_share(Raster& r, int share) {
         u32 drawn = bits(outline(r, cam, o, cut, span));
         vf uv = splat(1.0f / (2.0f * r.corner)), f[RECORD] = {};
         f[CX] = cam.cx + cam.fx * o.p.x * o.inv_z, f[CY] = cam.cy + cam.fy * o.p.y * o.inv_z;
-        f[KA] = o.a, f[KB] = 2.0f * o.b, f[KC] = o.c, f[BX] = o.bx, f[BY] = o.by, f[KAPPA] = o.inv_N;
+        vf zh = o.p.z * o.h, zzh = o.p.z * zh;
+        f[KA] = zzh * o.S11, f[KB] = 2.0f * zzh * o.S12, f[KC] = zzh * o.S22;
+        f[BX] = zh * (o.e1 + o.tau * o.w1), f[BY] = zh * (o.e2 + o.tau * o.w2), f[KAPPA] = o.tau * o.h;
         f[CUT] = cut, f[OPACITY] = o.opacity, f[PZ] = o.p.z, f[DZ] = o.mu_cam.z;
         for (int ch = 0; ch < 3; ch++) f[RED + ch] = vmax(o.raw[ch], vf{});
         for (int i = 0; i < 3; i++) f[NX + i] = o.R_obj_local(i, 2);
@@ -229,15 +248,22 @@ static void project_share(Raster& r, int share) {
 // R (9), t (3), focal lengths and principal point (4).
 INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected& o, const vf* g, V3 v_rgb,
                             V3 v_normal, vi drawn, int first, int count, vf* camera) {
-    vf z = o.p.z, iz = o.inv_z, uv = splat(1.0f / (2.0f * r.corner)), f = z * z * o.inv_N, h = z * o.inv_N;
-    // Conic.
-    vf v_b = 2.0f * g[G_B], sum = g[G_A] * o.a + v_b * o.b + g[G_C] * o.c;
-    V3 v_C1 = o.C1 * (2.0f * f * g[G_A]) + o.C2 * (f * v_b), v_C2 = o.C2 * (2.0f * f * g[G_C]) + o.C1 * (f * v_b);
-    vf v_beta = g[G_BX] * o.bx + g[G_BY] * o.by;
-    vf v_N = -o.inv_N * (sum + v_beta + o.inv_N * g[G_KAPPA]);
-    V3 v_P = cross(o.E1, v_C1) + cross(o.E2, v_C2) + o.E1 * (h * g[G_BX]) + o.E2 * (h * g[G_BY]) + o.P * (2.0f * v_N);
-    V3 v_E1 = cross(v_C1, o.P) + o.P * (h * g[G_BX]), v_E2 = cross(v_C2, o.P) + o.P * (h * g[G_BY]);
-    vf v_z = g[G_PZ] + iz * (2.0f * sum + v_beta);
+    vf z = o.p.z, iz = o.inv_z, uv = splat(1.0f / (2.0f * r.corner)), zh = z * o.h, zzh = z * zh;
+    // Conic, slant and kappa.
+    vf v_S11 = zzh * g[G_A], v_S12 = 2.0f * zzh * g[G_B], v_S22 = zzh * g[G_C];
+    vf m1 = o.e1 + o.tau * o.w1, m2 = o.e2 + o.tau * o.w2;
+    vf conic = v_S11 * o.S11 + v_S12 * o.S12 + v_S22 * o.S22, slant = zh * (g[G_BX] * m1 + g[G_BY] * m2);
+    vf v_z = g[G_PZ] + iz * (2.0f * conic + slant);
+    vf h_v_h = conic + slant + o.tau * o.h * g[G_KAPPA];   // h dL/dh
+    vf v_w1 = zh * o.tau * g[G_BX], v_w2 = zh * o.tau * g[G_BY];
+    vf v_tau = v_S11 * o.g1 * o.g1 + v_S12 * o.g1 * o.g2 + v_S22 * o.g2 * o.g2 +
+               zh * (g[G_BX] * o.w1 + g[G_BY] * o.w2) + o.h * g[G_KAPPA] - o.PP * o.h * h_v_h;
+    V2 v_F1 = o.F1 * (2.0f * v_S11) + o.F2 * v_S12, v_F2 = o.F2 * (2.0f * v_S22) + o.F1 * v_S12;
+    vf v_g1 = o.tau * (2.0f * v_S11 * o.g1 + v_S12 * o.g2), v_g2 = o.tau * (2.0f * v_S22 * o.g2 + v_S12 * o.g1);
+    vf v_e1 = zh * g[G_BX] - dot(v_F1, o.P), v_e2 = zh * g[G_BY] - dot(v_F2, o.P);
+    V2 v_E1 = v_F1 + o.P * v_w1 + V2{-o.P.y, o.P.x} * v_g1, v_E2 = v_F2 + o.P * v_w2 + V2{-o.P.y, o.P.x} * v_g2;
+    V2 v_P = v_F1 * -o.e1 + v_F2 * -o.e2 + o.E1 * v_w1 + o.E2 * v_w2 + V2{o.E1.y, -o.E1.x} * v_g1 +
+             V2{o.E2.y, -o.E2.x} * v_g2 + o.P * (-2.0f * o.tau * o.h * h_v_h);
     // Corner coordinates.
     vf zuv = z * uv;
     v_P.x += uv * g[G_EU], v_P.y += uv * g[G_EV];
@@ -246,13 +272,18 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     // Projected centre.
     V3 v_p = {g[G_CX] * cam.fx * iz, g[G_CY] * cam.fy * iz, v_z};
     v_p.z -= iz * (v_p.x * o.p.x + v_p.y * o.p.y);
-    V3 keep_E1 = o.E1 * v_E1, keep_E2 = o.E2 * v_E2;
-    camera[12] += keep(drawn, g[G_CX] * o.p.x * iz - (keep_E1.x + keep_E1.y + keep_E1.z) / cam.fx);
-    camera[13] += keep(drawn, g[G_CY] * o.p.y * iz - (keep_E2.x + keep_E2.y + keep_E2.z) / cam.fy);
+    vf inv_fx = 1.0f / cam.fx, inv_fy = 1.0f / cam.fy;
+    camera[12] += keep(drawn, g[G_CX] * o.p.x * iz - (dot(o.E1, v_E1) + o.e1 * v_e1) * inv_fx);
+    camera[13] += keep(drawn, g[G_CY] * o.p.y * iz - (dot(o.E2, v_E2) + o.e2 * v_e2) * inv_fy);
     camera[14] += keep(drawn, g[G_CX]), camera[15] += keep(drawn, g[G_CY]);
     // Whitening.
-    V3 v_s = (o.P * v_P + keep_E1 + keep_E2) * o.inv_s * splat(-1.0f);
-    V3 w = v_P * o.inv_s, w1 = v_E1 * o.inv_s * (1.0f / cam.fx), w2 = v_E2 * o.inv_s * (1.0f / cam.fy);
+    V3 v_s = {-o.inv_s.x * (o.P.x * v_P.x + o.E1.x * v_E1.x + o.E2.x * v_E2.x),
+              -o.inv_s.y * (o.P.y * v_P.y + o.E1.y * v_E1.y + o.E2.y * v_E2.y),
+              2.0f * v_tau * o.s.z * o.inv_n * o.inv_n};
+    vf v_n = -o.inv_n * (v_e1 * o.e1 + v_e2 * o.e2 + 2.0f * v_tau * o.tau);
+    V3 w = {v_P.x * o.inv_s.x, v_P.y * o.inv_s.y, v_n};
+    V3 w1 = V3{v_E1.x * o.inv_s.x, v_E1.y * o.inv_s.y, v_e1 * o.inv_n} * inv_fx;
+    V3 w2 = V3{v_E2.x * o.inv_s.x, v_E2.y * o.inv_s.y, v_e2 * o.inv_n} * inv_fy;
     v_p = v_p + mul(o.M, w);
     M3 v_M = {{o.p.x * w.x + w1.x, o.p.x * w.y + w1.y, o.p.x * w.z + w1.z, o.p.y * w.x + w2.x,
                o.p.y * w.y + w2.y, o.p.y * w.z + w2.z, o.p.z * w.x, o.p.z * w.y, o.p.z * w.z}};
@@ -299,7 +330,7 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
 static void project_adjoint_share(Raster& r, int share) {
     Camera cam = camera_of(r);
     vf camera[CAMERA] = {};
-    int end = share_start(r.n, share + 1, r.threads), size = r.gradient_size, width = r.channel_vectors * LANES;
+    int end = share_start(r.n, share + 1, r.threads), size = r.gradient_size;
     for (int first = share_start(r.n, share, r.threads); first < end; first += LANES) {
         int count = imin2(LANES, end - first);
         float lanes[GEOMETRY + 6][LANES] = {}, drawn_lanes[LANES] = {};
@@ -316,12 +347,10 @@ static void project_adjoint_share(Raster& r, int share) {
                 const float* more = r.parts + ((i64)part * r.n + g) * size;
                 for (int j = 0; j < size; j++) total[j] += more[j];
             }
-            for (int j = 0; j < GEOMETRY; j++) lanes[j][i] = total[j];
-            const float* channels = total + GEOMETRY;
-            for (int corner = 0; corner < (r.c ? 4 : 1); corner++, channels += width) {
-                for (int j = 0; j < 6; j++) lanes[GEOMETRY + j][i] += channels[j];
-                for (int ch = 0; ch < r.c; ch++) v_corners[corner * r.c + ch] = channels[6 + ch];
-            }
+            for (int j = 0; j < GEOMETRY + 6; j++) lanes[j][i] = total[j];
+            const float* corner = total + GEOMETRY + r.fixed_width;
+            for (int k = 0; k < 4; k++, corner += r.corner_width)
+                for (int ch = 0; ch < r.c; ch++) v_corners[k * r.c + ch] = corner[ch];
         }
         vf g[GEOMETRY + 6];
         for (int j = 0; j < GEOMETRY + 6; j++) g[j] = load(lanes[j]);

@@ -3,8 +3,8 @@
 // On screen, with (dx, dy) the offset of a pixel from the projected centre, everything at the peak of the pixel's ray is
 //     K = a dx^2 + b dx dy + c dy^2,   l = 1 + beta_x dx + beta_y dy,   q = l^2 + kappa K,
 //     |W(peak - mu)|^2 = K / q,   zeta = (z-depth of the peak) / (z-depth of the centre) = l / q.
-// Exact in perspective. K comes from a cross product and zeta - 1 = -(l (l - 1) + kappa K) / q is summed as written,
-// so nothing cancels in 32 bits however thin the Gaussian. The corner coordinates are
+// Exact in perspective. K is a sum of squares and zeta - 1 = -(l (l - 1) + kappa K) / q is summed as written, so nothing
+// cancels in 32 bits however thin the Gaussian. The corner coordinates are
 //     u = 1/2 + (zeta - 1) e_u + zeta (u_x dx + u_y dy), and v alike, clamped to [0, 1].
 #pragma once
 #include "parallel.h"
@@ -18,15 +18,15 @@ enum {
     NX, NY, NZ, EU, UX, UY, EV, VX, VY
 };
 
-// Sums over pixels that make a Gaussian's gradient; blended channels follow (rgb, normal, features), once for each of
-// the four corners if there are features.
+// Sums over pixels that make a Gaussian's gradient; those of its fixed channels follow (rgb, normal), then those of the
+// features at each of the four corners, all padded to whole vectors.
 enum { G_A, G_B, G_C, G_BX, G_BY, G_CX, G_CY, G_KAPPA, G_OPACITY, G_PZ, G_UX, G_UY, G_EU, G_VX, G_VY, G_EV };
 
 struct Raster {
     const float *means, *quats, *scales, *opacity, *sh, *corners, *R, *t, *focal, *mask;
     int n, k, c, height, width, threads;
     float alpha_max, alpha_min, T_min, facing, near, near_sigmas, corner;
-    int record_size, gradient_size, channel_vectors, mask_stride;
+    int record_size, gradient_size, fixed_width, corner_width, mask_stride;
     // Workspace. `span` is the outline on screen: centre and second moments; `ranks` the drawn Gaussians by depth.
     float *record, *span;
     u32 *keys;

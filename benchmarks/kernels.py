@@ -1,0 +1,188 @@
+"""How fast the kernels of the CPU are, on a closed shell of Gaussians seen whole: medians, and the reference beside.
+
+`python -m benchmarks.kernels` prints a table and writes `benchmarks/kernels.json`. One thread is timed by its own
+processor time, so that other work on the machine hardly counts; several threads by the wall clock.
+"""
+
+import argparse
+import json
+import math
+import os
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from tumble import backends
+from tumble.backends import Backend, _native
+
+RUNS = 9
+FEATURES = 16
+DIRECTIONS = 256
+SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (50_000, 128), (50_000, 256), (50_000, 512)]
+"""Gaussians and pixels across."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    parser.add_argument("--no-reference", action="store_true", help="skip the slow rows of the reference")
+    arguments = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for threads in arguments.threads:
+        torch.set_num_threads(threads)
+        rows += measure(backends.load("cpu"), "cpu", threads, SIZES)
+    if not arguments.no_reference:
+        torch.set_num_threads(1)
+        # The reference holds every pair of a pixel and a Gaussian nearby, so one size will do.
+        rows += rasterizing(backends.load("reference"), "reference", 1, [(10_000, 256)], runs=3)
+    document = {"command": "python -m benchmarks.kernels", "machine": machine(), "rows": rows}
+    arguments.out.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+
+def measure(backend: Backend, name: str, threads: int, sizes: list[tuple[int, int]]) -> list[dict[str, Any]]:
+    """All rows of one backend at one number of threads."""
+    return [
+        *rasterizing(backend, name, threads, sizes),
+        *tracing(backend, name, threads),
+        *shading(backend, name, threads),
+    ]
+
+
+def rasterizing(
+    backend: Backend, name: str, threads: int, sizes: list[tuple[int, int]], runs: int = RUNS
+) -> list[dict[str, Any]]:
+    """Milliseconds, projection and binning included, with no feature and with FEATURES of them."""
+    rows = []
+    for n, size in sizes:
+        for c in (0, FEATURES):
+            inputs = [*shell(n), torch.rand(n, 1, 3) + 0.5, torch.rand(n, 4, c), *camera(size)]
+            inputs = [x.requires_grad_() for x in inputs]
+            mask = torch.ones(1, 1)
+            with torch.no_grad():
+                forward = median(lambda: backend.rasterize(*inputs, size, size, mask), threads, runs)
+            view = backend.rasterize(*inputs, size, size, mask)[:6]
+            seeds = [torch.randn_like(x) for x in view]
+            backward = median(lambda: torch.autograd.grad(view, inputs, seeds, retain_graph=True), threads, runs)
+            what = f"rasterize {n // 1000}k, {size} px, {c} features"
+            rows.append(row(what, name, threads, "ms", forward * 1e3, backward * 1e3))
+    return rows
+
+
+def tracing(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
+    """Million rays per second: from outside at random, and from points of the surface to the hemisphere above."""
+    rows = []
+    for n in (10_000, 50_000):
+        means, quats, scales, opacity = shell(n)
+        k = f"{n // 1000}k"
+        build = median(lambda: backend.build(means, quats, scales, opacity), threads)  # noqa: B023
+        rows.append(row(f"build {k}", name, threads, "ms", build * 1e3))
+        bvh = backend.build(means, quats, scales, opacity)
+        rng = torch.Generator().manual_seed(0)
+        origins = 2.5 * normalize(torch.randn(100_000, 3, generator=rng), dim=-1)
+        aims = normalize(torch.randn(100_000, 3, generator=rng), dim=-1) * torch.rand(100_000, 1, generator=rng)
+        rays = origins, normalize(aims - origins, dim=-1), torch.rand(n, 3)
+        rate = 0.1 / median(lambda: backend.trace(bvh, *rays), threads)  # noqa: B023
+        rows.append(row(f"trace {k}, ordered, all blocked", name, threads, "M rays/s", rate))
+        normals = normalize(means[:: n // 1000], dim=-1)
+        directions = fibonacci(DIRECTIONS)
+        above = (normals @ directions.T > 0).sum().item() / 1e6
+        outside = 1.03 * normals, normals, directions
+        rate = above / median(lambda: backend.visible(bvh, *outside), threads)  # noqa: B023
+        rows.append(row(f"visible {k}, open sky", name, threads, "M rays/s", rate))
+        # A shell that faces inwards, seen from within: every ray is blocked.
+        inwards = backend.build(means, quats[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1, 1, -1]), scales, opacity)
+        inside = 0.5 * normals, normals, directions
+        rate = above / median(lambda: backend.visible(inwards, *inside), threads)  # noqa: B023
+        rows.append(row(f"visible {k}, all blocked", name, threads, "M rays/s", rate))
+    return rows
+
+
+def shading(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
+    """Million evaluations of light and BRDF per second: 2000 points under DIRECTIONS directions."""
+    p = 2000
+    rng = torch.Generator().manual_seed(0)
+    normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
+    view = normalize(normal + 0.3 * torch.randn(p, 3, generator=rng), dim=-1)
+    surface = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
+    surface = [x.requires_grad_() for x in surface]
+    light, directions = torch.rand(DIRECTIONS, 3).requires_grad_(), fibonacci(DIRECTIONS)
+    seen = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32)
+    rest = seen, torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3), 0.04
+    with torch.no_grad():
+        forward = median(lambda: backend.shade(*surface, directions, light, *rest), threads)
+    shaded = backend.shade(*surface, directions, light, *rest)
+    seed = torch.randn(p, 3)
+    backward = median(lambda: torch.autograd.grad(shaded, [*surface, light], seed, retain_graph=True), threads)
+    million = p * DIRECTIONS / 1e6
+    return [
+        row("shade, forward", name, threads, "M evaluations/s", million / forward),
+        row("shade, forward and backward", name, threads, "M evaluations/s", million / (forward + backward)),
+    ]
+
+
+def row(what: str, name: str, threads: int, unit: str, value: float, backward: float | None = None) -> dict[str, Any]:
+    """One line, printed and kept."""
+    text = f"{value:9.2f}" + (f" + {backward:7.2f}" if backward is not None else "")
+    print(f"{what:42s} {name:10s} {threads} thread{'s' * (threads > 1):1s} {text} {unit}", flush=True)
+    kept = {"what": what, "backend": name, "threads": threads, "unit": unit, "value": round(value, 3)}
+    return kept if backward is None else {**kept, "backward": round(backward, 3)}
+
+
+def median(run: Callable[[], Any], threads: int, runs: int = RUNS) -> float:
+    """Median seconds of a call, after two for warmth."""
+    clock = time.thread_time if threads == 1 else time.perf_counter
+    seconds = []
+    for i in range(runs + min(2, runs - 1)):
+        start = clock()
+        run()
+        if i >= min(2, runs - 1):
+            seconds.append(clock() - start)
+    return statistics.median(seconds)
+
+
+def machine() -> dict[str, Any]:
+    """What a number depends on."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
+    return {
+        "class": f"{os.cpu_count()}-core {platform.machine()} CPU, {32 * _native.library().lanes()}-bit vectors",
+        "torch": torch.__version__,
+        "load": round(load, 1),
+        "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+    }
+
+
+def fibonacci(n: int) -> Tensor:
+    """n directions of equal area."""
+    i = torch.arange(n, dtype=torch.float64) + 0.5
+    z, turn = 1 - 2 * i / n, i * math.pi * (3 - math.sqrt(5))
+    r = (1 - z * z).sqrt()
+    return torch.stack([r * turn.cos(), r * turn.sin(), z], -1).float()
+
+
+def shell(n: int) -> list[Tensor]:
+    """Means, quaternions, scales and opacity of a closed sphere of flat Gaussians, a little rough."""
+    rng = torch.Generator().manual_seed(0)
+    normals = fibonacci(n)
+    w, x, y = 1 + normals[:, 2], -normals[:, 1], normals[:, 0]
+    spread = math.sqrt(4 * math.pi / n) * torch.exp(0.3 * torch.randn(n, 3, generator=rng))
+    means = normals * (1 + 0.01 * torch.randn(n, 1, generator=rng))
+    opacity = 0.49 + 0.5 * torch.rand(n, generator=rng)
+    return [means, torch.stack([w, x, y, 0 * w], -1), spread * torch.tensor([1, 1, 0.1]), opacity]
+
+
+def camera(size: int) -> list[Tensor]:
+    """Rotation, translation and intrinsics of a square picture that the unit sphere fills to two thirds."""
+    return [torch.eye(3), torch.tensor([0, 0, 3.0]), torch.tensor([1.3 * size, 1.3 * size, size / 2, size / 2])]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""The bundled clip: it unpacks to a capture with truth, and its page needs no network."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tumble import demo, settings, video
+from tumble.datasets import folder
+
+
+def test_the_bundle_is_small_and_whole() -> None:
+    size = sum(path.stat().st_size for path in demo.bundled().rglob("*") if path.is_file())
+    assert size < 3_000_000
+
+
+def test_the_clip_unpacks_to_a_pose_free_capture_with_truth(tmp_path: Path) -> None:
+    path = demo.unpack(tmp_path / "capture")
+    capture, truth = folder.load(path), folder.load_truth(path)
+    assert capture.trajectory is None
+    assert capture.light == "camera"
+    assert len(capture) == 96
+    assert truth is not None
+    assert {truth.regions.count("shared"), truth.regions.count("sphere")} == {8, 2}
+    for part in (truth.albedo, truth.roughness, truth.normals, truth.depth, truth.light, truth.poses):
+        assert part is not None
+    # The film's frames lie under the masks' silhouettes: outside them it is black, but for compression.
+    outside = capture.images[capture.masks == 0].double()
+    assert outside.mean() < 2
+    T = truth.poses.T_cam_obj
+    turn = torch.rad2deg((T.rotation[1:] @ T.rotation[:-1].inverse()).angle())
+    low, high = (np.rad2deg(angle) for angle in settings.TUMBLE_STEP)
+    # Poses are written with all digits, and read as 32-bit numbers.
+    assert turn.min() > low - 0.05
+    assert turn.max() < high + 0.05
+    # A second call changes nothing.
+    stamp = (path / "images" / "0000.png").stat().st_mtime_ns
+    assert demo.unpack(path) == path
+    assert (path / "images" / "0000.png").stat().st_mtime_ns == stamp
+
+
+def test_the_page_carries_all_its_pictures(tmp_path: Path) -> None:
+    page = demo.run(tmp_path / "demo").read_text("utf-8")
+    assert page.count("data:image/png;base64,") > 24
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert "http" not in page
+
+
+def test_a_film_comes_back_with_its_frames_in_order(tmp_path: Path) -> None:
+    frames = np.zeros((6, 32, 48, 3), np.uint8)
+    for i in range(6):
+        frames[i, :, 8 * i : 8 * i + 8] = [30 * i + 40, 90, 200 - 30 * i]
+    video.write_clip(tmp_path / "x.mp4", iter(frames))
+    again = np.stack(list(video.read_clip(tmp_path / "x.mp4")))
+    assert again.shape == frames.shape
+    assert np.abs(again.astype(float) - frames).mean() < 4
+    for i in range(6):
+        assert again[i].sum((0, 2)).argmax() // 8 == i

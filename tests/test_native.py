@@ -1,0 +1,139 @@
+"""Compiling the CPU kernels on first use, and what the compiled code may not do."""
+
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests import backends_cases as cases
+from tumble import backends
+from tumble.backends import _native, reference
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def no_library() -> Iterator[None]:
+    """As in a fresh process; afterwards too."""
+    _native.library.cache_clear()
+    backends._warn_once.cache_clear()
+    yield
+    _native.library.cache_clear()
+    backends._warn_once.cache_clear()
+
+
+@pytest.mark.usefixtures("no_library")
+def test_without_a_compiler_the_reference_draws_and_one_warning_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.warns(RuntimeWarning, match=r"no-such-compiler.*install one"):
+        assert backends.choose(CPU, torch.float32) is reference
+    assert backends.choose(CPU, torch.float32) is reference
+
+
+@pytest.mark.usefixtures("no_library")
+def test_a_failing_compiler_is_named_with_what_it_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("CXX", _script(tmp_path / "broken", "echo out of cheese >&2; exit 1"))
+    assert "out of cheese" in backends.load("cpu").ready(CPU, torch.float32)
+    assert not list((tmp_path / "tumble").iterdir())
+
+
+def test_two_processes_that_start_at_once_compile_to_one_whole_file(tmp_path: Path) -> None:
+    """The compiler here is a script that takes its time to copy what was compiled before."""
+    if reason := backends.load("cpu").ready(CPU, torch.float32):
+        pytest.skip(reason)
+    to_output = 'while [ "$1" != -o ]; do [ "$1" = --version ] && exit; shift; done'
+    copy = f'{to_output}; sleep .3; cp {_native.library()._name} "$2"'
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "CXX": _script(tmp_path / "slow", copy)}
+    program = "import sys; from tumble.backends import _native; sys.exit(_native.library().lanes() not in (4, 8, 16))"
+    runs = [subprocess.Popen([sys.executable, "-c", program], env=environment) for _ in range(2)]
+    assert [run.wait() for run in runs] == [0, 0]
+    assert [path.suffix for path in (tmp_path / "tumble").iterdir()] == [".so"]
+
+
+WIDTHS = {"16": ["-march=x86-64-v4"], "8": ["-march=x86-64-v3"], "4": ["-march=x86-64"]}
+"""Floats in a vector, and the flag that brings it about."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", WIDTHS)
+@pytest.mark.usefixtures("no_library")
+def test_every_vector_width_gives_the_same_pictures(
+    lanes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if backends.load("cpu").ready(CPU, torch.float32) or _native.library().lanes() < int(lanes):
+        pytest.skip("this machine has no such vectors")
+    monkeypatch.setattr(_native, "VARIANTS", (WIDTHS[lanes],))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _native.library.cache_clear()
+    assert _native.library().lanes() == int(lanes)
+    exercise()
+
+
+def exercise() -> None:
+    """Every verb of the CPU backend on the hard scene, held against the reference."""
+    cpu, scene = backends.load("cpu"), cases.hard()
+    view, gradients = cases.render(cpu, scene, torch.float32)
+    truth, true_gradients = cases.render(reference, scene, torch.float64)
+    # 1e-4 as for the machine's own width; the variance is a difference of nearly equal numbers.
+    pairs = [*zip(view[:6], truth[:6], strict=True), *zip(gradients, true_gradients, strict=True)]
+    assert max(cases.difference(a, b) for a, b in pairs) < 5e-4
+    rng = torch.Generator().manual_seed(0)
+    cloud, directions = [x.float() for x in scene.inputs[:4]], cases.fibonacci(45).float()
+    points = torch.randn(40, 3, generator=rng)
+    normals = torch.nn.functional.normalize(torch.randn(40, 3, generator=rng), dim=-1)
+    tree, bvh = cpu.build(*cloud), reference.build(*cloud)
+    bits = cpu.visible(tree, points, normals, directions)
+    blockers = cpu.blockers(tree, points, normals, directions, bits)
+    assert (bits != reference.visible(bvh, points, normals, directions)).float().mean() < 0.02
+    assert (blockers != reference.blockers(bvh, points, normals, directions, bits)).float().mean() < 0.02
+    hits = cpu.trace(tree, points, normals, torch.rand(len(cloud[0]), 3, generator=rng))
+    assert cases.difference(hits.transmittance, reference.trace(bvh, points, normals, points[:0]).transmittance) < 1e-4
+    surface = [normals, torch.rand(40, 3, generator=rng), torch.rand(40, generator=rng), normals.roll(1, 0)]
+    light = [torch.rand(45, 3, generator=rng), torch.rand(len(cloud[0]), 3, generator=rng)]
+    inputs = [x.requires_grad_() for x in (*surface, *light)]
+    results = []
+    for backend in (cpu, reference):
+        shaded = backend.shade(*inputs[:4], directions, inputs[4], bits, blockers, inputs[5], 0.04)
+        results.append([shaded, *torch.autograd.grad(shaded.sum(), inputs)])
+    # Both in 32 bits.
+    assert max(cases.difference(a, b) for a, b in zip(*results, strict=True)) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_kernels_touch_no_memory_but_their_own(tmp_path: Path) -> None:
+    """Address and undefined-behaviour sanitizers watch every verb, with no Gaussians too, on one and three threads."""
+    try:
+        compiler = _native.find_compiler()
+    except _native.CannotCompile as reason:
+        pytest.skip(str(reason))
+    runtime = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True).stdout.strip()
+    if not Path(runtime).is_file():
+        pytest.skip("the compiler has no address sanitizer")
+    library = tmp_path / "kernels.so"
+    watch = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-march=native"]
+    source = str(_native.SOURCES / "kernels.cpp")
+    subprocess.run([compiler, *_native.FLAGS, *watch, source, "-o", str(library)], check=True)
+    program = (
+        "import ctypes, torch; from tumble.backends import _native, load; "
+        f"kernels = ctypes.CDLL({str(library)!r}); _native.library = lambda: kernels; "
+        "from tests import backends_cases as cases, test_native; "
+        "[(torch.set_num_threads(t), test_native.exercise(), "
+        "cases.render(load('cpu'), cases.empty(), torch.float32)) for t in (1, 3)]"
+    )
+    environment = {**os.environ, "LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0"}
+    run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-3000:]
+
+
+def _script(path: Path, text: str) -> str:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)

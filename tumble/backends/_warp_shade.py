@@ -1,0 +1,271 @@
+# type: ignore (this is Warp's language: arrays of vectors, `int / int`, ...)
+"""Kernels: Lambert + GGX of points under shared directions, and the adjoint.
+
+The formulas are in `Backend.shade`; f below is the specular part, t_h2 is t |H|^2, `v_x` is the gradient of x. Forward,
+and for the gradient of what belongs to a point, the 32 lanes of a warp share the point and lane i takes the directions
+of bit i. For what belongs to a direction or a blocker, a thread takes one direction and some points.
+"""
+
+import math
+
+import warp as wp
+
+from tumble.backends import ROUGHNESS_MIN
+from tumble.backends._warp import LANES, add_lanes, add_row, no_type_check, vec32
+
+wp.set_module_options({"enable_backward": False})
+
+POINTS = 32
+"""Points of a thread that gathers for a direction."""
+INV_PI = 1.0 / math.pi
+FOUR_PI = 4.0 * math.pi
+
+
+@wp.struct
+@no_type_check
+class Point:
+    """What a point's directions share."""
+
+    n: wp.vec3
+    v: wp.vec3
+    n_v: float
+    r: float
+    aa: float
+    k: float
+    g_v: float
+
+
+@wp.func
+@no_type_check
+def point_at(normal: wp.array[wp.vec3], roughness: wp.array[float], view: wp.array[wp.vec3], i: int) -> Point:
+    p = Point()
+    p.n = normal[i]
+    p.v = view[i]
+    p.n_v = wp.dot(p.n, p.v)
+    p.r = wp.max(roughness[i], ROUGHNESS_MIN)
+    p.aa = p.r * p.r * p.r * p.r
+    p.k = (p.r + 1.0) * (p.r + 1.0) * 0.125
+    p.g_v = wp.max(p.n_v, 0.0) * (1.0 - p.k) + p.k
+    return p
+
+
+@wp.struct
+@no_type_check
+class Lobe:
+    """The specular part of one direction: f = F rest."""
+
+    w: wp.vec3
+    n_w: float
+    HH: float
+    C: wp.vec3
+    t_h2: float
+    vh: float
+    F: float
+    g_w: float
+    rest: float
+    f: float
+    exists: bool
+
+
+@wp.func
+@no_type_check
+def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
+    o = Lobe()
+    o.w = w
+    o.n_w = n_w
+    o.HH = 2.0 + 2.0 * wp.dot(p.v, w)
+    o.exists = o.HH > 1.0e-6
+    if not o.exists:
+        return o
+    o.C = wp.cross(p.n, p.v + w)
+    o.t_h2 = wp.dot(o.C, o.C) + p.aa * (p.n_v + n_w) * (p.n_v + n_w)
+    o.g_w = n_w * (1.0 - p.k) + p.k
+    o.vh = 0.5 * wp.sqrt(o.HH)
+    m = 1.0 - o.vh
+    o.F = f0 + (1.0 - f0) * m * m * m * m * m
+    x = o.HH / o.t_h2
+    o.rest = p.aa * x * x / (FOUR_PI * p.g_v * o.g_w)
+    o.f = o.F * o.rest
+    return o
+
+
+OPEN = wp.constant(-1)
+BLACK = wp.constant(-2)
+
+
+@wp.func
+@no_type_check
+def source_of(
+    visibility: wp.array2d[int], blocker: wp.array2d[int], blocker_radiance: wp.array[wp.vec3], i: int, j: int
+) -> int:
+    """What sends light to point i from direction j: OPEN sky, BLACK, or the blocker of that index."""
+    if (visibility[i, j // 32] >> (j % 32)) & 1 == 1:
+        return OPEN
+    if blocker_radiance.shape[0] == 0:
+        return BLACK
+    return wp.where(blocker[i, j] < 0, BLACK, blocker[i, j])
+
+
+@wp.func
+@no_type_check
+def arriving(source: int, radiance: wp.array[wp.vec3], blocker_radiance: wp.array[wp.vec3], j: int) -> wp.vec3:
+    if source == OPEN:
+        return radiance[j]
+    return blocker_radiance[source]
+
+
+@wp.kernel
+@no_type_check
+def shade_forward(
+    normal: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    view: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+    visibility: wp.array2d[int],
+    blocker: wp.array2d[int],
+    blocker_radiance: wp.array[wp.vec3],
+    f0: float,
+    out: wp.array[float],
+):
+    i, lane = wp.tid()
+    p = point_at(normal, roughness, view, i)
+    sum = wp.vec3()
+    for j in range(lane, directions.shape[0], LANES):
+        n_w = wp.dot(p.n, directions[j])
+        source = source_of(visibility, blocker, blocker_radiance, i, j)
+        if n_w > 0.0 and source != BLACK:
+            f = lobe_at(p, directions[j], n_w, f0).f
+            lit = n_w * arriving(source, radiance, blocker_radiance, j)
+            sum += INV_PI * wp.cw_mul(albedo[i], lit) + f * lit
+    sum *= FOUR_PI / float(directions.shape[0])
+    for ch in range(3):
+        add_lanes(out, 3 * i + ch, sum[ch])
+
+
+@wp.struct
+@no_type_check
+class PointSums:
+    """What some of a point's directions find for its gradient."""
+
+    n: wp.vec3
+    v: wp.vec3
+    albedo: wp.vec3
+    g_v: float
+    n_v: float
+    k: float
+    aa: float
+
+
+@wp.func
+@no_type_check
+def lobe_adjoint(p: Point, o: Lobe, f0: float, v_f: float, v_n_w: float, sum: PointSums) -> PointSums:
+    """Adds one direction's part. v.h and |H| depend on v.w only, |C| and n.H on the rest."""
+    to = sum
+    v_log_f = v_f * o.f
+    v_t_h2 = -2.0 * v_log_f / o.t_h2
+    n_H = p.n_v + o.n_w
+    v_n_H = 2.0 * v_t_h2 * p.aa * n_H
+    to.g_v += v_log_f
+    to.k -= v_log_f / o.g_w * (1.0 - o.n_w)
+    to.aa += v_log_f / p.aa + v_t_h2 * n_H * n_H
+    to.n_v += v_n_H
+    m = 1.0 - o.vh
+    v_HH = 2.0 * v_log_f / o.HH - v_f * o.rest * 5.0 * (1.0 - f0) * m * m * m * m / (8.0 * o.vh)
+    v_C = 2.0 * v_t_h2 * o.C
+    to.n += wp.cross(p.v + o.w, v_C) + (v_n_w + v_n_H - v_log_f / o.g_w * (1.0 - p.k)) * o.w
+    to.v += wp.cross(v_C, p.n) + 2.0 * v_HH * o.w
+    return to
+
+
+@wp.func
+@no_type_check
+def point_adjoint(p: Point, sum: PointSums, roughness: float) -> vec32:
+    """Gradients of normal, view, albedo and roughness, in this order."""
+    row = vec32()
+    v_g_v = -sum.g_v / p.g_v
+    v_n_v = sum.n_v
+    if p.n_v >= 0.0:
+        v_n_v += v_g_v * (1.0 - p.k)
+    v_k = sum.k + v_g_v * (1.0 - wp.max(p.n_v, 0.0))
+    v_n = sum.n + v_n_v * p.v
+    v_v = sum.v + v_n_v * p.n
+    for a in range(3):
+        row[a] = v_n[a]
+        row[3 + a] = v_v[a]
+        row[6 + a] = sum.albedo[a]
+    if roughness >= ROUGHNESS_MIN:
+        row[9] = 4.0 * p.r * p.r * p.r * sum.aa + 0.25 * (p.r + 1.0) * v_k
+    return row
+
+
+@wp.kernel
+@no_type_check
+def shade_adjoint(
+    normal: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    view: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    radiance: wp.array[wp.vec3],
+    visibility: wp.array2d[int],
+    blocker: wp.array2d[int],
+    blocker_radiance: wp.array[wp.vec3],
+    f0: float,
+    v_out: wp.array[wp.vec3],
+    v_points: wp.array2d[float],
+):
+    """What belongs to a point."""
+    i, lane = wp.tid()
+    p = point_at(normal, roughness, view, i)
+    sum = PointSums()
+    seed = v_out[i] * (FOUR_PI / float(directions.shape[0]))
+    seed_diffuse = INV_PI * wp.cw_mul(seed, albedo[i])
+    for j in range(lane, directions.shape[0], LANES):
+        n_w = wp.dot(p.n, directions[j])
+        source = source_of(visibility, blocker, blocker_radiance, i, j)
+        if n_w > 0.0 and source != BLACK:
+            L = arriving(source, radiance, blocker_radiance, j)
+            o = lobe_at(p, directions[j], n_w, f0)
+            specular = wp.dot(seed, L)
+            v_n_w = wp.dot(seed_diffuse, L) + o.f * specular
+            sum.albedo += n_w * INV_PI * wp.cw_mul(seed, L)
+            if o.exists:
+                sum = lobe_adjoint(p, o, f0, specular * n_w, v_n_w, sum)
+            else:
+                sum.n += v_n_w * directions[j]
+    add_row(v_points, i, 0, 10, point_adjoint(p, sum, roughness[i]))
+
+
+@wp.kernel
+@no_type_check
+def light_adjoint(
+    normal: wp.array[wp.vec3],
+    albedo: wp.array[wp.vec3],
+    roughness: wp.array[float],
+    view: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    visibility: wp.array2d[int],
+    blocker: wp.array2d[int],
+    f0: float,
+    v_out: wp.array[wp.vec3],
+    v_radiance: wp.array[wp.vec3],
+    v_blocker_radiance: wp.array[wp.vec3],
+):
+    """What belongs to a direction and to blockers."""
+    group, j = wp.tid()
+    open = wp.vec3()
+    for i in range(POINTS * group, wp.min(POINTS * group + POINTS, normal.shape[0])):
+        p = point_at(normal, roughness, view, i)
+        n_w = wp.dot(p.n, directions[j])
+        source = source_of(visibility, blocker, v_blocker_radiance, i, j)
+        if n_w > 0.0 and source != BLACK:
+            f = lobe_at(p, directions[j], n_w, f0).f
+            v_L = n_w * (INV_PI * wp.cw_mul(v_out[i], albedo[i]) + f * v_out[i])
+            v_L *= FOUR_PI / float(directions.shape[0])
+            if source == OPEN:
+                open += v_L
+            else:
+                wp.atomic_add(v_blocker_radiance, source, v_L)
+    wp.atomic_add(v_radiance, j, open)

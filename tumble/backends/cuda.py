@@ -1,0 +1,292 @@
+"""The contract of this folder on NVIDIA GPUs: float32, through kernels in Warp (the files `_warp*.py` beside this one).
+
+`autograd.Function`s around the kernels: save, launch, return. Warp is an optional package, so it is imported when the
+first tensor comes; it compiles the kernels then, in seconds, and keeps them in the user's cache. Gradients are summed
+by atomic additions: two runs on a GPU agree to rounding, not bit by bit.
+
+The kernels run where the tensors are, on the CPU too. They are slow there; that is for tests without a GPU.
+"""
+
+import importlib.util
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+from torch.nn.functional import pad
+
+from tumble.backends import Hits, Rendering
+
+
+def ready(device: torch.device, dtype: torch.dtype) -> str:
+    """Empty if the kernels take such tensors here and now, else the reason and the fix."""
+    if device.type != "cuda" or dtype != torch.float32:
+        return f"the kernels take float32 on an NVIDIA GPU, not {dtype} on {device}"
+    if not torch.cuda.is_available():
+        return "torch finds no NVIDIA GPU; it needs the driver, and a torch built for CUDA"
+    if importlib.util.find_spec("warp") is None:
+        return "the kernels need NVIDIA Warp; install it: pip install 'tumble[cuda]'"
+    return ""
+
+
+def rasterize(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacity: Float[Tensor, " n"],
+    sh: Float[Tensor, "n k 3"],
+    corners: Float[Tensor, "n 4 c"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    t_cam_obj: Float[Tensor, "3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    height: int,
+    width: int,
+    mask: Float[Tensor, "#h #w"],
+) -> Rendering:
+    """One view of the Gaussians; see `Backend.rasterize`. Many features are drawn in groups."""
+    from tumble.backends._warp_composite import WIDTHS
+
+    camera = torch.cat([R_cam_obj.flatten(), t_cam_obj, fx_fy_cx_cy])
+    views = []
+    for group in corners.split(max(WIDTHS), 2):
+        channels = min(x for x in WIDTHS if x >= group.shape[2])
+        gaussians = means, quats, scales, opacity, sh, pad(group, (0, channels - group.shape[2]))
+        pixels, weight, touched, dominant = _Rasterize.apply(*gaussians, camera, height, width, mask)
+        rgb, alpha, depth, depth_var, normal, features = pixels.split([3, 1, 1, 1, 3, channels], -1)
+        alpha, depth, depth_var = alpha[..., 0], depth[..., 0], depth_var[..., 0]
+        features = features[..., : group.shape[2]]
+        views.append(Rendering(rgb, alpha, depth, depth_var, normal, features, weight, touched, dominant))
+    if len(views) == 1:
+        return views[0]
+    return views[0]._replace(features=torch.cat([view.features for view in views], -1))
+
+
+class _Rasterize(torch.autograd.Function):
+    """(means, quats, scales, opacity, sh, corners, camera, height, width, mask) -> pixels, weight, touched, dominant.
+
+    Cameras and pixels are laid out as the kernels say.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, ...]:
+        from tumble.backends import _warp, _warp_composite, _warp_project
+
+        *inputs, height, width, mask = args
+        inputs = [x.contiguous() for x in inputs]
+        *geometry, corners, camera = inputs
+        means, n, channels = geometry[0], len(corners), corners.shape[2]
+        record = means.new_empty(n, _warp_project.RECORD, 4)
+        depth, n_tiles = means.new_empty(n), _int32(means, n)
+        pixels = means.new_zeros(height * width, _warp_composite.FIXED + channels)
+        counts = means.new_zeros(n), torch.zeros_like(n_tiles), _int32(means, height * width).fill_(-1)
+        with _warp.stream(means.device):
+            prepared = record, depth, n_tiles
+            _warp.launch(_warp_project.project_forward, n, *geometry, camera, height, width, *prepared)
+            starts, listed = _bin(*prepared, height, width)
+            drawing = record, _packed(corners), camera, mask.expand(height, width), starts, listed, height, width
+            kernel = _warp_composite.forward(channels)
+            _warp.launch(kernel, _threads(starts), *drawing, pixels, *counts)
+        ctx.size = height, width
+        ctx.save_for_backward(*inputs, record, n_tiles, starts, listed, pixels)
+        ctx.mark_non_differentiable(*counts)
+        weight, touched, dominant = counts
+        return pixels.view(height, width, -1), weight, touched, dominant.view(height, width)
+
+    @staticmethod
+    def backward(ctx: Any, v_pixels: Tensor, *_: Any) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        from tumble.backends import _warp, _warp_adjoint, _warp_composite, _warp_project
+
+        means, quats, scales, _, sh, corners, camera, record, n_tiles, starts, listed, pixels = ctx.saved_tensors
+        n, channels = len(means), corners.shape[2]
+        sums = means.new_zeros(n, _warp_project.CORNERS + 4 * channels)
+        v_means, v_quats, v_scales, v_sh = (torch.zeros_like(x) for x in (means, quats, scales, sh))
+        v_camera = camera.new_zeros(1, len(camera))
+        with _warp.stream(means.device):
+            drawn = record, _packed(corners), camera, starts, listed, *ctx.size, pixels
+            kernel = _warp_composite.adjoint(channels)
+            _warp.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
+            gradients = v_means, v_quats, v_scales, v_sh, v_camera
+            whole = -(-n // _warp.LANES) * _warp.LANES
+            inputs = means, quats, scales, sh, camera, n_tiles
+            _warp.launch(_warp_adjoint.project_adjoint, whole, *inputs, sums, *gradients)
+        v_opacity = sums[:, _warp_project.OPACITY]
+        v_corners = sums[:, _warp_project.CORNERS :].view(n, 4, channels)
+        return v_means, v_quats, v_scales, v_opacity, v_sh, v_corners, v_camera[0], None, None, None
+
+
+def _packed(corners: Float[Tensor, "n 4 c"]) -> Float[Tensor, "n 4 c1"]:
+    """Warp has no vectors of length 0; the kernel does not look at these."""
+    return corners if corners.shape[2] else corners.new_empty(len(corners), 4, 1)
+
+
+def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
+    from tumble.backends._warp_project import TILE
+
+    return (len(starts) - 1) * TILE * TILE
+
+
+def _bin(
+    record: Float[Tensor, "n 8 4"], depth: Float[Tensor, " n"], n_tiles: Int32[Tensor, " n"], height: int, width: int
+) -> tuple[Int32[Tensor, " tiles_1"], Int32[Tensor, " pairs"]]:
+    """Where each tile's list starts (and the last ends), and the lists: Gaussians by depth, ties by index."""
+    import warp
+
+    from tumble.backends import _warp, _warp_project
+
+    order = torch.argsort(depth, stable=True)
+    ends = n_tiles[order].cumsum(0)
+    n_pairs = int(ends[-1]) if len(ends) else 0
+    # The second half of each is the sort's workspace. It is stable, so a tile's Gaussians stay in order of depth.
+    tiles, listed = _int32(depth, 2 * n_pairs), _int32(depth, 2 * n_pairs)
+    _warp.launch(_warp_project.list_tiles, len(order), order, ends, record, n_tiles, height, width, tiles, listed)
+    n_all = -(-height // _warp_project.TILE) * -(-width // _warp_project.TILE)
+    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), n_pairs, end_bit=n_all.bit_length())
+    every = torch.arange(n_all + 1, dtype=torch.int32, device=depth.device)
+    return torch.searchsorted(tiles[:n_pairs], every, out_int32=True), listed[:n_pairs]
+
+
+class Tree(NamedTuple):
+    """What `build` hands to the tracing functions."""
+
+    boxes: Any
+    """A `warp.Bvh`."""
+    record: Float[Tensor, "n 4 4"]
+    low: Float[Tensor, "n 3"]
+    high: Float[Tensor, "n 3"]
+    """Corners of the boxes, to which the first points."""
+
+
+@torch.no_grad()
+def build(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacity: Float[Tensor, " n"],
+) -> Tree:
+    """See `Backend.build`."""
+    import warp
+
+    from tumble.backends import _warp, _warp_trace
+
+    # Warp's tree is never empty: one box far away stands for no Gaussians.
+    n = max(len(means), 1)
+    record = means.new_zeros(n, 4, 4)
+    low, high = means.new_full((n, 3), _warp_trace.NOWHERE), means.new_full((n, 3), _warp_trace.NOWHERE)
+    with _warp.stream(means.device):
+        gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
+        _warp.launch(_warp_trace.enclose, len(means), *gaussians, record, low, high)
+        boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3))
+    return Tree(boxes, record, low, high)
+
+
+@torch.no_grad()
+def trace(
+    bvh: Tree,
+    origins: Float[Tensor, "r 3"],
+    directions: Float[Tensor, "r 3"],
+    radiance: Float[Tensor, "m 3"],
+) -> Hits:
+    """See `Backend.trace`."""
+    from tumble.backends import _warp, _warp_trace
+
+    n = len(origins)
+    hits = Hits(origins.new_empty(n), origins.new_empty(n, 3), _int32(origins, n))
+    with _warp.stream(origins.device):
+        rays = [x.contiguous() for x in (radiance, origins, directions)]
+        _warp.launch(_warp_trace.trace_rays, n, bvh.boxes.id, bvh.record, *rays, *hits)
+    return hits
+
+
+@torch.no_grad()
+def visible(
+    bvh: Tree,
+    points: Float[Tensor, "p 3"],
+    normals: Float[Tensor, "p 3"],
+    directions: Float[Tensor, "d 3"],
+) -> Int32[Tensor, "p words"]:
+    """See `Backend.visible`."""
+    from tumble.backends import _warp, _warp_trace
+
+    words = -(-len(directions) // 32)
+    bits = _int32(points, len(points), words)
+    with _warp.stream(points.device):
+        around = [x.contiguous() for x in (points, normals, directions)]
+        _warp.launch(_warp_trace.look_around, (words, len(points)), bvh.boxes.id, bvh.record, *around, bits)
+    return bits
+
+
+@torch.no_grad()
+def blockers(
+    bvh: Tree,
+    points: Float[Tensor, "p 3"],
+    normals: Float[Tensor, "p 3"],
+    directions: Float[Tensor, "d 3"],
+    visibility: Int32[Tensor, "p words"],
+) -> Int32[Tensor, "p d"]:
+    """See `Backend.blockers`."""
+    from tumble.backends import _warp, _warp_trace
+
+    found = _int32(points, len(points), len(directions))
+    with _warp.stream(points.device):
+        around = [x.contiguous() for x in (points.new_zeros(0, 3), points, normals, directions, visibility)]
+        threads = len(directions), len(points)
+        _warp.launch(_warp_trace.find_blockers, threads, bvh.boxes.id, bvh.record, *around, found)
+    return found
+
+
+def _int32(like: Tensor, *shape: int) -> Int32[Tensor, "..."]:
+    return torch.empty(shape, dtype=torch.int32, device=like.device)
+
+
+def shade(
+    normal: Float[Tensor, "p 3"],
+    albedo: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+    view: Float[Tensor, "p 3"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
+    visibility: Int32[Tensor, "p words"],
+    blocker: Int32[Tensor, "#p #d"],
+    blocker_radiance: Float[Tensor, "m 3"],
+    f0: float,
+) -> Float[Tensor, "p 3"]:
+    """See `Backend.shade`."""
+    surface = normal, albedo, roughness, view
+    return _Shade.apply(*surface, directions, radiance, visibility, blocker, blocker_radiance, f0)
+
+
+class _Shade(torch.autograd.Function):
+    """The arguments of `shade`, one by one."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> Tensor:
+        from tumble.backends import _warp, _warp_shade
+
+        *tensors, ctx.f0 = args
+        tensors = [x.contiguous() for x in tensors]
+        n, d = len(tensors[0]), len(tensors[4])
+        tensors[7] = tensors[7].expand(n, d)
+        out = torch.zeros_like(tensors[0])
+        with _warp.stream(out.device):
+            _warp.launch(_warp_shade.shade_forward, (n, _warp.LANES), *tensors, ctx.f0, out.view(-1))
+        ctx.save_for_backward(*tensors)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        from tumble.backends import _warp, _warp_shade
+
+        *surface, directions, radiance, visibility, blocker, blocker_radiance = ctx.saved_tensors
+        v_out = v_out.contiguous()
+        n, groups = len(v_out), -(-len(v_out) // _warp_shade.POINTS)
+        v_points = v_out.new_zeros(n, 10)
+        v_radiance, v_blocker_radiance = torch.zeros_like(radiance), torch.zeros_like(blocker_radiance)
+        with _warp.stream(v_out.device):
+            inputs = *surface, directions, radiance, visibility, blocker, blocker_radiance, ctx.f0
+            _warp.launch(_warp_shade.shade_adjoint, (n, _warp.LANES), *inputs, v_out, v_points)
+            inputs = *surface, directions, visibility, blocker, ctx.f0
+            threads = groups, len(directions)
+            _warp.launch(_warp_shade.light_adjoint, threads, *inputs, v_out, v_radiance, v_blocker_radiance)
+        v_normal, v_view, v_albedo, v_roughness = v_points.split([3, 3, 3, 1], 1)
+        v_surface = v_normal, v_albedo, v_roughness[:, 0], v_view
+        return *v_surface, None, v_radiance, None, None, v_blocker_radiance, None

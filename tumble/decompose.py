@@ -1,0 +1,299 @@
+"""Stage 3: albedo, roughness and light, by physically based deferred shading of the refined Gaussians (section 4.3).
+
+Every step shades some pixels of one frame: the light of that frame is the environment seen through `R_env_obj`, and
+so is the light that other parts of the object send on (deviation from the paper's frame-averaged radiance: a point's
+radiance changes with the pose). Visibility is cached per Gaussian over several turned sets of shared directions.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from tumble import coarse_light, losses, optim
+from tumble.asset import Asset
+from tumble.buffers import Buffers
+from tumble.camera import Camera
+from tumble.capture import Capture
+from tumble.coarse_light import F0
+from tumble.directions import fibonacci_sphere, random_rotation
+from tumble.environment import Environment
+from tumble.gaussians import Gaussians
+from tumble.images import edge_aware
+from tumble.loop import State
+from tumble.material import TEMPERATURE, Material
+from tumble.prefilter import prefilter
+from tumble.rasterize import rasterize
+from tumble.refine import Frame, Refined, frame
+from tumble.se3 import SE3
+from tumble.shade import Bounce, Surface, shade_split, surface
+from tumble.trace import Visibility, build, surface_points, visibility
+from tumble.trajectory import Trajectory
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Eq. 14; values from appendix A, stage 3."""
+
+    light: float = 0.05
+    """Squared differences of neighbouring texels."""
+    material: float = 0.25
+    """Edge-aware smoothness of albedo and roughness."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates; material and light from appendix A."""
+
+    albedo: float = 0.025
+    roughness: float = 0.025
+    normal: float = 1e-3
+    light: float = 0.01
+    means: float = 1.6e-5
+    """Geometry joins after the warm-up, about ten times slower than in stage 2. The paper: "from SVG-IR"."""
+    quats: float = 1e-4
+    log_scales: float = 5e-4
+    sdf: float = 5e-3
+    poses: float = 0.0
+    """0 leaves the poses of stage 2."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Paper values where it states them; where it is silent, what measured best."""
+
+    steps: int = 150_000
+    """Appendix A."""
+    warmup: int = 5_000
+    """Steps before geometry joins (appendix A)."""
+    directions: int = 512
+    """Shared directions of the diffuse light (appendix A)."""
+    sets: int = 8
+    """Turned sets of directions, taken in turn: more leave less of their pattern in the albedo."""
+    pixels: int = 1024
+    """Pixels shaded per step."""
+    rows: int = 16
+    """Of the light map at the start (appendix A)."""
+    doublings: int = 6
+    """Of the light map, spread evenly over the run (appendix A: up to 1024 rows)."""
+    roughness: float = 0.4
+    """At the start."""
+    brightness: float = 0.8
+    """Brightest albedo at the start (95 %); the light takes up the rest. Their product is all that stage 2 knows."""
+    visibility: bool = True
+    """Whether the object shadows itself."""
+    bounce: bool = True
+    """Whether the object lights itself."""
+    weights: Weights = field(default_factory=Weights)
+    rates: Rates = field(default_factory=Rates)
+
+
+@dataclass(frozen=True)
+class Params:
+    """What stage 3 trains."""
+
+    gaussians: Gaussians
+    gamma: Float[Tensor, ""]
+    material: Material
+    environment: Environment
+    poses: Float[Tensor, "t 6"]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A capture and what stage 2 made of it."""
+
+    capture: Capture
+    refined: Refined
+
+
+def length(cfg: Config, inputs: Inputs) -> int:
+    return cfg.steps
+
+
+def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
+    """Materials and light as stage 2 found them; visibility traced."""
+    refined = inputs.refined
+    # One factor for all channels: a saturated object has a channel that is dark for good reason.
+    share = cfg.brightness / refined.albedo.amax(-1).quantile(0.95)
+    albedo = (refined.albedo * share).clamp(0.02, 0.98)
+    light = coarse_light.environment(refined.light, cfg.rows)
+    material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
+    params = Params(
+        gaussians=refined.gaussians,
+        gamma=refined.gamma,
+        material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
+        environment=Environment.from_radiance(light.radiance / share),
+        poses=albedo.new_zeros(len(refined.trajectory), 6),
+    )
+    params = optim.leaves(params)
+    optimizer = optim.adam(params, _rates(cfg))
+    turns = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
+    state = State(0, params, optimizer, rng, {"directions": torch.stack(turns)})
+    _look_around(cfg, inputs, state)
+    return state
+
+
+def _rates(cfg: Config) -> dict[str, float]:
+    rates = cfg.rates
+    return {
+        "material.albedo_logits": rates.albedo,
+        "material.roughness_logits": rates.roughness,
+        "material.normal_offset": rates.normal,
+        "environment": rates.light,
+        "gaussians.means": rates.means,
+        "gaussians.quats": rates.quats,
+        "gaussians.log_scales": rates.log_scales,
+        "gaussians.sdf": rates.sdf,
+        "gaussians.sh": 0.0,
+        "gamma": 0.0,
+        "poses": rates.poses,
+    }
+
+
+@torch.no_grad()
+def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Trace what every Gaussian sees, from the surface that it stands for."""
+    params, camera = state.params, inputs.capture.camera
+    gaussians = params.gaussians
+    views = []
+    for number in range(len(inputs.capture)):
+        T_cam_obj = pose(params, inputs, number)
+        views.append((rasterize(gaussians, params.gamma, T_cam_obj, camera, {}), T_cam_obj, camera))
+    points = surface_points(gaussians, views, alpha_min=0.5)
+    tracer = build(gaussians, params.gamma)
+    seen = [
+        visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce)
+        for directions in state.memory["directions"]
+    ]
+    state.memory["bits"] = torch.stack([v.bits for v in seen])
+    if cfg.bounce:
+        state.memory["blocker"] = torch.stack([v.blocker for v in seen if v.blocker is not None])
+
+
+def pose(params: Params, inputs: Inputs, number: int) -> SE3:
+    """`T_cam_obj` of one frame."""
+    return SE3.exp(params.poses[number]) @ inputs.refined.trajectory.T_cam_obj[number]
+
+
+def buffers_of(asset: Asset | Params, T_cam_obj: SE3, camera: Camera) -> Buffers:
+    """One view's albedo, roughness and normal, with the detail of the normal added."""
+    material = asset.material
+    assert material is not None, "an asset with material"
+    features = {
+        "albedo": material.albedo,
+        "roughness": material.roughness[..., None],
+        "offset": material.normal_offset,
+    }
+    view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, features)
+    return replace(view, normal=view.normal + view.features["offset"])
+
+
+def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor]:
+    _grow_light(cfg, state)
+    params, capture = state.params, inputs.capture
+    number = int(torch.randint(len(capture), (1,), generator=state.rng))
+    T_cam_obj = pose(params, inputs, number)
+    view = buffers_of(params, T_cam_obj, capture.camera)
+    truth = frame(capture, number, view.alpha)
+    points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, truth, state.rng))
+    R_env_obj = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), capture.light).R_env_obj[0]
+    shaded = _shaded(cfg, state, view, points, R_env_obj)
+    alpha = points.sample(view.alpha[..., None])
+    rendered, photograph = (shaded * alpha)[None], points.sample(truth.image)[None]
+    terms = {
+        "render": (losses.developed(rendered, photograph) - photograph).abs().mean(),
+        "light": cfg.weights.light * _roughness_of(params.environment.radiance),
+        "material": cfg.weights.material * _smoothness(view, truth),
+    }
+    joined = float(state.step >= cfg.warmup)
+    slow = 0.1 ** (state.step / cfg.steps)
+    optim.anneal(
+        state.optimizer, {"material": slow, "environment": slow, "gaussians": joined * slow, "poses": joined * slow}
+    )
+    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    return {name: value.detach() for name, value in terms.items()}
+
+
+def _draw(cfg: Config, view: Buffers, truth: Frame, rng: torch.Generator) -> Tensor:
+    """Some pixels that show the object for sure."""
+    solid = torch.where(((view.alpha > 0.5) & (truth.mask > 0.5)).flatten())[0]
+    if not len(solid):
+        return solid
+    return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
+
+
+def _shaded(
+    cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj: Tensor
+) -> Float[Tensor, "p 3"]:
+    params = state.params
+    which = state.step % cfg.sets
+    index = view.dominant.flatten()[points.pixels].clamp_min(0).long()
+    bits = state.memory["bits"][which]
+    bits = bits if cfg.visibility else torch.full_like(bits, -1)
+    blocker = state.memory["blocker"][which] if cfg.bounce else None
+    seen = Visibility(state.memory["directions"][which], bits, blocker).gather(index)
+    bounce = Bounce(params.material.albedo.mean(1), params.gaussians.normals) if cfg.bounce else None
+    return shade_split(
+        points,
+        points.sample(view.features["albedo"]),
+        points.sample(view.features["roughness"]),
+        prefilter(params.environment),
+        R_env_obj,
+        seen,
+        f0=F0,
+        bounce=bounce,
+    )
+
+
+def _roughness_of(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean squared difference between neighbouring texels, around the seam too (L_light)."""
+    down, across = radiance[1:] - radiance[:-1], radiance.roll(-1, 1) - radiance
+    return (down**2).mean() + (across**2).mean()
+
+
+def _smoothness(view: Buffers, truth: Frame) -> Float[Tensor, ""]:
+    """Edge-aware smoothness of albedo and roughness on the object (L_material)."""
+    inside = (truth.mask * (view.alpha > 0.5))[..., None]
+    maps = torch.cat([view.features["albedo"], view.features["roughness"]], -1)
+    return edge_aware(maps * inside, truth.image)
+
+
+def _grow_light(cfg: Config, state: State) -> None:
+    """Double the light map at even intervals; the optimizer goes on."""
+    done = round(math.log2(state.params.environment.log_radiance.shape[0] / cfg.rows))
+    due = min(cfg.doublings, state.step * (cfg.doublings + 1) // cfg.steps)
+    if done >= due:
+        return
+
+    def doubled(x: Tensor) -> Tensor:
+        return interpolate(x.movedim(-1, 0)[None], scale_factor=2, mode="bilinear")[0].movedim(0, -1)
+
+    environment = optim.resample(
+        state.params.environment,
+        state.optimizer,
+        "log_radiance",
+        lambda x: Environment(x).upsampled().log_radiance,
+        moments=doubled,
+    )
+    state.params = replace(state.params, environment=environment)
+
+
+@torch.no_grad()
+def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
+    """The relightable object."""
+    params = state.params
+    T_cam_obj = SE3.exp(params.poses) @ inputs.refined.trajectory.T_cam_obj
+    return Asset(
+        gaussians=params.gaussians,
+        gamma=params.gamma,
+        material=params.material,
+        environment=params.environment,
+        trajectory=Trajectory(T_cam_obj, inputs.capture.light),
+        camera=inputs.capture.camera,
+    )

@@ -1,0 +1,317 @@
+"""Stage 2: geometry, poses and a first guess of albedo and light, by fitting Gaussians to the frames (paper section 4.2).
+
+The Gaussians start on the visual hull of the masks. Their colour is the rotation-aware one of `coarse_light` by default;
+`ShConfig` is the paper's static colour per Gaussian, kept as an ablation.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from tumble import coarse_light, densify, hull, losses, optim
+from tumble.buffers import Buffers
+from tumble.camera import Camera
+from tumble.capture import OBJECT, UNKNOWN, Capture
+from tumble.coarse_light import CoarseLight
+from tumble.gaussians import Gaussians, constant_sh, opacity, sdf_from_opacity
+from tumble.loop import State
+from tumble.rasterize import rasterize
+from tumble.se3 import SE3
+from tumble.trajectory import Trajectory
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Eq. 9-13; values from appendix A, stage 2."""
+
+    mask: float = 1.0
+    normal: float = 0.05
+    variance: float = 1.0
+    rank: float = 0.1
+    gamma: float = 5.0
+    proj: float = 1.0
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates. The paper takes those of 3DGS; ours are for a start on the hull, and a few thousand steps."""
+
+    means: float = 1e-3
+    """[object radius]; decays to `decay` of it."""
+    quats: float = 4e-3
+    log_scales: float = 8e-3
+    sdf: float = 2e-3
+    gamma: float = 0.05
+    albedo: float = 2e-2
+    light: float = 1e-2
+    sh: float = 1e-2
+    poses: float = 0.0
+    """0 leaves the poses as given."""
+    decay: float = 0.05
+
+
+@dataclass(frozen=True)
+class Config:
+    """Paper values where it states them; where it is silent, what measured best."""
+
+    steps: int = 150_000
+    """Appendix A."""
+    colour: Literal["light", "sh"] = "light"
+    """light: rotation-aware; sh: the paper's static radiance per Gaussian, degree 3."""
+    points: int = 20_000
+    """Gaussians at the start. Not stated in the paper."""
+    limit: int = 100_000
+    """Largest number of Gaussians."""
+    hull: int = 128
+    """Cells per side of the carved grid."""
+    opacity: float = 0.9
+    """At the start."""
+    gamma: float = 30.0
+    """Sharpness at the start [1 / object radius]."""
+    gamma_floor: float = 0.02
+    """Median distance under which gamma is not pushed further (L_gamma) [object radius]."""
+    ssim: float = 0.2
+    """Share of 1 - SSIM in the photometric term."""
+    weights: Weights = field(default_factory=Weights)
+    rates: Rates = field(default_factory=Rates)
+    ramp: float = 0.1
+    """Share of the run over which normal and variance terms come in."""
+    every: int = 500
+    """Steps between densifications (FastGS)."""
+    until: float = 0.7
+    """Share of the run after which the number of Gaussians stays."""
+    views: int = 10
+    """Views that are scored at each densification (FastGS)."""
+    bad: float = 0.1
+    """Share of the largest error from which a pixel counts as bad (FastGS)."""
+    bad_floor: float = 0.02
+    """Least error of a bad pixel, sRGB."""
+    importance: float = 2.0
+    """Bad pixels that a Gaussian touches, mean over views, from which it splits."""
+    fraction: float = 0.12
+    """Largest share of the Gaussians that splits at once."""
+    least_opacity: float = 0.05
+    """Gaussians below it are dropped."""
+    least_weight: float = 0.05
+    """Gaussians whose weight in no scored view reaches this are dropped [pixels]."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """All that there is one row of per Gaussian."""
+
+    gaussians: Gaussians
+    albedo_logits: Float[Tensor, "n 3"]
+
+
+@dataclass(frozen=True)
+class Params:
+    """What stage 2 trains."""
+
+    points: Points
+    gamma: Float[Tensor, ""]
+    light: CoarseLight
+    poses: Float[Tensor, "t 6"]
+    """Tangents: `T_cam_obj = exp(poses) @ base`."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The outcome of stage 2."""
+
+    gaussians: Gaussians
+    gamma: Float[Tensor, ""]
+    albedo: Float[Tensor, "n 3"]
+    """Linear, up to one factor per channel that the light takes up."""
+    light: CoarseLight
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A capture and its poses."""
+
+    capture: Capture
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph as the losses want it."""
+
+    image: Float[Tensor, "h w 3"]
+    """sRGB in [0, 1]."""
+    mask: Float[Tensor, "h w"]
+    valid: Float[Tensor, "h w 1"]
+
+
+def frame(capture: Capture, number: int, like: Tensor) -> Frame:
+    """Photograph `number` of a capture in the dtype and on the device of `like`."""
+    mask = capture.masks[number].to(like.device)
+    image = capture.images[number].to(like) / 255
+    return Frame(image, (mask == OBJECT).to(like), (mask != UNKNOWN).to(like)[..., None])
+
+
+def length(cfg: Config, inputs: Inputs) -> int:
+    return cfg.steps
+
+
+def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
+    """Gaussians on the visual hull, grey, under a uniform light."""
+    like = inputs.trajectory.T_cam_obj.xyz
+    cells = hull.carve(inputs.capture, inputs.trajectory, resolution=cfg.hull)
+    start = hull.surface(cells, cfg.points, rng)
+    n = len(start.positions)
+    scale = (0.7 * start.spacing).clamp(1e-3, 0.2)
+    gamma = torch.tensor(cfg.gamma).to(like)
+    sdf = sdf_from_opacity(torch.full_like(scale, cfg.opacity), gamma)
+    k = 1 if cfg.colour == "light" else 16
+    gaussians = Gaussians(
+        means=start.positions,
+        quats=_facing(start.normals),
+        log_scales=torch.stack([scale, scale, 0.1 * scale], -1).log(),
+        sdf=sdf,
+        sh=torch.cat([constant_sh(torch.full_like(start.positions, 0.2)), start.positions.new_zeros(n, k - 1, 3)], 1),
+    )
+    params = Params(
+        points=Points(gaussians, torch.full_like(start.positions, -0.4)),
+        gamma=gamma,
+        light=CoarseLight.constant(0.4, like),
+        poses=like.new_zeros(len(inputs.trajectory), 6),
+    )
+    params = optim.leaves(params)
+    return State(0, params, optim.adam(params, _rates(cfg)), rng, {"order": torch.zeros(0, dtype=torch.long)})
+
+
+def _rates(cfg: Config) -> dict[str, float]:
+    rates, light = cfg.rates, cfg.colour == "light"
+    return {
+        "points.gaussians.means": rates.means,
+        "points.gaussians.quats": rates.quats,
+        "points.gaussians.log_scales": rates.log_scales,
+        "points.gaussians.sdf": rates.sdf,
+        "points.gaussians.sh": 0.0 if light else rates.sh,
+        "points.albedo_logits": rates.albedo if light else 0.0,
+        "light": rates.light if light else 0.0,
+        "gamma": rates.gamma,
+        "poses": rates.poses,
+    }
+
+
+def _facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Shortest rotations that take the third axis to given normals, wxyz."""
+    z = normals[:, 2:]
+    w = 1 + z
+    axis = torch.stack([-normals[:, 1], normals[:, 0], torch.zeros_like(normals[:, 0])], -1)
+    quats = torch.cat([w, axis], -1)
+    opposite = (w < 1e-4).expand_as(quats)
+    return normalize(torch.where(opposite, quats.new_tensor([0.0, 1.0, 0.0, 0.0]), quats), dim=-1)
+
+
+def pose(params: Params, inputs: Inputs, number: int) -> SE3:
+    """`T_cam_obj` of one frame."""
+    return SE3.exp(params.poses[number]) @ inputs.trajectory.T_cam_obj[number]
+
+
+def render(
+    points: Points, gamma: Tensor, light: CoarseLight, T_cam_obj: SE3, trajectory: Trajectory, camera: Camera, mask: Tensor | None = None
+) -> Buffers:
+    """One view with stage 2's colour, linear radiance."""
+    gaussians = points.gaussians
+    if gaussians.sh.shape[1] == 1:
+        R_env_obj = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), trajectory.light).R_env_obj[0]
+        view = normalize(T_cam_obj.inverse().xyz - gaussians.means, dim=-1)
+        albedo = torch.sigmoid(points.albedo_logits)
+        colour = coarse_light.radiance(light, albedo, gaussians.normals, view, R_env_obj)
+        gaussians = replace(gaussians, sh=constant_sh(colour))
+    return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
+
+
+def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor]:
+    progress = state.step / cfg.steps
+    if state.step and state.step % cfg.every == 0 and progress < cfg.until:
+        _densify(cfg, inputs, state)
+    params, camera = state.params, inputs.capture.camera
+    number = _draw(state, len(inputs.capture))
+    T_cam_obj = pose(params, inputs, number)
+    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+    terms = _terms(cfg, params, view, frame(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
+    optim.anneal(state.optimizer, _annealed(cfg, progress))
+    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    return {name: value.detach() for name, value in terms.items()} | {"gaussians": len(params.points.albedo_logits)}
+
+
+def _draw(state: State, n: int) -> int:
+    """The next frame: all frames in a new random order, again and again."""
+    if state.step % n == 0 or not len(state.memory["order"]):
+        state.memory["order"] = torch.randperm(n, generator=state.rng)
+    return int(state.memory["order"][state.step % n])
+
+
+def _annealed(cfg: Config, progress: float) -> dict[str, float]:
+    slow = 0.2**progress
+    return {"": slow, "points.gaussians.means": cfg.rates.decay**progress, "gamma": 1.0}
+
+
+def _terms(
+    cfg: Config, params: Params, view: Buffers, truth: Frame, camera: Camera, T_cam_obj: SE3, progress: float
+) -> dict[str, Tensor]:
+    weights, gaussians = cfg.weights, params.points.gaussians
+    ramp = min(1.0, progress / cfg.ramp)
+    image = losses.developed(view.rgb, truth.image)
+    from_depth, known = losses.surface_normals(view.depth, view.alpha > 0.5, camera, T_cam_obj)
+    seen = view.weight > 0
+    return {
+        "render": losses.photometric(image, truth.image, truth.valid, ssim_weight=cfg.ssim),
+        "mask": weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
+        "normal": ramp * weights.normal * losses.normal_consistency(view.normal, from_depth, known),
+        "variance": ramp * weights.variance * losses.variance(view.depth_var),
+        "rank": weights.rank * losses.effective_rank(gaussians.log_scales),
+        "gamma": weights.gamma * losses.sharpness(gaussians.sdf, params.gamma, floor=cfg.gamma_floor) * 1e-2,
+        "proj": weights.proj * losses.projection(gaussians, seen, view.depth, camera, T_cam_obj, reach=0.1),
+    }
+
+
+@torch.no_grad()
+def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
+    params, camera = state.params, inputs.capture.camera
+    n = len(params.points.albedo_logits)
+    bad, weight = torch.zeros(n), torch.zeros(n)
+    numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: cfg.views].tolist()
+    for number in numbers:
+        T_cam_obj = pose(params, inputs, number)
+        arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+        first = render(*arguments)
+        truth = frame(inputs.capture, number, first.alpha)
+        error = (losses.developed(first.rgb, truth.image) - truth.image).abs().mean(-1)
+        where = densify.bad_pixels(error, truth.mask, relative=cfg.bad, absolute=cfg.bad_floor)
+        bad += render(*arguments, mask=where).touched / len(numbers)
+        weight = torch.maximum(weight, first.weight)
+    drop = opacity(params.points.gaussians.sdf, params.gamma) < cfg.least_opacity
+    # Ten views show about everything of a tumbling object; what none of them shows lies inside.
+    drop |= weight < cfg.least_weight
+    plan = densify.plan(bad, drop, threshold=cfg.importance, fraction=cfg.fraction, limit=cfg.limit)
+    points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
+    densify.place_children(points.gaussians, plan)
+    state.params = replace(params, points=points)
+
+
+@torch.no_grad()
+def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
+    """Geometry, first albedo and light; the Gaussians' static colour is the mean over all frames."""
+    params = state.params
+    T_cam_obj = SE3.exp(params.poses) @ inputs.trajectory.T_cam_obj
+    trajectory = Trajectory(T_cam_obj, inputs.trajectory.light)
+    gaussians, albedo = params.points.gaussians, torch.sigmoid(params.points.albedo_logits)
+    if cfg.colour == "light":
+        mean = torch.zeros_like(albedo)
+        for R_env_obj in trajectory.R_env_obj:
+            mean += albedo * params.light.diffuse(gaussians.normals @ R_env_obj.T) / len(trajectory)
+        gaussians = replace(gaussians, sh=constant_sh(mean))
+    return Refined(gaussians, params.gamma, albedo, params.light, trajectory)

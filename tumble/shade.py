@@ -1,0 +1,233 @@
+"""Deferred shading: what a camera sees of the surface, lit by the environment of one frame.
+
+Everything happens in the object frame, under one set of directions for the whole view: the light of a frame is
+`environment.lookup(R_env_obj @ w)`, one lookup per direction and frame. *Surface*: the points behind some pixels.
+*Bounce*: light that Gaussians standing in the way send on, of the same frame, since light and object turn apart.
+
+Two estimators for training: `shade` sums both lobes over the shared directions (unbiased, but a few hundred cannot
+resolve a lobe of low roughness), `shade_split` sums the diffuse lobe and takes the specular one from a prefiltered
+light. `importance.relight_surface` is the third, for final pictures.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from tumble import backends, brdf, harmonics
+from tumble.buffers import Buffers
+from tumble.camera import Camera
+from tumble.directions import reflect
+from tumble.environment import Environment
+from tumble.prefilter import Prefiltered
+from tumble.se3 import SE3
+from tumble.trace import Visibility
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points that a camera sees, object frame."""
+
+    pixels: Int64[Tensor, " p"]
+    """Which pixels, counted row by row."""
+    points: Float[Tensor, "p 3"]
+    """[object radius]"""
+    normals: Float[Tensor, "p 3"]
+    """Outward, unit."""
+    views: Float[Tensor, "p 3"]
+    """Unit directions to the camera."""
+
+    def sample(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "p c"]:
+        """An image of the same view at the points."""
+        return image.flatten(0, 1)[self.pixels]
+
+    def paint(self, values: Float[Tensor, "p c"], height: int, width: int) -> Float[Tensor, "{height} {width} c"]:
+        """An image with values at the points, 0 elsewhere."""
+        empty = values.new_zeros(height * width, values.shape[1])
+        return empty.index_copy(0, self.pixels, values).unflatten(0, (height, width))
+
+
+def surface(
+    buffers: Buffers,
+    T_cam_obj: SE3,
+    camera: Camera,
+    *,
+    alpha_min: float = 0.5,
+    pixels: Int64[Tensor, " p"] | None = None,
+) -> Surface:
+    """The points behind pixels, at their mean depth; differentiable in buffers and pose.
+
+    To shade detail of the normal (`Material.normal_offset`), add its image to `Buffers.normal` beforehand.
+
+    Args:
+        alpha_min: Coverage from which a pixel counts as surface: at a depth edge the mean depth is in mid-air.
+        pixels: Only these, counted row by row, each with a coverage above zero; all with `alpha_min` when None.
+    """
+    if pixels is None:
+        pixels = torch.where(buffers.alpha.flatten() >= alpha_min)[0]
+    column, row = pixels % camera.width, pixels // camera.width
+    uv = torch.stack([column, row], -1).to(buffers.depth) + 0.5
+    ray_cam = camera.unproject(uv, torch.ones_like(uv[:, 0])).to(buffers.depth)
+    T_obj_cam = T_cam_obj.inverse()
+    points = T_obj_cam @ (buffers.depth.flatten()[pixels][:, None] * ray_cam)
+    normals = normalize(buffers.normal.flatten(0, 1)[pixels], dim=-1)
+    return Surface(pixels, points, normals, normalize(T_obj_cam.rotation @ -ray_cam, dim=-1))
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """Diffuse light from whatever stands in the way, one bounce, itself lit from everywhere."""
+
+    albedo: Float[Tensor, "n 3"]
+    """Linear base colour of every Gaussian."""
+    normals: Float[Tensor, "n 3"]
+    """Unit normals, object frame."""
+
+    def radiance(self, directions: Float[Tensor, "D 3"], light: Float[Tensor, "D 3"]) -> Float[Tensor, "n 3"]:
+        """Radiance of every Gaussian under light from directions of equal area.
+
+        Nothing shades a Gaussian itself. Its irradiance is that of harmonics to degree 2, within 1 % of the
+        integral for most lights (Ramamoorthi and Hanrahan 2001).
+        """
+        Y = harmonics.basis(directions, 2)
+        coefficients = 4 * math.pi / len(directions) * (Y.mT @ light)
+        irradiance = harmonics.basis(self.normals, 2) @ harmonics.irradiance_coefficients(coefficients)
+        # Under a single lamp the truncated series dips below zero on the far side.
+        return self.albedo / math.pi * irradiance.clamp(min=0)
+
+
+def shade(
+    surface: Surface,
+    albedo: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, "p 1"],
+    environment: Environment,
+    R_env_obj: Float[Tensor, "3 3"],
+    visibility: Visibility,
+    *,
+    f0: float,
+    bounce: Bounce | None = None,
+) -> Float[Tensor, "p 3"]:
+    """Reflected radiance (eq. 10), both lobes summed over the visibility's directions.
+
+    Differentiable in everything but directions and visibility. Unbiased if the directions are rotated at random.
+
+    Args:
+        visibility: What the points see; `trace.open_sky` for everything.
+        f0: Reflectance at normal incidence.
+        bounce: What stands in the way, where the visibility keeps blockers; black when None.
+    """
+    light = environment.lookup(visibility.directions @ R_env_obj.mT)
+    return _sum(surface.normals, albedo, roughness, surface.views, visibility, light, bounce, f0)
+
+
+def diffuse(
+    surface: Surface,
+    albedo: Float[Tensor, "p 3"],
+    environment: Environment,
+    R_env_obj: Float[Tensor, "3 3"],
+    visibility: Visibility,
+    *,
+    bounce: Bounce | None = None,
+) -> Float[Tensor, "p 3"]:
+    """The diffuse lobe of `shade` alone."""
+    light = environment.lookup(visibility.directions @ R_env_obj.mT)
+    return _diffuse(surface, albedo, visibility, light, bounce)
+
+
+def shade_split(
+    surface: Surface,
+    albedo: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, "p 1"],
+    prefiltered: Prefiltered,
+    R_env_obj: Float[Tensor, "3 3"],
+    visibility: Visibility,
+    *,
+    f0: float,
+    bounce: Bounce | None = None,
+) -> Float[Tensor, "p 3"]:
+    """Reflected radiance, the diffuse lobe summed over the directions and the specular one by the split sum.
+
+    The mirrored light is dimmed by the share of its lobe that is visible. Arguments as for `shade`.
+    """
+    light = prefiltered.environment.lookup(visibility.directions @ R_env_obj.mT)
+    shine = specular(surface.normals, surface.views, roughness, prefiltered, R_env_obj, f0)
+    seen = lobe_visibility(visibility, reflect(surface.views, surface.normals), roughness)
+    return _diffuse(surface, albedo, visibility, light, bounce) + seen * shine
+
+
+def specular(
+    normals: Float[Tensor, "p 3"],
+    views: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, "p 1"],
+    prefiltered: Prefiltered,
+    R_env_obj: Float[Tensor, "3 3"],
+    f0: float,
+) -> Float[Tensor, "p 3"]:
+    """The specular lobe by the split sum, nothing in the way; unit normals and directions to the eye, object frame."""
+    nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
+    scale, bias = brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness).split(1, -1)
+    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * (f0 * scale + bias)
+
+
+@torch.no_grad()
+def lobe_visibility(
+    visibility: Visibility, mirrored: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]
+) -> Float[Tensor, "p 1"]:
+    """Visible share of the specular lobe around unit directions; not differentiable.
+
+    Its directions are weighted as `prefilter` does, by a lobe no narrower than they lie apart.
+    """
+    cosine = mirrored @ visibility.directions.T
+    # GGX falls to a quarter at 2 a^2; neighbours lie sqrt(4 pi / D) apart.
+    a = roughness.square().clamp(min=math.sqrt(math.pi / len(visibility.directions)) / 2)
+    t = 0.5 * (1 - cosine) + a * a * 0.5 * (1 + cosine)
+    weight = cosine.clamp(min=0) / t.square()
+    return (weight * visibility.unpacked()).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True)
+
+
+@cache
+def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size 2"]:
+    return brdf.split_sum_table().to(device, dtype)
+
+
+def _diffuse(
+    surface: Surface,
+    albedo: Float[Tensor, "p 3"],
+    visibility: Visibility,
+    light: Float[Tensor, "D 3"],
+    bounce: Bounce | None,
+) -> Float[Tensor, "p 3"]:
+    # An eye behind a smooth surface sees no highlight: what the specular lobe then adds is below 1e-4 of the
+    # light (test_an_eye_behind_the_surface_sees_the_diffuse_lobe_alone).
+    behind, smooth = -surface.normals.detach(), torch.zeros_like(albedo[:, :1])
+    return _sum(surface.normals, albedo, smooth, behind, visibility, light, bounce, 0.0)
+
+
+def _sum(
+    normals: Float[Tensor, "p 3"],
+    albedo: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, "p 1"],
+    views: Float[Tensor, "p 3"],
+    visibility: Visibility,
+    light: Float[Tensor, "D 3"],
+    bounce: Bounce | None,
+    f0: float,
+) -> Float[Tensor, "p 3"]:
+    """Both lobes through the backend's kernel."""
+    blocker, sent = _in_the_way(visibility, light, bounce)
+    backend = backends.choose(normals.device, normals.dtype)
+    directions, bits = visibility.directions, visibility.bits
+    return backend.shade(normals, albedo, roughness[:, 0], views, directions, light, bits, blocker, sent, f0)
+
+
+def _in_the_way(
+    visibility: Visibility, light: Float[Tensor, "D 3"], bounce: Bounce | None
+) -> tuple[Int32[Tensor, "#p #D"], Float[Tensor, "n 3"]]:
+    """What stands in each direction, and the radiance that it sends on."""
+    if bounce is None or visibility.blocker is None:
+        return torch.full((1, 1), -1, dtype=torch.int32, device=light.device), light.new_zeros(0, 3)
+    return visibility.blocker, bounce.radiance(visibility.directions, light)
