@@ -13,6 +13,7 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +69,10 @@ def rasterizing(
             inputs = [x.requires_grad_() for x in inputs]
             mask = torch.ones(1, 1)
             with torch.no_grad():
-                forward = median(lambda: backend.rasterize(*inputs, size, size, mask), threads, runs)
+                forward = median(partial(backend.rasterize, *inputs, size, size, mask), threads, runs)
             view = backend.rasterize(*inputs, size, size, mask)[:6]
             seeds = [torch.randn_like(x) for x in view]
-            backward = median(lambda: torch.autograd.grad(view, inputs, seeds, retain_graph=True), threads, runs)
+            backward = median(partial(torch.autograd.grad, view, inputs, seeds, retain_graph=True), threads, runs)
             what = f"rasterize {n // 1000}k, {size} px, {c} features"
             rows.append(row(what, name, threads, "ms", forward * 1e3, backward * 1e3))
     return rows
@@ -83,25 +84,25 @@ def tracing(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
     for n in (10_000, 50_000):
         means, quats, scales, opacity = shell(n)
         k = f"{n // 1000}k"
-        build = median(lambda: backend.build(means, quats, scales, opacity), threads)  # noqa: B023
+        build = median(partial(backend.build, means, quats, scales, opacity), threads)
         rows.append(row(f"build {k}", name, threads, "ms", build * 1e3))
         bvh = backend.build(means, quats, scales, opacity)
         rng = torch.Generator().manual_seed(0)
         origins = 2.5 * normalize(torch.randn(100_000, 3, generator=rng), dim=-1)
         aims = normalize(torch.randn(100_000, 3, generator=rng), dim=-1) * torch.rand(100_000, 1, generator=rng)
         rays = origins, normalize(aims - origins, dim=-1), torch.rand(n, 3)
-        rate = 0.1 / median(lambda: backend.trace(bvh, *rays), threads)  # noqa: B023
+        rate = 0.1 / median(partial(backend.trace, bvh, *rays), threads)
         rows.append(row(f"trace {k}, ordered, all blocked", name, threads, "M rays/s", rate))
         normals = normalize(means[:: n // 1000], dim=-1)
         directions = fibonacci(DIRECTIONS)
         above = (normals @ directions.T > 0).sum().item() / 1e6
         outside = 1.03 * normals, normals, directions
-        rate = above / median(lambda: backend.visible(bvh, *outside), threads)  # noqa: B023
+        rate = above / median(partial(backend.visible, bvh, *outside), threads)
         rows.append(row(f"visible {k}, open sky", name, threads, "M rays/s", rate))
         # A shell that faces inwards, seen from within: every ray is blocked.
         inwards = backend.build(means, quats[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1, 1, -1]), scales, opacity)
         inside = 0.5 * normals, normals, directions
-        rate = above / median(lambda: backend.visible(inwards, *inside), threads)  # noqa: B023
+        rate = above / median(partial(backend.visible, inwards, *inside), threads)
         rows.append(row(f"visible {k}, all blocked", name, threads, "M rays/s", rate))
     return rows
 
@@ -118,10 +119,10 @@ def shading(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
     seen = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32)
     rest = seen, torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3), 0.04
     with torch.no_grad():
-        forward = median(lambda: backend.shade(*surface, directions, light, *rest), threads)
+        forward = median(partial(backend.shade, *surface, directions, light, *rest), threads)
     shaded = backend.shade(*surface, directions, light, *rest)
     seed = torch.randn(p, 3)
-    backward = median(lambda: torch.autograd.grad(shaded, [*surface, light], seed, retain_graph=True), threads)
+    backward = median(partial(torch.autograd.grad, shaded, [*surface, light], seed, retain_graph=True), threads)
     million = p * DIRECTIONS / 1e6
     return [
         row("shade, forward", name, threads, "M evaluations/s", million / forward),

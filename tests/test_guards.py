@@ -22,9 +22,9 @@ LAYERS = [
     {"losses", "optim", "densify", "fields", "posenets", "metrics", "lpips", "matching"},
     {"loop"},
     {"track", "lift", "refine", "decompose", "relight"},
-    {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "sheet"}
+    {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
     | {"scoresheet", "evaluate", "export", "report", "viewer", "doctor", "demo", "demo_assets"},
-    {"recipes", "run"},
+    {"recipes", "run", "reconstruct"},
     {"cli", "__main__"},
 ]
 """Each row may import only rows above it and itself (design, section 3)."""

@@ -118,7 +118,7 @@ def test_the_kernels_touch_no_memory_but_their_own(tmp_path: Path) -> None:
     if not Path(runtime).is_file():
         pytest.skip("the compiler has no address sanitizer")
     library = tmp_path / "kernels.so"
-    watch = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-march=native"]
+    watch = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-march=native", "-O1"]
     source = str(_native.SOURCES / "kernels.cpp")
     subprocess.run([compiler, *_native.FLAGS, *watch, source, "-o", str(library)], check=True)
     program = (

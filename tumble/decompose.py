@@ -228,9 +228,7 @@ def _draw(cfg: Config, view: Buffers, truth: Frame, rng: torch.Generator) -> Ten
     return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
 
 
-def _shaded(
-    cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj: Tensor
-) -> Float[Tensor, "p 3"]:
+def _shaded(cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj: Tensor) -> Float[Tensor, "p 3"]:
     params = state.params
     which = state.step % cfg.sets
     index = view.dominant.flatten()[points.pixels].clamp_min(0).long()

@@ -8,7 +8,7 @@ Gaussians send on, one bounce, by the split sum. Not differentiable.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from tumble import brdf
@@ -20,6 +20,8 @@ from tumble.trace import Tracer, trace
 
 RAYS = 1 << 18
 """Rays at once: bounds memory to some 300 MB, changes nothing else."""
+CELL_ROWS = 512
+"""Rows of cells aimed at: a million cells in all."""
 HARMONIOUS = 1.2207440846057596
 """Root of x^4 = x + 1: the fractions of its powers fill the unit cube evenly."""
 
@@ -28,8 +30,8 @@ HARMONIOUS = 1.2207440846057596
 class LightSampler:
     """Directions in proportion to the radiance that arrives from them.
 
-    The density is constant on *cells*, four to a texel: fine enough that it is nowhere zero where the bilinear map is
-    not, and at most a few times lower than the map asks for.
+    The density is constant on *cells*, at least four to a texel: it is nowhere zero where the bilinear map is not. The
+    finer the cells, the less noise a bright texel leaves.
     """
 
     environment: Environment
@@ -38,17 +40,20 @@ class LightSampler:
     cumulative: Float64[Tensor, " cells"]
     """Probability of this cell or one before it, row by row. In 64 bits: a bright sun shares a million cells."""
 
-    def sample(self, u: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Unit directions, env frame, from uniform numbers in [0, 1)."""
+    def sample(self, u: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
+        """Unit directions, env frame, from uniform numbers in [0, 1): `u[0]` picks the row, `u[1]` the place in it."""
         rows, columns = self.density.shape
-        cell = torch.searchsorted(self.cumulative, u[..., 0].double().contiguous()).clamp(max=rows * columns - 1)
-        row, column = cell // columns, cell % columns
-        # Even by area: along a column, in the cosine of the polar angle.
-        top, bottom = ((torch.pi / rows * (row + i)).to(u).cos() for i in (0, 1))
-        cosine = top + (bottom - top) * u[..., 1]
-        phi = 2 * torch.pi * ((column + u[..., 2]) / columns - 0.5)
+        ends = self.cumulative[columns - 1 :: columns].contiguous()
+        row, down, start, share = _place(ends, u[..., 0].double())
+        cell, along, _, _ = _place(self.cumulative, start + u[..., 1] * share)
+        # Rounding may end a row in the next.
+        column = (cell - row * columns).clamp(0, columns - 1)
+        # Even by area: down a cell, in the cosine of the polar angle.
+        top, bottom = ((torch.pi / rows * (row + i)).cos() for i in (0, 1))
+        cosine = top + (bottom - top) * down
+        phi = 2 * torch.pi * ((column + along) / columns - 0.5)
         sine = (1 - cosine.square()).clamp(min=0).sqrt()
-        return torch.stack([sine * phi.sin(), cosine, -sine * phi.cos()], -1)
+        return torch.stack([sine * phi.sin(), cosine, -sine * phi.cos()], -1).to(u)
 
     def pdf(self, d_env: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 1"]:
         """Density of `sample` [1 / steradian]."""
@@ -59,13 +64,24 @@ class LightSampler:
         return self.density[row, column][..., None]
 
 
+def _place(
+    ends: Float64[Tensor, " bins"], x: Float64[Tensor, "*b"]
+) -> tuple[Int64[Tensor, "*b"], Float64[Tensor, "*b"], Float64[Tensor, "*b"], Float64[Tensor, "*b"]]:
+    """The bin in which x lies, how far in it is from 0 to 1, and the bin's start and width."""
+    bin_ = torch.searchsorted(ends, x.contiguous(), right=True).clamp(max=len(ends) - 1)
+    start = torch.where(bin_ > 0, ends[(bin_ - 1).clamp(min=0)], 0.0)
+    width = ends[bin_] - start
+    return bin_, ((x - start) / width.clamp(min=1e-300)).clamp(0, 1), start, width
+
+
 @torch.no_grad()
 def light_sampler(environment: Environment) -> LightSampler:
     """A sampler of an environment, by the mean of its channels."""
     h, w, _ = environment.log_radiance.shape
+    h, w = (x * max(2, min(8, CELL_ROWS // h)) for x in (h, w))
     like = {"dtype": environment.log_radiance.dtype, "device": environment.log_radiance.device}
-    brightness = environment.lookup(texel_directions(2 * h, 2 * w, **like)).mean(-1)
-    power = brightness.double() * texel_solid_angles(2 * h, 2 * w).to(brightness.device, torch.float64)
+    brightness = environment.lookup(texel_directions(h, w, **like)).mean(-1)
+    power = brightness.double() * texel_solid_angles(h, w, dtype=torch.float64, device=like["device"])
     density = brightness / power.sum().to(brightness)
     return LightSampler(environment, density, power.flatten().cumsum(0) / power.sum())
 
@@ -112,7 +128,7 @@ def relight_surface(
         normals, views, rough = surface.normals[at, None], surface.views[at, None], roughness[at, None]
         u = (_lattice(n_brdf + n_light).to(albedo) + shift[at.to(shift.device)].to(albedo)) % 1
         scattered = brdf.sample(u[:, :n_brdf], views, normals, roughness=rough)
-        wi = torch.cat([scattered, light.sample(u[:, n_brdf:]) @ R_env_obj], 1)
+        wi = torch.cat([scattered, light.sample(u[:, n_brdf:, 1:]) @ R_env_obj], 1)
         cosine = (wi * normals).sum(-1, keepdim=True).clamp(min=0)
         pdf_light = light.pdf(wi @ R_env_obj.mT)
         density = n_brdf * brdf.pdf(wi, views, normals, roughness=rough) + n_light * pdf_light

@@ -1,7 +1,7 @@
-"""Stage 2: geometry, poses and a first guess of albedo and light, by fitting Gaussians to the frames (paper section 4.2).
+"""Stage 2: geometry, poses and a first guess of albedo and light, by fitting Gaussians to the frames (section 4.2).
 
-The Gaussians start on the visual hull of the masks. Their colour is the rotation-aware one of `coarse_light` by default;
-`ShConfig` is the paper's static colour per Gaussian, kept as an ablation.
+The Gaussians start on the visual hull of the masks. Their colour is the rotation-aware one of `coarse_light`; the
+paper's static colour per Gaussian is an ablation (`Config.colour`).
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,7 +40,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates. The paper takes those of 3DGS; ours are for a start on the hull, and a few thousand steps."""
+    """Adam's learning rates. The paper takes those of 3DGS; ours are for a start on the hull and a few thousand steps."""
 
     means: float = 1e-3
     """[object radius]; decays to `decay` of it."""
@@ -220,7 +220,13 @@ def pose(params: Params, inputs: Inputs, number: int) -> SE3:
 
 
 def render(
-    points: Points, gamma: Tensor, light: CoarseLight, T_cam_obj: SE3, trajectory: Trajectory, camera: Camera, mask: Tensor | None = None
+    points: Points,
+    gamma: Tensor,
+    light: CoarseLight,
+    T_cam_obj: SE3,
+    trajectory: Trajectory,
+    camera: Camera,
+    mask: Tensor | None = None,
 ) -> Buffers:
     """One view with stage 2's colour, linear radiance."""
     gaussians = points.gaussians

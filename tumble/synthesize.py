@@ -52,7 +52,7 @@ class Options:
     """Field of view [degrees]; the object fills it."""
     samples: int = 400
     """Paths per pixel of a photograph."""
-    truth_samples: int = 2048
+    truth_samples: int = 1024
     """Paths per pixel of a relit picture: a score near 40 dB must not measure the truth's noise."""
     path_depth: int = 5
     """Path segments: 2 is direct light alone, each further one adds a bounce between parts of the object."""

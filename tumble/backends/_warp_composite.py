@@ -171,12 +171,11 @@ def forward(channels: int) -> wp.Kernel:
         winner = int(-1)
         tile = thread // (TILE * TILE)
         for k in range(starts[tile], starts[tile + 1]):
-            alive = T >= T_MIN
-            if not any_lane(alive):
+            if not any_lane(T >= T_MIN):
                 break
             g = gaussians[k]
             p = peak_at(record, g, at)
-            on = alive and p.alpha > 0.0
+            on = T >= T_MIN and p.alpha > 0.0
             if any_lane(on):
                 w = float(0.0)
                 if on:
@@ -262,8 +261,8 @@ def step_at(p: Peak, s: Seed, T: float, record: wp.array2d[wp.vec4], g: int) -> 
 
 @wp.func
 @no_type_check
-def geometry_sums(p: Peak, s: Seed, o: Step, T: float, rem: float, record: wp.array2d[wp.vec4], g: int) -> vec32:
-    """A pixel's part of a Gaussian's sums, but for its features; `rem` is what lies behind."""
+def geometry_sums(p: Peak, s: Seed, o: Step, T: float, record: wp.array2d[wp.vec4], g: int) -> vec32:
+    """A pixel's part of a Gaussian's sums, but for its features."""
     x = vec32()
     conic = record[g, 1]
     beta = record[g, 2]
@@ -271,7 +270,7 @@ def geometry_sums(p: Peak, s: Seed, o: Step, T: float, rem: float, record: wp.ar
     zeta = p.l * p.r
     v_alpha = float(0.0)
     if p.raw <= ALPHA_MAX:
-        v_alpha = T * o.value - rem / (1.0 - p.alpha)
+        v_alpha = T * o.value - s.rem / (1.0 - p.alpha)
     v_rho = -0.5 * v_alpha * p.raw
     v_u = o.v_uv[0]
     v_v = o.v_uv[1]
@@ -304,7 +303,7 @@ def geometry_sums(p: Peak, s: Seed, o: Step, T: float, rem: float, record: wp.ar
 
 @cache
 def adjoint(channels: int) -> wp.Kernel:
-    """Adjoint of blending with so many features (of WIDTHS)."""
+    """Adjoint of blending with so many features (of WIDTHS); theirs are added corner by corner, 32 numbers at once."""
     vec = wp.types.vector(length=channels or 1, dtype=float)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 32})
@@ -333,15 +332,13 @@ def adjoint(channels: int) -> wp.Kernel:
             for ch in range(channels):
                 f[ch] = v_pixels[i, FIXED + ch] / pixels[i, 3]
                 s.alpha -= f[ch] * pixels[i, FIXED + ch]
-        rem = s.rem
         tile = thread // (TILE * TILE)
         for k in range(starts[tile], starts[tile + 1]):
-            alive = T >= T_MIN
-            if not any_lane(alive):
+            if not any_lane(T >= T_MIN):
                 break
             g = gaussians[k]
             p = peak_at(record, g, at)
-            on = alive and p.alpha > 0.0
+            on = T >= T_MIN and p.alpha > 0.0
             if any_lane(on):
                 x = vec32()
                 c = wp.vec4()
@@ -356,8 +353,8 @@ def adjoint(channels: int) -> wp.Kernel:
                         o.value += wp.dot(c, at_corner)
                         o.v_uv = o.w * corner_slopes(uv, at_corner)
                         c *= o.w
-                    rem -= o.w * o.value
-                    x = geometry_sums(p, s, o, T, rem, record, g)
+                    s.rem -= o.w * o.value
+                    x = geometry_sums(p, s, o, T, record, g)
                     T -= o.w
                 add_row(sums, g, 0, SUMS, x)
                 for part in range(channels // 8):

@@ -34,6 +34,10 @@ TILE, RECORD, GEOMETRY, SPAN, CAMERA = 8, 32, 16, 5, 16
 WIDE, LEVELS, LEAF, NODE = 16, 8, 14 * 16, 10 * 16
 """Sizes in `native/bvh.h`, the last two in numbers."""
 FEATURES_AT_ONCE = 16
+ROOM = 1 << 28
+"""Most numbers (1 GiB) for the threads' own sums of gradients: many threads and many Gaussians get fewer threads."""
+ROOM_KEPT = 1 << 24
+"""Most numbers kept from one backward pass to the next (64 MiB)."""
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
@@ -143,13 +147,14 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
     lanes = _native.library().lanes()
     c_drawn = -(-c // 4) * 4
     fixed_width, corner_width = (-(-x // lanes) * lanes for x in (6, c_drawn))
+    gradient_size = GEOMETRY + fixed_width + 4 * corner_width
     return Raster(
         n=n,
         k=k,
         c=c,
         height=height,
         width=width,
-        threads=torch.get_num_threads(),
+        threads=max(1, min(torch.get_num_threads(), ROOM // max(1, n * gradient_size))),
         alpha_max=ALPHA_MAX,
         alpha_min=ALPHA_MIN,
         T_min=T_MIN,
@@ -158,7 +163,7 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
         near_sigmas=NEAR_SIGMAS,
         corner=CORNER,
         record_size=RECORD + 4 * c_drawn,
-        gradient_size=GEOMETRY + fixed_width + 4 * corner_width,
+        gradient_size=gradient_size,
         fixed_width=fixed_width,
         corner_width=corner_width,
         mask_stride=int(masked),
@@ -167,10 +172,11 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
 
 def _scratch(n: int) -> Tensor:
     """Room for n numbers until the next call in this thread: fresh pages would cost as much as a small picture."""
-    room = getattr(_kept, "room", None)
-    if room is None or len(room) < n:
-        _kept.room = room = torch.empty(n)
-    return room
+    if n > ROOM_KEPT:
+        return torch.empty(n)
+    if len(getattr(_kept, "room", ())) < n:
+        _kept.room = torch.empty(n)
+    return _kept.room
 
 
 _kept = threading.local()

@@ -7,14 +7,14 @@
 struct Block {
     vf x, y;       // pixel centres
     vi inside;     // lanes within the image
+    bool whole;    // all lanes are
     i64 pixel[LANES];
-    int x0, y0;
 };
 
 INLINE Block block_at(const Raster& r, int x0, int y0) {
     Block b;
     vi i = lane_index(), x = (i & 3) + x0, y = (i >> 2) + y0;
-    b.x0 = x0, b.y0 = y0;
+    b.whole = x0 + BLOCK_W <= r.width && y0 + BLOCK_H <= r.height;
     b.x = __builtin_convertvector(x, vf) + 0.5f, b.y = __builtin_convertvector(y, vf) + 0.5f;
     b.inside = (x < r.width) & (y < r.height);
     for (int l = 0; l < LANES; l++)
@@ -22,19 +22,67 @@ INLINE Block block_at(const Raster& r, int x0, int y0) {
     return b;
 }
 
-// Zero where there is no image.
-INLINE vf read(const float* image, const Block& b, int stride, int channel) {
+// Channels `first` .. of an image with `stride` of them, at a block's pixels. What is read beyond the last channel is the
+// next pixel's, or zero at the end of the image. Zero where there is no image.
+INLINE void read_channels(const Raster& r, const float* image, const Block& b, int stride, int first, vf* x) {
+    i64 end = (i64)r.height * r.width * stride;
+    for (int l = 0; l < LANES; l++) {
+        i64 at = b.pixel[l] * stride + first;
+        if (image && at + LANES <= end) {
+            x[l] = load(image + at);
+            continue;
+        }
+        float part[LANES] = {};
+        for (int ch = 0; image && ch < end - at; ch++) part[ch] = image[at + ch];
+        x[l] = load(part);
+    }
+    transpose(x);
+}
+INLINE vf read_one(const float* image, const Block& b) {
     float x[LANES];
     if (!image) return vf{};
-    for (int l = 0; l < LANES; l++) x[l] = image[b.pixel[l] * stride + channel];
+    for (int y = 0; y < BLOCK_H; y++) {
+        const i64* pixel = b.pixel + y * BLOCK_W;
+        if (b.whole)
+            __builtin_memcpy(x + y * BLOCK_W, image + *pixel, 4 * BLOCK_W);
+        else
+            for (int l = 0; l < BLOCK_W; l++) x[y * BLOCK_W + l] = image[pixel[l]];
+    }
     return load(x);
 }
-INLINE void write(float* image, const Block& b, int stride, int channel, vf value) {
+
+// Channels of a block's pixels as one row a pixel, padded with zeros; x[C].
+template <int C, int N>
+INLINE void lay_out(const vf* x, float (*rows)[N]) {
+    for (int first = 0; first < N; first += LANES) {
+        vf group[LANES];
+        for (int i = 0; i < LANES; i++) group[i] = first + i < C ? x[first + i] : vf{};
+        transpose(group);
+        for (int l = 0; l < LANES; l++) store(rows[l] + first, group[l]);
+    }
+}
+
+// Numbers in whole vectors.
+template <int N>
+constexpr int PADDED = (N + LANES - 1) / LANES * LANES;
+
+// The first `count` of C channels to an image of as many.
+template <int C>
+INLINE void write_channels(float* image, const Block& b, int count, const vf* x) {
+    float rows[LANES][PADDED<C>];
+    u32 inside = bits(b.inside);
+    lay_out<C>(x, rows);
+    for (int l = 0; l < LANES; l++)
+        if (inside >> l & 1) __builtin_memcpy(image + b.pixel[l] * count, rows[l], 4 * count);
+}
+INLINE void write_one(float* image, const Block& b, vf value) {
     float x[LANES];
     u32 inside = bits(b.inside);
     store(x, value);
-    for (int l = 0; l < LANES; l++)
-        if (inside >> l & 1) image[b.pixel[l] * stride + channel] = x[l];
+    for (int y = 0; b.whole && y < BLOCK_H; y++)
+        __builtin_memcpy(image + b.pixel[y * BLOCK_W], x + y * BLOCK_W, 4 * BLOCK_W);
+    for (int l = 0; !b.whole && l < LANES; l++)
+        if (inside >> l & 1) image[b.pixel[l]] = x[l];
 }
 
 // A Gaussian at a block's pixels, up to its alpha.
@@ -91,11 +139,43 @@ struct Weights {
     }
 };
 
+// Features wait for a few Gaussians, so that their sums stay in registers while those are added.
+template <int C>
+struct Features {
+    enum { WAITING = 8 };
+    vf sum[C + !C], w[WAITING][4];
+    const float* f4[WAITING];
+    int count;
+
+    METHOD void flush() {
+        vf s[C + !C];
+        for (int ch = 0; ch < C; ch++) s[ch] = sum[ch];
+        for (int i = 0; i < count; i++) {
+            const float* f = f4[i];
+            vf w0 = w[i][0], w1 = w[i][1], w2 = w[i][2], w3 = w[i][3];
+#pragma GCC unroll 16
+            for (int ch = 0; ch < C; ch++)
+                s[ch] += w0 * f[4 * ch] + w1 * f[4 * ch + 1] + w2 * f[4 * ch + 2] + w3 * f[4 * ch + 3];
+        }
+        for (int ch = 0; ch < C; ch++) sum[ch] = s[ch];
+        count = 0;
+    }
+    METHOD void add(const float* features, vf weight, const Corners& c) {
+        vf* to = w[count];
+        to[0] = weight, to[1] = weight * c.u, to[2] = weight * c.v, to[3] = to[1] * c.v;
+        f4[count] = features;
+        if (++count == WAITING) flush();
+    }
+};
+
 template <int C>
 static void composite_block(const Raster& r, const Block& b, const int* list, int count, Weights& weights,
                             int* touched) {
     vf T = keep(b.inside, splat(1.0f)), red = {}, green = {}, blue = {}, z = {}, zz = {}, nx = {}, ny = {}, nz = {};
-    vf features[C + 1] = {}, best = {};
+    vf best = {};
+    Features<C> features;
+    features.count = 0;
+    for (int ch = 0; ch < C; ch++) features.sum[ch] = vf{};
     vi dominant = splat(-1);
     u32 counted = 0;
     for (int l = 0; l < LANES; l++)
@@ -110,13 +190,7 @@ static void composite_block(const Raster& r, const Block& b, const int* list, in
         nx += w * f[NX], ny += w * f[NY], nz += w * f[NZ];
         vf wz = w * depth;
         z += wz, zz += wz * depth;
-        if (C) {
-            Corners c = corners_at(f, p, p.l * p.r, zeta_1);
-            vf wu = w * c.u, wv = w * c.v, wuv = wu * c.v;
-            const float* f4 = f + RECORD;
-            for (int ch = 0; ch < C; ch++, f4 += 4)
-                features[ch] += w * f4[0] + wu * f4[1] + wv * f4[2] + wuv * f4[3];
-        }
+        if (C) features.add(f + RECORD, w, corners_at(f, p, p.l * p.r, zeta_1));
         vi better = w > best;
         best = pick(better, w, best), dominant = better ? splat(g) : dominant;
         weights.add(g, w);
@@ -124,21 +198,17 @@ static void composite_block(const Raster& r, const Block& b, const int* list, in
         T -= w;
         if (!any(T >= r.T_min)) break;
     }
+    features.flush();
     vf alpha = keep(b.inside, 1.0f - T);
     vi covered = dominant >= 0;
     vf inv = keep(covered, 1.0f / alpha), mean = z * inv;
-    write(r.rgb, b, 3, 0, red), write(r.rgb, b, 3, 1, green), write(r.rgb, b, 3, 2, blue);
-    write(r.alpha, b, 1, 0, keep(covered, alpha));
-    write(r.depth, b, 1, 0, keep(covered, r.t[2] + mean));
-    write(r.depth_var, b, 1, 0, zz * inv - mean * mean);
-    write(r.normal, b, 3, 0, nx * inv), write(r.normal, b, 3, 1, ny * inv), write(r.normal, b, 3, 2, nz * inv);
-    for (int ch = 0; ch < r.c; ch++) write(r.features, b, r.c, ch, features[ch] * inv);
-    write((float*)r.dominant, b, 1, 0, (vf)dominant);
+    const vf rgb[3] = {red, green, blue}, normal[3] = {nx * inv, ny * inv, nz * inv};
+    write_channels<3>(r.rgb, b, 3, rgb), write_channels<3>(r.normal, b, 3, normal);
+    write_one(r.alpha, b, keep(covered, alpha)), write_one(r.depth, b, keep(covered, r.t[2] + mean));
+    write_one(r.depth_var, b, zz * inv - mean * mean), write_one((float*)r.dominant, b, (vf)dominant);
+    for (int ch = 0; ch < C; ch++) features.sum[ch] *= inv;
+    if (C) write_channels<C + !C>(r.features, b, r.c, features.sum);
 }
-
-// Numbers in whole vectors.
-template <int N>
-constexpr int PADDED = (N + LANES - 1) / LANES * LANES;
 
 // dL/d(sums) at a block's pixels.
 template <int C>
@@ -149,41 +219,29 @@ struct Seeds {
     float fixed_rows[LANES][PADDED<6>], feature_rows[LANES][PADDED<C + !C>];
 };
 
-// Channels of a block's pixels as one row a pixel.
-template <int C, int N>
-INLINE void lay_out(const vf* channels, float (*rows)[N]) {
-    clear(rows, 4 * LANES * N);
-    for (int ch = 0; ch < C; ch++) {
-        float x[LANES];
-        store(x, channels[ch]);
-        for (int l = 0; l < LANES; l++) rows[l][ch] = x[l];
-    }
-}
-
 template <int C>
 INLINE void seed(const Raster& r, const Block& b, Seeds<C>& s) {
-    vf alpha = read(r.alpha, b, 1, 0), inv = keep(b.inside & (alpha > 0.0f), 1.0f / alpha);
+    vf alpha = read_one(r.alpha, b), inv = keep(b.inside & (alpha > 0.0f), 1.0f / alpha), x[LANES], v[LANES];
     vi covered = inv > 0.0f;
-    s.red = keep(covered, read(r.v_rgb, b, 3, 0)), s.green = keep(covered, read(r.v_rgb, b, 3, 1));
-    s.blue = keep(covered, read(r.v_rgb, b, 3, 2)), s.alpha = keep(covered, read(r.v_alpha, b, 1, 0));
-    s.rem = s.red * read(r.rgb, b, 3, 0) + s.green * read(r.rgb, b, 3, 1) + s.blue * read(r.rgb, b, 3, 2) +
-            s.alpha * alpha;
-    s.nx = read(r.v_normal, b, 3, 0) * inv, s.ny = read(r.v_normal, b, 3, 1) * inv;
-    s.nz = read(r.v_normal, b, 3, 2) * inv;
-    s.alpha -= s.nx * read(r.normal, b, 3, 0) + s.ny * read(r.normal, b, 3, 1) + s.nz * read(r.normal, b, 3, 2);
-    for (int ch = 0; ch < C; ch++) {
-        if (ch >= r.c) {
-            s.features[ch] = vf{};
-            continue;
+    read_channels(r, r.rgb, b, 3, 0, x), read_channels(r, r.v_rgb, b, 3, 0, v);
+    s.red = keep(covered, v[0]), s.green = keep(covered, v[1]), s.blue = keep(covered, v[2]);
+    s.alpha = keep(covered, read_one(r.v_alpha, b));
+    s.rem = s.red * x[0] + s.green * x[1] + s.blue * x[2] + s.alpha * alpha;
+    read_channels(r, r.normal, b, 3, 0, x), read_channels(r, r.v_normal, b, 3, 0, v);
+    s.nx = v[0] * inv, s.ny = v[1] * inv, s.nz = v[2] * inv;
+    s.alpha -= s.nx * x[0] + s.ny * x[1] + s.nz * x[2];
+    for (int first = 0; first < C; first += LANES) {
+        read_channels(r, r.features, b, r.c, first, x), read_channels(r, r.v_features, b, r.c, first, v);
+        for (int i = 0; i < imin2(C - first, LANES); i++) {
+            s.features[first + i] = first + i < r.c ? v[i] * inv : vf{};
+            if (first + i < r.c) s.alpha -= s.features[first + i] * x[i];
         }
-        s.features[ch] = read(r.v_features, b, r.c, ch) * inv;
-        s.alpha -= s.features[ch] * read(r.features, b, r.c, ch);
     }
-    vf mean = read(r.depth, b, 1, 0) - r.t[2], v_var = read(r.v_depth_var, b, 1, 0);
+    vf mean = read_one(r.depth, b) - r.t[2], v_var = read_one(r.v_depth_var, b);
     s.zz = v_var * inv;
-    s.z = (read(r.v_depth, b, 1, 0) - 2.0f * mean * v_var) * inv;
-    s.alpha -= s.z * mean + s.zz * (read(r.depth_var, b, 1, 0) + mean * mean);
-    vf fixed[6] = {s.red, s.green, s.blue, s.nx, s.ny, s.nz};
+    s.z = (read_one(r.v_depth, b) - 2.0f * mean * v_var) * inv;
+    s.alpha -= s.z * mean + s.zz * (read_one(r.depth_var, b) + mean * mean);
+    const vf fixed[6] = {s.red, s.green, s.blue, s.nx, s.ny, s.nz};
     lay_out<6>(fixed, s.fixed_rows), lay_out<C>(s.features, s.feature_rows);
 }
 
@@ -223,11 +281,15 @@ static void adjoint_block(const Raster& r, const Block& b, const int* list, int 
         if (C) {
             Corners c = corners_at(f, p, zeta, zeta_1);
             const float* f4 = f + RECORD;
-            vf f0 = {}, f1 = {}, f2 = {}, f3 = {};
-            for (int ch = 0; ch < C; ch++, f4 += 4) {
-                f0 += s.features[ch] * f4[0], f1 += s.features[ch] * f4[1];
-                f2 += s.features[ch] * f4[2], f3 += s.features[ch] * f4[3];
+            // Two chains of sums for each, or the processor waits.
+            vf f0 = {}, f1 = {}, f2 = {}, f3 = {}, h0 = {}, h1 = {}, h2 = {}, h3 = {};
+#pragma GCC unroll 8
+            for (int ch = 0; ch < C; ch += 2, f4 += 8) {
+                vf x = s.features[ch], y = s.features[ch + 1];
+                f0 += x * f4[0], f1 += x * f4[1], f2 += x * f4[2], f3 += x * f4[3];
+                h0 += y * f4[4], h1 += y * f4[5], h2 += y * f4[6], h3 += y * f4[7];
             }
+            f0 += h0, f1 += h1, f2 += h2, f3 += h3;
             value += f0 + c.u * f1 + c.v * (f2 + c.u * f3);
             vf v_u = keep(c.u == c.free_u, w * (f1 + c.v * f3)), v_v = keep(c.v == c.free_v, w * (f2 + c.u * f3));
             vf zu = zeta * v_u, zv = zeta * v_v;

@@ -110,6 +110,8 @@ INLINE vf vlog(vf x) {
 }
 
 #if LANES == 16
+INLINE vf zip_low(vf a, vf b) { return SHUFFLE(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23); }
+INLINE vf zip_high(vf a, vf b) { return SHUFFLE(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31); }
 INLINE vf fold1(vf a, vf b) {
     vf x = SHUFFLE(a, b, 0, 17, 2, 19, 4, 21, 6, 23, 8, 25, 10, 27, 12, 29, 14, 31);
     return x + SHUFFLE(a, b, 1, 16, 3, 18, 5, 20, 7, 22, 9, 24, 11, 26, 13, 28, 15, 30);
@@ -127,6 +129,8 @@ INLINE vf fold8(vf a, vf b) {
     return x + SHUFFLE(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23);
 }
 #elif LANES == 8
+INLINE vf zip_low(vf a, vf b) { return SHUFFLE(a, b, 0, 8, 1, 9, 2, 10, 3, 11); }
+INLINE vf zip_high(vf a, vf b) { return SHUFFLE(a, b, 4, 12, 5, 13, 6, 14, 7, 15); }
 INLINE vf fold1(vf a, vf b) {
     return SHUFFLE(a, b, 0, 9, 2, 11, 4, 13, 6, 15) + SHUFFLE(a, b, 1, 8, 3, 10, 5, 12, 7, 14);
 }
@@ -137,9 +141,24 @@ INLINE vf fold4(vf a, vf b) {
     return SHUFFLE(a, b, 0, 1, 2, 3, 12, 13, 14, 15) + SHUFFLE(a, b, 4, 5, 6, 7, 8, 9, 10, 11);
 }
 #else
+INLINE vf zip_low(vf a, vf b) { return SHUFFLE(a, b, 0, 4, 1, 5); }
+INLINE vf zip_high(vf a, vf b) { return SHUFFLE(a, b, 2, 6, 3, 7); }
 INLINE vf fold1(vf a, vf b) { return SHUFFLE(a, b, 0, 5, 2, 7) + SHUFFLE(a, b, 1, 4, 3, 6); }
 INLINE vf fold2(vf a, vf b) { return SHUFFLE(a, b, 0, 1, 6, 7) + SHUFFLE(a, b, 2, 3, 4, 5); }
 #endif
+
+// Lane i of x[j] becomes lane j of x[i]: zipping the halves together rotates the bits of an element's place by one.
+INLINE void transpose(vf* x) {
+#pragma GCC unroll 4
+    for (int bit = 1; bit < LANES; bit *= 2) {
+        vf y[LANES];
+#pragma GCC unroll 8
+        for (int i = 0; i < LANES / 2; i++)
+            y[2 * i] = zip_low(x[i], x[i + LANES / 2]), y[2 * i + 1] = zip_high(x[i], x[i + LANES / 2]);
+#pragma GCC unroll 16
+        for (int i = 0; i < LANES; i++) x[i] = y[i];
+    }
+}
 
 // Lane i of the result is the sum of the lanes of x[i]: a transposed reduction, three operations a sum.
 INLINE vf sums_of(const vf* x) {
@@ -161,4 +180,6 @@ INLINE float sum_of(vf x) {
     return s;
 }
 
-INLINE void clear(void* p, i64 bytes) { __builtin_memset(p, 0, bytes); }
+INLINE void clear(void* p, i64 bytes) {
+    if (bytes) __builtin_memset(p, 0, bytes);   // no bytes may mean no pointer
+}
