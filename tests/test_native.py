@@ -5,6 +5,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,24 @@ def test_two_processes_that_start_at_once_compile_to_one_whole_file(tmp_path: Pa
     runs = [subprocess.Popen([sys.executable, "-c", program], env=environment) for _ in range(2)]
     assert [run.wait() for run in runs] == [0, 0]
     assert [path.suffix for path in (tmp_path / "tumble").iterdir()] == [".so"]
+
+
+def test_threads_of_python_may_draw_at_once() -> None:
+    """One has the pool of workers, the other draws alone: the same picture."""
+    cpu, scene = backends.load("cpu"), cases.hard()
+    if reason := cpu.ready(CPU, torch.float32):
+        pytest.skip(reason)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            drawn = list(pool.map(lambda _: cases.render(cpu, scene, torch.float32), range(12)))
+    finally:
+        torch.set_num_threads(threads)
+    for view, gradients in drawn[1:]:
+        assert torch.equal(view.rgb, drawn[0][0].rgb)
+        # Other threads of torch may see another number of threads: sums in another order.
+        assert all(cases.difference(a, b) < 1e-5 for a, b in zip(gradients, drawn[0][1], strict=True))
 
 
 WIDTHS = {"16": ["-march=x86-64-v4"], "8": ["-march=x86-64-v3"], "4": ["-march=x86-64"]}

@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -30,7 +30,14 @@ def main() -> None:
     """Entry point of the `tumble` command; an error ends with one line and exit code 1, Ctrl-C with 130."""
     from tumble import __version__
 
-    commands = {"doctor": doctor, "synth": _synth(), "evaluate": evaluate, "demo": demo}
+    commands = {
+        "doctor": doctor,
+        "synth": _synth(),
+        "run": run,
+        "relight": relight,
+        "evaluate": evaluate,
+        "demo": demo,
+    }
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
         return
@@ -75,11 +82,47 @@ def _synth():
     return synth
 
 
-def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: OptionalFolder = None) -> None:
-    """Score a prediction folder against a capture with truth: report.json and a picture sheet.
+def run(
+    capture: Positional[Path], /, out: Folder, quality: Literal["draft", "standard", "paper"] = "draft", seed: int = 0
+) -> None:
+    """Reconstruct a capture with known poses: geometry, albedo, roughness and light.
 
     Args:
-        prediction: The prediction folder (docs/prediction.md).
+        capture: The capture folder (docs/format.md). Its truth is never read.
+        out: The run directory; the same command goes on where an interrupted one stopped.
+        quality: draft: two CPU cores, minutes; standard: one GPU, minutes; paper: the published numbers, hours.
+        seed: Of every random draw.
+    """
+    from dataclasses import replace
+
+    from tumble.recipes import QUALITIES
+    from tumble.reconstruct import ASSET, reconstruct
+
+    reconstruct(capture, out, replace(QUALITIES[quality], seed=seed))
+    print(out / ASSET)
+
+
+def relight(run: Positional[Path], /, env: Path, out: OptionalFolder = None, fast: bool = False) -> None:
+    """Show a reconstructed object under another light, from where the camera saw it.
+
+    Args:
+        run: The run directory.
+        env: The light, a lat-long .hdr or .exr (+y up in the object's frame).
+        out: Where the pictures go; RUN/relit/<name of the light> when left out.
+        fast: Prefiltered light without shadows, instead of rays.
+    """
+    from tumble.reconstruct import relight_run
+
+    where = out or run / "relit" / env.stem
+    relight_run(run, env, where, fast=fast)
+    print(where)
+
+
+def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: OptionalFolder = None) -> None:
+    """Score a prediction folder, or a run, against a capture with truth: report.json and a picture sheet.
+
+    Args:
+        prediction: The prediction folder (docs/prediction.md), or a run directory: its prediction is rendered first.
         capture: The capture folder (docs/format.md).
         out: Where report.json and sheet.png go; the prediction folder when left out.
     """
@@ -87,9 +130,11 @@ def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: Op
     from rich.table import Table
 
     from tumble import evaluate as evaluation
+    from tumble.reconstruct import ASSET, predict_run
 
     where = out or prediction
-    report = evaluation.run(prediction, capture, where)
+    folder = predict_run(prediction, capture) if (prediction / ASSET).is_file() else prediction
+    report = evaluation.run(folder, capture, where)
     table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
     regions = report["regions"]
     for heading in ("metric", *regions):

@@ -194,7 +194,8 @@ def buffers_of(asset: Asset | Params, T_cam_obj: SE3, camera: Camera) -> Buffers
     return replace(view, normal=view.normal + view.features["offset"])
 
 
-def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor]:
+def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+    assert state.optimizer is not None, "init makes one"
     _grow_light(cfg, state)
     params, capture = state.params, inputs.capture
     number = int(torch.randint(len(capture), (1,), generator=state.rng))
@@ -272,6 +273,7 @@ def _grow_light(cfg: Config, state: State) -> None:
     def doubled(x: Tensor) -> Tensor:
         return interpolate(x.movedim(-1, 0)[None], scale_factor=2, mode="bilinear")[0].movedim(0, -1)
 
+    assert state.optimizer is not None, "init makes one"
     environment = optim.resample(
         state.params.environment,
         state.optimizer,

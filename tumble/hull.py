@@ -28,13 +28,13 @@ class OrientedPoints:
 def carve(capture: Capture, trajectory: Trajectory, *, resolution: int) -> Float[Tensor, "x y z"]:
     """How surely each cell of [-1, 1]^3 is inside all silhouettes: the least, over all frames, of the masks around it.
 
-    Cells that no frame shows count as inside.
+    Cells of the unit ball that no frame shows count as inside; what lies beyond the ball is outside.
     """
     like = {"dtype": trajectory.T_cam_obj.xyz.dtype, "device": trajectory.T_cam_obj.xyz.device}
     ticks = (torch.arange(resolution, **like) + 0.5) / resolution * 2 - 1
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
-    inside = torch.ones(len(x_obj), **like)
+    inside = (x_obj.norm(dim=-1) <= 1).to(**like)
     for frame in range(len(trajectory)):
         uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj)
         mask = (capture.masks[frame] != BACKGROUND).to(**like)

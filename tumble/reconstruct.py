@@ -1,14 +1,19 @@
 """From a capture folder to an asset: the stages in order, kept in a run directory."""
 
 from pathlib import Path
-from typing import Any
 
-from tumble import decompose, evaluate, files, predict, refine, run, tree
+import torch
+from rich.progress import track
+
+from tumble import decompose, files, predict, refine, relight, run, tree
 from tumble.asset import Asset
 from tumble.capture import Capture
 from tumble.datasets import folder
+from tumble.environment import Environment
 from tumble.files import BadFile
+from tumble.images import srgb_from_linear
 from tumble.recipes import Recipe
+from tumble.trajectory import Trajectory
 
 ASSET = "asset.safetensors"
 PREDICTION = "prediction"
@@ -45,17 +50,48 @@ def _keep(asset: Asset, capture: Capture, out: Path) -> None:
     files.write_json(out / "poses.json", poses)
 
 
-def score(out: Path, capture_path: Path, recipe: Recipe) -> dict[str, Any]:
-    """Render a run's prediction of a capture's evaluation views, and score it; returns the report.
+def predict_run(out: Path, capture_path: Path) -> Path:
+    """Render a finished run's answer for a capture's evaluation views as `out/prediction`; returns that folder.
 
     Raises:
         BadFile: There is no finished run in `out`, or the capture has no evaluation views.
     """
-    if not (out / ASSET).is_file():
-        raise BadFile(out, f"has no {ASSET}", "finish the run first: tumble run")
+    asset = finished(out)
     capture, truth = folder.load(capture_path), folder.load_truth(capture_path)
     if truth is None or truth.trajectory is None:
         raise BadFile(capture_path, "has no evaluation views with truth")
-    prediction = predict.predict(recipe.relight, tree.load(Asset, out / ASSET), capture, truth)
-    prediction.write(out / PREDICTION)
-    return evaluate.run(out / PREDICTION, capture_path, out)
+    predict.predict(_relighting(out), asset, capture, truth).write(out / PREDICTION)
+    return out / PREDICTION
+
+
+def relight_run(out: Path, env: Path, pictures: Path, *, fast: bool) -> None:
+    """Write a run's object under another light as `0000.png`, ..., one per training frame.
+
+    The light's frame is the object's.
+
+    Raises:
+        BadFile: There is no finished run in `out`, or the light cannot be read.
+    """
+    asset, light, cfg = finished(out), Environment.read(env), _relighting(out)
+    still = Trajectory(asset.trajectory.T_cam_obj, "object")
+    draw = relight.preview if fast else relight.relight
+    views = draw(cfg, asset, light, still, asset.camera)
+    for number, linear in enumerate(track(views, f"relighting under {env.stem}", len(still), transient=True)):
+        values = (srgb_from_linear(linear.clamp(0, 1)) * 255).round().to(torch.uint8)
+        files.write_png(pictures / f"{number:04}.png", values.numpy())
+
+
+def finished(out: Path) -> Asset:
+    """The asset of a finished run.
+
+    Raises:
+        BadFile: There is none.
+    """
+    if not (out / ASSET).is_file():
+        raise BadFile(out, f"has no {ASSET}", "finish the run first: tumble run")
+    return tree.load(Asset, out / ASSET)
+
+
+def _relighting(out: Path) -> relight.Config:
+    """The run's own way to relight."""
+    return relight.Config(**files.read_json(out / run.RECIPE)["recipe"]["relight"])

@@ -40,7 +40,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates. The paper takes those of 3DGS; ours are for a start on the hull and a few thousand steps."""
+    """Adam's learning rates. The paper takes those of 3DGS; ours suit a start on the hull and a few thousand steps."""
 
     means: float = 1e-3
     """[object radius]; decays to `decay` of it."""
@@ -239,7 +239,8 @@ def render(
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
 
 
-def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor]:
+def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+    assert state.optimizer is not None, "init makes one"
     progress = state.step / cfg.steps
     if state.step and state.step % cfg.every == 0 and progress < cfg.until:
         _densify(cfg, inputs, state)
@@ -288,6 +289,7 @@ def _terms(
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     params, camera = state.params, inputs.capture.camera
     n = len(params.points.albedo_logits)
+    assert state.optimizer is not None, "init makes one"
     bad, weight = torch.zeros(n), torch.zeros(n)
     numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: cfg.views].tolist()
     for number in numbers:

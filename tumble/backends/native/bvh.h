@@ -254,18 +254,23 @@ struct Hits {
     float z[BUFFER + LANES], alpha[BUFFER];
     int id[BUFFER], order[BUFFER], count;
 
-    // Into `order`, nearest first: a hit's place is the number of nearer ones. Equal distances (exact duplicates) are
-    // told apart by id.
+    // Into `order`, nearest first: a hit's place is the number of nearer ones.
     METHOD void sort() {
+        int sum = 0;
         store(z + count, splat(2e30f));
         for (int i = 0; i < count; i++) {
-            vf z_i = splat(z[i]);
-            int place = 0, same = 0;
-            for (int c = 0; c < count; c += LANES) {
-                vf x = load(z + c);
-                place += __builtin_popcount(bits(x < z_i)), same += __builtin_popcount(bits(x == z_i));
-            }
-            for (int c = 0; same > 1 && c < count; c++) place += z[c] == z[i] && id[c] < id[i];
+            int place = 0;
+            for (int c = 0; c < count; c += LANES) place += __builtin_popcount(bits(load(z + c) < z[i]));
+            order[place] = i, sum += place;
+        }
+        if (sum != count * (count - 1) / 2) sort_duplicates();
+    }
+
+    // Equal distances (exact duplicates) are told apart by id.
+    __attribute__((noinline)) void sort_duplicates() {
+        for (int i = 0; i < count; i++) {
+            int place = 0;
+            for (int j = 0; j < count; j++) place += z[j] < z[i] || (z[j] == z[i] && id[j] < id[i]);
             order[place] = i;
         }
     }

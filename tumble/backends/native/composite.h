@@ -8,6 +8,8 @@ struct Block {
     vf x, y;       // pixel centres
     vi inside;     // lanes within the image
     bool whole;    // all lanes are
+    bool corner;   // the first of its tile
+    int tile;
     i64 pixel[LANES];
 };
 
@@ -328,9 +330,25 @@ INLINE void for_blocks(const Raster& r, int share, F visit) {
         int start = r.tile_start[tile], count = r.tile_start[tile + 1] - start;
         int x0 = tile % across * TILE, y0 = tile / across * TILE;
         for (int y = y0; y < imin2(y0 + TILE, r.height); y += BLOCK_H)
-            for (int x = x0; x < imin2(x0 + TILE, r.width); x += BLOCK_W)
-                visit(block_at(r, x, y), r.list + start, count);
+            for (int x = x0; x < imin2(x0 + TILE, r.width); x += BLOCK_W) {
+                Block b = block_at(r, x, y);
+                b.tile = tile, b.corner = x == x0 && y == y0;
+                visit(b, r.list + start, count);
+            }
     }
+}
+
+// Ask for what the adjoint of a tile will read; its pixels lie far apart in memory.
+INLINE void prefetch_tile(const Raster& r, int tile) {
+    const float* images[] = {r.rgb, r.v_rgb, r.normal, r.v_normal, r.features, r.v_features, r.alpha, r.v_alpha};
+    const int strides[] = {3, 3, 3, 3, r.c, r.c, 1, 1};
+    int across = tiles_x(r), x0 = tile % across * TILE, y0 = tile / across * TILE;
+    if (tile >= across * tiles_y(r) || r.tile_start[tile] == r.tile_start[tile + 1]) return;
+    for (int i = 0; i < 8; i++)
+        for (int y = y0; images[i] && y < imin2(y0 + TILE, r.height); y++) {
+            const float* row = images[i] + ((i64)y * r.width + x0) * strides[i];
+            for (int at = 0; at < TILE * strides[i]; at += 16) __builtin_prefetch(row + at);
+        }
 }
 
 template <int C>
@@ -350,6 +368,7 @@ static void adjoint_share(Raster& r, int share) {
     float* parts = r.parts + (i64)share * r.n * r.gradient_size;
     clear(parts, (i64)4 * r.n * r.gradient_size);
     for_blocks(r, share, [&](const Block& b, const int* list, int count) {
+        if (b.corner) prefetch_tile(r, b.tile + r.threads);
         if (count) adjoint_block<C>(r, b, list, count, parts);
     });
 }

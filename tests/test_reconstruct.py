@@ -1,0 +1,145 @@
+"""All stages on a few small frames: interrupted equals whole, truth is never read, scores come out."""
+
+import dataclasses
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.test_hull import silhouettes
+from tumble import capture_writer, evaluate, files, recipes, reconstruct, refine, tree
+from tumble.asset import Asset
+from tumble.capture import OBJECT, Capture, Truth
+from tumble.datasets import folder
+from tumble.environment import Environment
+from tumble.files import BadFile
+
+RECIPE = dataclasses.replace(recipes.SMOKE, seed=3)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A grey ellipsoid with a bright half, as a capture of eight frames and two evaluation views."""
+    torch.manual_seed(0)
+    frames, trajectory = silhouettes(10, 32)
+    shade = torch.linspace(60, 220, 32).to(torch.uint8)[None, None, :, None]
+    images = torch.where(frames.masks[..., None] == OBJECT, shade, 0).to(torch.uint8).repeat(1, 1, 1, 3)
+    train, views = list(range(8)), [8, 9]
+    taken = Capture(
+        images[train], frames.masks[train], frames.camera, frames.names[:8], "camera", trajectory.select(train)
+    )
+    truth = Truth(
+        images=images[views],
+        masks=frames.masks[views],
+        names=frames.names[8:],
+        regions=("shared", "sphere"),
+        trajectory=trajectory.select(views),
+        albedo=torch.rand(2, 32, 32, 3) * (frames.masks[views] == OBJECT)[..., None],
+        normals=torch.nn.functional.normalize(torch.randn(2, 32, 32, 3), dim=-1),
+        relit={"sun": images[views]},
+        light=Environment.from_radiance(torch.rand(8, 16, 3)),
+        lights={"sun": Environment.from_radiance(torch.rand(8, 16, 3))},
+        poses=trajectory.select(train),
+    )
+    path = tmp_path_factory.mktemp("capture") / "c"
+    capture_writer.save(path, taken, truth, setting="handheld")
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Asset]:
+    out = tmp_path_factory.mktemp("runs") / "r"
+    return out, reconstruct.reconstruct(capture, out, RECIPE)
+
+
+def assert_same(a: Asset, b: Asset) -> None:
+    one, other = tree.named_tensors(a), tree.named_tensors(b)
+    assert list(one) == list(other)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_run_leaves_an_asset_a_light_and_poses(finished: tuple[Path, Asset], capture: Path) -> None:
+    out, asset = finished
+    assert_same(tree.load(Asset, out / "asset.safetensors"), asset)
+    assert all(torch.isfinite(x).all() for x in tree.named_tensors(asset).values())
+    assert Environment.read(out / "light.exr").log_radiance.shape == asset.environment.log_radiance.shape
+    poses = folder.read_poses(out / "poses.json", folder.load(capture).names)
+    torch.testing.assert_close(poses, folder.load(capture).trajectory.camera_to_object(), atol=1e-5, rtol=0)
+    assert len(asset.gaussians) > 50
+
+
+def test_a_run_without_truth_makes_the_same_asset(finished: tuple[Path, Asset], capture: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare)
+    shutil.rmtree(bare / "truth")
+    assert_same(reconstruct.reconstruct(bare, tmp_path / "run", RECIPE), finished[1])
+
+
+def test_an_interrupted_run_ends_the_same(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in the middle of stage 2, after a densification; then the same command again."""
+    step = refine.step
+
+    def interrupted(cfg, inputs, state):
+        result = step(cfg, inputs, state)
+        if state.step == 17:
+            import signal
+
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(refine, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct.reconstruct(capture, tmp_path / "run", RECIPE)
+    monkeypatch.setattr(refine, "step", step)
+    assert_same(reconstruct.reconstruct(capture, tmp_path / "run", RECIPE), finished[1])
+
+
+def test_finished_stages_are_not_run_again(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("ran again")
+
+    monkeypatch.setattr(refine, "step", never)
+    assert_same(reconstruct.reconstruct(capture, finished[0], RECIPE), finished[1])
+
+
+def test_a_run_is_scored_with_known_poses_as_they_are(finished: tuple[Path, Asset], capture: Path) -> None:
+    prediction = reconstruct.predict_run(finished[0], capture)
+    report = evaluate.run(prediction, capture, finished[0])
+    assert set(report["regions"]) == {"shared", "sphere"}
+    shared = report["regions"]["shared"]
+    for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_full_srgb", "normal.mean_fg_degrees"):
+        assert math.isfinite(shared[key])
+    assert report["poses"]["poses.rotation_mean_degrees"] < 0.01
+    assert (finished[0] / "sheet.png").is_file()
+
+
+def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path) -> None:
+    taken = folder.load(capture)
+    bare = Capture(taken.images, taken.masks, taken.camera, taken.names, taken.light)
+    capture_writer.save(tmp_path / "bare", bare)
+    with pytest.raises(BadFile, match="has no poses"):
+        reconstruct.reconstruct(tmp_path / "bare", tmp_path / "run", RECIPE)
+    with pytest.raises(BadFile, match="finish the run first"):
+        reconstruct.predict_run(tmp_path / "nowhere", capture)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_run_can_be_put_under_another_light(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, fast: bool
+) -> None:
+    reconstruct.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
+    pictures = [files.read_picture(path) for path in sorted(tmp_path.iterdir())]
+    assert len(pictures) == 8
+    assert all(0 < picture.mean() < 255 for picture in pictures)
+
+
+def test_the_third_axis_is_the_smallest_after_training(finished: tuple[Path, Asset]) -> None:
+    """Our normal is the third axis by construction; the paper's is that of the smallest scale."""
+    scales = finished[1].gaussians.scales
+    assert (scales.argmin(-1) == 2).double().mean() > 0.99
