@@ -18,7 +18,7 @@ LAYERS = [
     {"gaussians", "material", "environment", "buffers", "coarse_light"},
     {"capture", "asset"},
     {"rasterize", "trace", "volume"},
-    {"shade", "mesh", "hull"},
+    {"prefilter", "shade", "importance", "mesh", "hull"},
     {"losses", "optim", "densify", "fields", "posenets", "metrics", "lpips", "matching"},
     {"loop"},
     {"track", "lift", "refine", "decompose", "relight"},

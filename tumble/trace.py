@@ -24,8 +24,9 @@ from tumble.gaussians import Gaussians, opacity
 from tumble.se3 import SE3
 
 OFFSET = 1.5
-"""How far rays start above the surface [median of the Gaussians' largest standard deviations]. On spheres and tori with
-noisy centres, normals, sizes and opacities, 1 throws false shadows and 2 loses contact shadows; a sphere keeps 0.998."""
+"""How far rays start above the surface [median of the Gaussians' largest standard deviations]. On spheres and tori
+with noisy centres, normals, sizes and opacities, 1 throws false shadows and 2 loses contact shadows; a sphere then sees
+0.998 of its sky."""
 WORD = 32
 """Bits in a word of a visibility."""
 ROWS = 1024

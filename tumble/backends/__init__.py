@@ -12,8 +12,9 @@ Vocabulary
     *Peak*: the point of a ray where that is largest. For a ray `x = a + z d`: `z = W(mu - a).Wd / |Wd|^2`.
     Rasterizer and tracer both take response, depth and corner coordinates at the peak. It is exact in
     perspective (no affine approximation), is the ray-plane hit for a thin Gaussian, and is never further from
-    the centre than the response says, edge-on too. No screen-space blur: it would fatten silhouettes by half
-    a pixel and the tracer has none.
+    the centre than the response says, edge-on too.
+    No screen-space blur: a sphere of 8000 Gaussians at 128 pixels has a silhouette 0.6 pixels too wide without, 1.4
+    with the usual 0.3 px^2, and the tracer has none. Gaussians much smaller than a pixel may fall between pixels.
     *alpha*: `min(ALPHA_MAX, o exp(-|W(peak - mu)|^2/2))`, and 0 where that is below `ALPHA_MIN`.
 
 Frames: OpenCV camera with pixel centres at +0.5, object radius 1, linear radiance, quaternions wxyz.

@@ -20,7 +20,7 @@ from tumble.backends._structs import STRUCTURES
 SOURCES = Path(__file__).parent / "native"
 FLAGS = (
     *("-std=c++17", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-Wno-psabi"),
-    *("-fno-exceptions", "-fno-rtti", "-fno-math-errno", "-pthread"),
+    *("-fno-exceptions", "-fno-rtti", "-fno-math-errno", "-fno-trapping-math", "-pthread"),
 )
 """Never -ffast-math: it folds the rounding trick of the kernels' exp away."""
 VARIANTS = (("-march=native",), ("-mcpu=native",), ())
