@@ -41,7 +41,7 @@ fmt: install
 	$(BIN)/ruff format .
 
 bench: install
-	$(BIN)/python benchmarks/kernels.py
+	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m benchmarks.kernels
 
 docs: install
 	$(BIN)/pdoc -o build/docs tumble

@@ -2,6 +2,10 @@
 
 import os
 import sys
+
+# Torch's own threads otherwise spin while they wait, on the cores that the kernels need. Read when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 from pathlib import Path
 from typing import Annotated, Literal
 

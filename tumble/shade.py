@@ -4,9 +4,11 @@ Everything happens in the object frame, under one set of directions for the whol
 `environment.lookup(R_env_obj @ w)`, one lookup per direction and frame. *Surface*: the points behind some pixels.
 *Bounce*: light that Gaussians standing in the way send on, of the same frame, since light and object turn apart.
 
-Two estimators for training: `shade` sums both lobes over the shared directions (unbiased, but a few hundred cannot
-resolve a lobe of low roughness), `shade_split` sums the diffuse lobe and takes the specular one from a prefiltered
-light. `importance.relight_surface` is the third, for final pictures.
+Two estimators for training. `shade` sums both lobes over the shared directions: unbiased, but a few hundred cannot
+resolve a narrow lobe. `shade_split` sums the diffuse lobe and takes the specular one from a prefiltered light. On a
+sphere under real light, 256 directions, the first errs by 0.6 to 1.4 at roughness 0.1, by 0.14 to 0.46 at 0.2 and by
+0.01 to 0.12 from 0.5 up; the second by 0.01 to 0.12 everywhere, of which 0.01 to 0.05 is bias (`benchmarks`).
+Take the second wherever roughness may fall below 0.4. `importance.relight_surface` is for final pictures.
 """
 
 import math

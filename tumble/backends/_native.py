@@ -1,5 +1,7 @@
 """Compile the kernels of `native/` on first use, keep them in a user cache, and load them.
 
+By the system's compiler; without one that works, by the Clang inside Warp, if that is installed (`_jit`).
+
 A *build* is one shared library, named by a hash of everything that decides its machine code: sources, flags, compiler
 and processor. Processes that start at once may compile the same build twice; each puts a whole file in place.
 """
@@ -14,6 +16,7 @@ import subprocess
 import tempfile
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 from tumble.backends._structs import STRUCTURES
 
@@ -33,21 +36,44 @@ class CannotCompile(RuntimeError):
 
 
 @cache
-def library() -> ctypes.CDLL:
+def library() -> ctypes.CDLL | SimpleNamespace:
     """The compiled kernels of this machine.
 
     Raises:
-        CannotCompile: There is no working C++ compiler.
+        CannotCompile: There is no working C++ compiler, and no Warp that could stand in.
     """
+    try:
+        kernels = _by_compiler()
+    except CannotCompile as reason:
+        kernels = _by_warp(reason)
+    assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), "layouts differ"
+    return kernels
+
+
+def _by_compiler() -> ctypes.CDLL:
     compiler = find_compiler()
     name = f"kernels-{_build_hash(compiler)}.so"
     path = next((folder / name for folder in _cache_folders() if (folder / name).is_file()), None)
     if path is None:
         path = _writable(_cache_folders()) / name
         compile_to(path, compiler)
-    kernels = ctypes.CDLL(str(path))
-    assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), "layouts differ"
-    return kernels
+    return ctypes.CDLL(str(path))
+
+
+def _by_warp(no_compiler: CannotCompile) -> SimpleNamespace:
+    """What Warp offers for this is marked as experimental: if a version lacks or changes it, the reason is told."""
+    try:
+        import warp
+    except ImportError:
+        raise CannotCompile(f"{no_compiler}; or pip install 'tumble[cuda]', which brings one (no GPU needed)") from None
+    try:
+        from tumble.backends import _jit
+
+        return _jit.library()
+    except Exception as reason:
+        raise CannotCompile(
+            f"{no_compiler}; nor can Warp {warp.__version__}, which is here, compile the kernels: {reason}"
+        ) from reason
 
 
 def find_compiler() -> str:

@@ -7,16 +7,20 @@
 #include "simd.h"
 
 #if defined(__unix__) || defined(__APPLE__)
-extern "C" {
-int pthread_create(void*, const void*, void* (*)(void*), void*);
-int pthread_mutex_init(void*, const void*);
-int pthread_mutex_lock(void*);
-int pthread_mutex_unlock(void*);
-int pthread_cond_init(void*, const void*);
-int pthread_cond_wait(void*, void*);
-int pthread_cond_broadcast(void*);
-int getpid();
-}
+// A just-in-time compiler links no library: there these are pointers, and whoever loads the kernels sets them.
+#if defined(JUST_IN_TIME)
+#define FROM_SYSTEM(name, ...) static int (*name)(__VA_ARGS__);
+#else
+#define FROM_SYSTEM(name, ...) extern "C" int name(__VA_ARGS__);
+#endif
+FROM_SYSTEM(pthread_create, void*, const void*, void* (*)(void*), void*)
+FROM_SYSTEM(pthread_mutex_init, void*, const void*)
+FROM_SYSTEM(pthread_mutex_lock, void*)
+FROM_SYSTEM(pthread_mutex_unlock, void*)
+FROM_SYSTEM(pthread_cond_init, void*, const void*)
+FROM_SYSTEM(pthread_cond_wait, void*, void*)
+FROM_SYSTEM(pthread_cond_broadcast, void*)
+FROM_SYSTEM(getpid)
 
 enum { MAX_WORKERS = 255, SPINS = 2000 };
 
