@@ -1,5 +1,6 @@
-"""Compiling the CPU kernels on first use, and what the compiled code may not do."""
+"""Compiling the CPU kernels on first use, with a compiler and without, and what the compiled code may not do."""
 
+import ctypes
 import os
 import stat
 import subprocess
@@ -28,17 +29,30 @@ def no_library() -> Iterator[None]:
     backends._warn_once.cache_clear()
 
 
-@pytest.mark.usefixtures("no_library")
+@pytest.fixture
+def no_warp(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "warp", None)
+
+
+@pytest.fixture
+def no_compiler(no_library: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only Warp's own Clang is left."""
+    pytest.importorskip("warp", reason="needs Warp: pip install 'tumble[cuda]'")
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(_native, "COMPILERS", ())
+
+
+@pytest.mark.usefixtures("no_library", "no_warp")
 def test_without_a_compiler_the_reference_draws_and_one_warning_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
-    with pytest.warns(RuntimeWarning, match=r"no-such-compiler.*install one"):
+    with pytest.warns(RuntimeWarning, match=r"no-such-compiler.*install one.*pip install 'tumble\[cuda\]'"):
         assert backends.choose(CPU, torch.float32) is reference
     assert backends.choose(CPU, torch.float32) is reference
 
 
-@pytest.mark.usefixtures("no_library")
+@pytest.mark.usefixtures("no_library", "no_warp")
 def test_a_failing_compiler_is_named_with_what_it_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CXX", _script(tmp_path / "broken", "echo out of cheese >&2; exit 1"))
@@ -46,12 +60,60 @@ def test_a_failing_compiler_is_named_with_what_it_said(tmp_path: Path, monkeypat
     assert not list((tmp_path / "tumble").iterdir())
 
 
+@pytest.mark.parametrize("name", cases.SCENES)
+@pytest.mark.usefixtures("no_compiler")
+def test_without_a_compiler_the_kernels_of_warps_clang_draw_as_the_reference(name: str) -> None:
+    cpu, scene = backends.load("cpu"), cases.SCENES[name]()
+    assert backends.choose(CPU, torch.float32) is cpu
+    assert not isinstance(_native.library(), ctypes.CDLL)
+    view, gradients = cases.render(cpu, scene, torch.float32)
+    truth, true_gradients = cases.render(reference, scene, torch.float64)
+    # 1e-4 as for a compiler; the variance is a difference of nearly equal numbers.
+    pairs = [*zip(view[:6], truth[:6], strict=True), *zip(gradients, true_gradients, strict=True)]
+    worst = [cases.difference(a, b) for a, b in pairs]
+    assert worst.pop(view._fields.index("depth_var")) < 5e-4
+    assert max(worst) < 1e-4, worst
+    assert torch.equal(view.touched, truth.touched)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.usefixtures("no_compiler")
+def test_without_a_compiler_every_verb_works_on_any_number_of_threads(threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        exercise()
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_warps_clang_takes_the_vectors_of_the_machine() -> None:
+    """Narrower ones cost half the speed, wider ones far more. The flags are those that a compiler would look at."""
+    flags = next((x.split() for x in _native._cpu_features().splitlines() if x.startswith("flags")), None)
+    if flags is None:
+        pytest.skip("this system does not list what its processor can")
+    lanes = 16 if {"avx512f", "avx512dq"} <= set(flags) else 8 if "avx2" in flags else 4
+    assert _native.library().lanes() == lanes
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_a_warp_that_cannot_compile_is_named_and_the_reference_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As an older or a later Warp, which may lack what is used of it."""
+    import warp
+
+    monkeypatch.delitem(sys.modules, "tumble.backends._jit", raising=False)
+    monkeypatch.delattr(backends, "_jit", raising=False)
+    monkeypatch.delattr(warp, "ModuleBuildOptions")
+    with pytest.warns(RuntimeWarning, match=r"no C\+\+ compiler.*nor can Warp [0-9.]+.*ModuleBuildOptions"):
+        assert backends.choose(CPU, torch.float32) is reference
+
+
 def test_two_processes_that_start_at_once_compile_to_one_whole_file(tmp_path: Path) -> None:
     """The compiler here is a script that takes its time to copy what was compiled before."""
-    if reason := backends.load("cpu").ready(CPU, torch.float32):
-        pytest.skip(reason)
+    library = compiled()
     to_output = 'while [ "$1" != -o ]; do [ "$1" = --version ] && exit; shift; done'
-    copy = f'{to_output}; sleep .3; cp {_native.library()._name} "$2"'
+    copy = f'{to_output}; sleep .3; cp {library._name} "$2"'
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "CXX": _script(tmp_path / "slow", copy)}
     program = "import sys; from tumble.backends import _native; sys.exit(_native.library().lanes() not in (4, 8, 16))"
     runs = [subprocess.Popen([sys.executable, "-c", program], env=environment) for _ in range(2)]
@@ -87,13 +149,23 @@ WIDTHS = {"16": ["-march=x86-64-v4"], "8": ["-march=x86-64-v3"], "4": ["-march=x
 def test_every_vector_width_gives_the_same_pictures(
     lanes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if backends.load("cpu").ready(CPU, torch.float32) or _native.library().lanes() < int(lanes):
+    if compiled().lanes() < int(lanes):
         pytest.skip("this machine has no such vectors")
     monkeypatch.setattr(_native, "VARIANTS", (WIDTHS[lanes],))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     _native.library.cache_clear()
     assert _native.library().lanes() == int(lanes)
     exercise()
+
+
+def compiled() -> ctypes.CDLL:
+    """What the system's compiler made of the kernels."""
+    if reason := backends.load("cpu").ready(CPU, torch.float32):
+        pytest.skip(reason)
+    library = _native.library()
+    if not isinstance(library, ctypes.CDLL):
+        pytest.skip("needs a C++ compiler")
+    return library
 
 
 def exercise() -> None:

@@ -17,9 +17,7 @@ from torch.nn.functional import normalize, softplus
 from tumble import harmonics
 from tumble.directions import reflect, texel_directions
 from tumble.environment import Environment
-
-F0 = 0.04
-"""Reflectance of a dielectric at normal incidence (paper section 4.3)."""
+from tumble.material import DIELECTRIC
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ def radiance(
         view: Unit directions from the points to the camera, object frame.
     """
     n_v = (normals * view).sum(-1, keepdim=True).clamp(0, 1)
-    fresnel = F0 + (1 - F0) * (1 - n_v) ** 5
+    fresnel = DIELECTRIC + (1 - DIELECTRIC) * (1 - n_v) ** 5
     mirrored = normalize(reflect(view, normals), dim=-1)
     return albedo * light.diffuse(normals @ R_env_obj.T) + fresnel * light.glossy(mirrored @ R_env_obj.T)
 

@@ -18,7 +18,6 @@ from tumble.asset import Asset
 from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.capture import Capture
-from tumble.coarse_light import F0
 from tumble.directions import fibonacci_sphere, random_rotation
 from tumble.environment import Environment
 from tumble.gaussians import Gaussians
@@ -53,6 +52,8 @@ class Rates:
     albedo: float = 0.025
     roughness: float = 0.025
     normal: float = 1e-3
+    f0: float = 0.0
+    """The paper fixes 0.04. One number for the object: a Lambertian surface cannot be fitted with a highlight."""
     light: float = 0.01
     means: float = 1.6e-5
     """Geometry joins after the warm-up, about ten times slower than in stage 2. The paper: "from SVG-IR"."""
@@ -145,6 +146,7 @@ def _rates(cfg: Config) -> dict[str, float]:
         "material.albedo_logits": rates.albedo,
         "material.roughness_logits": rates.roughness,
         "material.normal_offset": rates.normal,
+        "material.f0_logit": rates.f0,
         "environment": rates.light,
         "gaussians.means": rates.means,
         "gaussians.quats": rates.quats,
@@ -245,7 +247,7 @@ def _shaded(cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj
         prefilter(params.environment),
         R_env_obj,
         seen,
-        f0=F0,
+        f0=params.material.f0,
         bounce=bounce,
     )
 

@@ -36,7 +36,7 @@ STANDARD = replace(
         warmup=2_000,
         doublings=3,
         weights=DecomposeWeights(light=0.02, material=0.02),
-        rates=replace(PAPER.decompose.rates, albedo=0.02, roughness=0.03, light=0.03),
+        rates=replace(PAPER.decompose.rates, albedo=0.02, roughness=0.03, light=0.03, f0=0.01),
     ),
 )
 
@@ -59,7 +59,7 @@ DRAFT = replace(
         directions=256,
         doublings=1,
         weights=DecomposeWeights(light=0.002, material=0.01),
-        rates=replace(PAPER.decompose.rates, albedo=0.02, roughness=0.05, light=0.05),
+        rates=replace(PAPER.decompose.rates, albedo=0.02, roughness=0.05, light=0.05, f0=0.05),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
 )

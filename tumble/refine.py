@@ -251,7 +251,9 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     terms = _terms(cfg, params, view, frame(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
     optim.anneal(state.optimizer, _annealed(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
-    return {name: value.detach() for name, value in terms.items()} | {"gaussians": float(len(params.points.albedo_logits))}
+    return {name: value.detach() for name, value in terms.items()} | {
+        "gaussians": float(len(params.points.albedo_logits))
+    }
 
 
 def _draw(state: State, n: int) -> int:

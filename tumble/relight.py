@@ -12,12 +12,11 @@ from torch import Tensor
 
 from tumble.asset import Asset
 from tumble.camera import Camera
-from tumble.coarse_light import F0
 from tumble.decompose import buffers_of
 from tumble.directions import fibonacci_sphere
 from tumble.environment import Environment
 from tumble.importance import GlossyBounce, light_sampler, relight_surface
-from tumble.material import TEMPERATURE, Material
+from tumble.material import TEMPERATURE
 from tumble.prefilter import prefilter
 from tumble.shade import shade_split, surface
 from tumble.trace import build, open_sky
@@ -66,7 +65,7 @@ def relight(
             sampler,
             R_env_obj,
             tracer,
-            f0=F0,
+            f0=float(material.f0),
             generator=generator,
             n_brdf=cfg.brdf_samples,
             n_light=cfg.light_samples,
@@ -80,6 +79,8 @@ def preview(
     cfg: Config, asset: Asset, environment: Environment, trajectory: Trajectory, camera: Camera
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """As `relight`, at once: no shadows, no bounce, prefiltered highlights."""
+    material = asset.material
+    assert material is not None, "an asset with material"
     prefiltered = prefilter(environment)
     directions = fibonacci_sphere(cfg.preview_directions).to(asset.gaussians.means)
     for T_cam_obj, R_env_obj in zip(_poses(trajectory), trajectory.R_env_obj, strict=True):
@@ -92,7 +93,7 @@ def preview(
             prefiltered,
             R_env_obj,
             open_sky(directions, len(points.points)),
-            f0=F0,
+            f0=float(material.f0),
         )
         yield points.paint(shaded, camera.height, camera.width) * view.alpha[..., None]
 
@@ -103,7 +104,7 @@ def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
     assert material is not None, "an asset with material"
     albedo = (material.albedo * albedo_scale).clamp(1e-4, 0.999)
     logits = TEMPERATURE * torch.logit(albedo)
-    return replace(asset, material=Material(logits, material.roughness_logits, material.normal_offset))
+    return replace(asset, material=replace(material, albedo_logits=logits))
 
 
 def _poses(trajectory: Trajectory) -> Iterator:

@@ -148,7 +148,7 @@ def shade_split(
     R_env_obj: Float[Tensor, "3 3"],
     visibility: Visibility,
     *,
-    f0: float,
+    f0: float | Float[Tensor, ""],
     bounce: Bounce | None = None,
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance, the diffuse lobe summed over the directions and the specular one by the split sum.
@@ -167,7 +167,7 @@ def specular(
     roughness: Float[Tensor, "p 1"],
     prefiltered: Prefiltered,
     R_env_obj: Float[Tensor, "3 3"],
-    f0: float,
+    f0: float | Float[Tensor, ""],
 ) -> Float[Tensor, "p 3"]:
     """The specular lobe by the split sum, nothing in the way; unit normals and directions to the eye, object frame."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
