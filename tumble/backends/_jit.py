@@ -1,8 +1,8 @@
 """The kernels of `native/` through the Clang that Warp brings, for machines without a compiler.
 
-They become the preamble of a Warp module whose one Warp kernel exchanges addresses: Clang's code is linked to nothing, so
-it takes the system's thread functions from here, and gives its own entry points in return. Warp caches the object file,
-by the text of the kernels, its own version and the processor, in the folder that `_warp` names.
+They become the preamble of a Warp module whose one Warp kernel exchanges addresses: what Clang makes here is linked to
+nothing, so it is given the system's thread functions and gives its own entry points in return. Warp caches the object
+file, by the text of the kernels, its own version and the processor, in the folder that `_warp` names.
 """
 
 import ctypes
@@ -11,12 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-# That there is no driver of a GPU is no news to those who draw on the CPU.
-_level, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
-from tumble.backends import _warp  # noqa: E402
-from tumble.backends._native import SOURCES  # noqa: E402
-
-wp.config.log_level = max(_level, wp.LOG_WARNING)
+from tumble.backends import _warp
+from tumble.backends._native import SOURCES
 
 ENTRY_POINTS = (
     *("lanes", "sizes", "raster_prepare", "raster_forward", "raster_adjoint", "bvh_build"),

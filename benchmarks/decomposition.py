@@ -1,0 +1,81 @@
+"""The paper's central table: hand-held against turntable against dome, on captures with truth and known poses.
+
+`python -m benchmarks.decomposition CAPTURE... --runs FOLDER` reconstructs and scores each capture (`tumble run`,
+`tumble evaluate`) and adds a row to `benchmarks/decomposition.json`; finished runs are only scored. Each capture is
+made by `tumble synth`; what made it stands in the row.
+"""
+
+import argparse
+import json
+import resource
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.kernels import machine
+from tumble import evaluate, files
+from tumble.recipes import QUALITIES
+from tumble.reconstruct import predict_run, reconstruct
+from tumble.synthesize import NOTE
+
+KEPT = (
+    "albedo.psnr_fg_srgb",
+    "albedo.psnr_fg_linear",
+    "albedo.psnr_full_srgb",
+    "relit.psnr_fg_srgb",
+    "relit.psnr_full_srgb",
+    "image.psnr_fg_srgb",
+    "normal.mean_fg_degrees",
+    "roughness.rmse_fg",
+    "silhouette.iou",
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--runs", type=Path, required=True)
+    parser.add_argument("--quality", choices=QUALITIES, default="draft")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    arguments = parser.parse_args()
+    rows = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
+    for capture in arguments.captures:
+        row = measure(capture, arguments.runs / capture.name, arguments.quality, arguments.seed)
+        rows = [old for old in rows if old["made_by"] != row["made_by"] or old["recipe"] != row["recipe"]] + [row]
+        command = f"python -m benchmarks.decomposition CAPTURE... --quality {arguments.quality}"
+        files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
+        shared = row["shared"]
+        print(
+            f"{capture.name:60} albedo {shared[KEPT[0]]:6.2f}  relit {shared[KEPT[3]]:6.2f}  {row['run_seconds']:.0f} s",
+            flush=True,
+        )
+
+
+def measure(capture: Path, run: Path, quality: str, seed: int) -> dict[str, Any]:
+    """One row: reconstruct if need be, predict, score."""
+    begun = time.perf_counter()
+    reconstruct(capture, run, replace(QUALITIES[quality], seed=seed))
+    seconds = time.perf_counter() - begun
+    begun = time.perf_counter()
+    report = evaluate.run(predict_run(run, capture), capture, run)
+    note = files.read_json(capture / NOTE)
+    regions = {
+        region: {key: round(scores[key], 4) for key in KEPT if key in scores}
+        for region, scores in report["regions"].items()
+    }
+    return {
+        "made_by": {"model": note["model"], **note["options"]},
+        "recipe": {"quality": quality, "seed": seed},
+        "run_seconds": round(seconds, 1),
+        "score_seconds": round(time.perf_counter() - begun, 1),
+        "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+        **regions,
+        "light": {key: value for key, value in report["light"].items() if value is not None},
+        "albedo_scale": report["albedo_scale"],
+    }
+
+
+if __name__ == "__main__":
+    main()
