@@ -47,10 +47,8 @@ def main() -> None:
         command = f"python -m benchmarks.decomposition CAPTURE... --quality {arguments.quality}"
         files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
         shared = row["shared"]
-        print(
-            f"{capture.name:60} albedo {shared[KEPT[0]]:6.2f}  relit {shared[KEPT[3]]:6.2f}  {row['run_seconds']:.0f} s",
-            flush=True,
-        )
+        scores = f"albedo {shared[KEPT[0]]:6.2f}  relit {shared[KEPT[3]]:6.2f}"
+        print(f"{capture.name:60} {scores}  {row['run_seconds']:.0f} s", flush=True)
 
 
 def measure(capture: Path, run: Path, quality: str, seed: int) -> dict[str, Any]:
