@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble import backends
+from tumble import backends, losses
 from tumble.backends import Backend, _native
 
 RUNS = 9
@@ -41,6 +41,7 @@ def main() -> None:
     for threads in arguments.threads:
         torch.set_num_threads(threads)
         rows += measure(backends.load("cpu"), "cpu", threads, SIZES)
+        rows += comparing(threads)
     facts = machine()  # Before the reference, which needs gigabytes.
     if not arguments.no_reference:
         torch.set_num_threads(1)
@@ -129,6 +130,18 @@ def shading(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
         row("shade, forward", name, threads, "M evaluations/s", million / forward),
         row("shade, forward and backward", name, threads, "M evaluations/s", million / (forward + backward)),
     ]
+
+
+def comparing(threads: int) -> list[dict[str, Any]]:
+    """Milliseconds of L1 + SSIM with its gradient, in plain torch: what a step pays beside the kernels."""
+    rows = []
+    for size in (128, 256):
+        rendered, photograph = torch.rand(size, size, 3, requires_grad=True), torch.rand(size, size, 3)
+        loss = partial(losses.photometric, rendered, photograph, torch.ones(size, size, 1), ssim_weight=0.2)
+        forward = median(loss, threads)
+        backward = median(partial(torch.autograd.grad, loss(), [rendered], retain_graph=True), threads)
+        rows.append(row(f"L1 + SSIM, {size} px", "torch", threads, "ms", forward * 1e3, backward * 1e3))
+    return rows
 
 
 def row(what: str, name: str, threads: int, unit: str, value: float, backward: float | None = None) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from tumble.shade import Bounce, Surface, shade_split, surface
 from tumble.trace import Visibility, build, surface_points, visibility
 from tumble.trajectory import Trajectory
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from tumble.rasterize import rasterize
 from tumble.se3 import SE3
 from tumble.trajectory import Trajectory
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Rates:
     sdf: float = 2e-3
     gamma: float = 0.05
     albedo: float = 2e-2
-    light: float = 1e-2
+    light: float = 2e-2
     sh: float = 1e-2
     poses: float = 0.0
     """0 leaves the poses as given."""
