@@ -14,6 +14,7 @@ from tumble.images import (
     edge_aware,
     gradients,
     linear_from_srgb,
+    photograph,
     resize,
     resize_area,
     srgb_from_linear,
@@ -194,3 +195,9 @@ def test_crop_box_fits_the_mask_and_stays_in_the_picture(dtype: torch.dtype) -> 
 def test_crop_box_of_an_empty_mask_is_an_error() -> None:
     with pytest.raises(ValueError, match="empty"):
         crop_box(torch.zeros(4, 4), 1)
+
+
+def test_a_photograph_saturates_and_rounds() -> None:
+    linear = torch.tensor([-0.1, 0.0, 0.2140411, 1.0, 7.0])
+    # 0.214 linear is half of sRGB: code value 127.5, rounded to even.
+    assert photograph(linear).tolist() == [0, 0, 128, 255, 255]

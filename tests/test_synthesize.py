@@ -12,7 +12,7 @@ from PIL import Image
 mi = pytest.importorskip("mitsuba", reason="needs the extra `synth`")
 trimesh = pytest.importorskip("trimesh", reason="needs the extra `synth`")
 
-from tumble import files, pathtracer, settings, synthesize, video  # noqa: E402
+from tumble import files, images, pathtracer, settings, synthesize, video  # noqa: E402
 from tumble.camera import Camera  # noqa: E402
 from tumble.datasets import folder  # noqa: E402
 from tumble.environment import Environment  # noqa: E402
@@ -332,7 +332,7 @@ def test_the_written_light_is_the_light_of_the_photographs(captures: dict[str, P
     pose = SE3(capture.trajectory.T_cam_obj.wxyz[1], capture.trajectory.T_cam_obj.xyz[1])
     pixels, _ = pathtracer.radiance(scene, pose, capture.camera, capture.trajectory.R_env_obj[1], samples=64, seed=5)
     solid = capture.masks[1].numpy() == 255
-    error = synthesize.photograph(pixels)[solid].astype(float) - capture.images[1].numpy()[solid]
+    error = images.photograph(torch.from_numpy(pixels)).numpy()[solid].astype(float) - capture.images[1].numpy()[solid]
     # Sixteen samples a pixel leave noise of some code values, and no bias.
     assert abs(error.mean()) < 1.5
     assert np.abs(error).mean() < 12
@@ -376,7 +376,7 @@ def test_a_pose_free_film_under_a_white_light(pebble: Path, tmp_path: Path) -> N
     # mix with the background, so they are left out.
     solid = -torch.nn.functional.max_pool2d(-(truth.masks == 255).float(), 3, 1, 1) == 1
     light = truth.light.radiance[0, 0]
-    expected = synthesize.photograph((truth.albedo[solid] * light).clamp(0, 1).numpy()[None])[0]
+    expected = images.photograph(truth.albedo[solid] * light).numpy()
     assert np.abs(expected.astype(float) - truth.images[solid].numpy()).mean() < 2
 
 

@@ -21,7 +21,7 @@ from tumble import files, video
 from tumble.capture import Capture, Truth
 from tumble.datasets import folder
 from tumble.environment import Environment
-from tumble.images import srgb_from_linear
+from tumble.images import photograph
 
 CLIP = "clip.mp4"
 
@@ -98,7 +98,7 @@ def _page(capture: Capture, truth: Truth) -> str:
     roughness = (truth.roughness[views][..., None] * 255).to(torch.uint8).expand(-1, -1, -1, 3)
     rows = {
         "photograph": truth.images[views],
-        "albedo": _code_values(truth.albedo[views]),
+        "albedo": photograph(truth.albedo[views]),
         "roughness": roughness,
         "normal": normals,
     } | {f"under {name}": pictures[views] for name, pictures in truth.relit.items()}
@@ -147,13 +147,9 @@ def _lights(lights: dict[str, Environment]) -> str:
     for name, light in lights.items():
         # Half of the radiance range of a room lies above what a screen shows: a soft shoulder keeps the lamp's shape.
         radiance = light.radiance / light.radiance.mean()
-        shown = _picture(_code_values(radiance / (1 + radiance)))
+        shown = _picture(photograph(radiance / (1 + radiance)))
         figures.append(f"<figure>{shown}<figcaption>{html.escape(name)}</figcaption></figure>")
     return f'<div class="lights">{"".join(figures)}</div>'
-
-
-def _code_values(linear: torch.Tensor) -> torch.Tensor:
-    return (srgb_from_linear(linear.clamp(0, 1)) * 255).round().to(torch.uint8)
 
 
 def _picture(values: torch.Tensor | UInt8[np.ndarray, "h w 3"]) -> str:

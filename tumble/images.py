@@ -4,7 +4,7 @@ Pixel centres lie at +0.5, so a resized picture covers the same area. Values are
 """
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -31,6 +31,11 @@ def linear_from_srgb(srgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """The inverse of `srgb_from_linear`: negative values become 0, without gradient."""
     srgb = srgb.clamp_min(0)
     return torch.where(srgb <= SRGB_KNEE, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def photograph(linear: Float[Tensor, "*b"]) -> UInt8[Tensor, "*b"]:
+    """What a camera stores of linear values: saturated at 1, along the sRGB curve, rounded to 8 bits."""
+    return (srgb_from_linear(linear.clamp(0, 1)) * 255).round().to(torch.uint8)
 
 
 def ssim(

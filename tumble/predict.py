@@ -10,7 +10,7 @@ from tumble.asset import Asset
 from tumble.capture import Capture, Truth
 from tumble.decompose import buffers_of
 from tumble.environment import Environment
-from tumble.images import srgb_from_linear
+from tumble.images import photograph
 from tumble.metrics import Similarity
 from tumble.prediction import Prediction
 from tumble.se3 import SO3
@@ -92,4 +92,4 @@ def _pictures(
     cfg: relight.Config, asset: Asset, light: Environment, views: Trajectory, capture: Capture
 ) -> UInt8[Tensor, "v h w 3"]:
     linear = torch.stack(list(relight.relight(cfg, asset, light, views, capture.camera)))
-    return (srgb_from_linear(linear.clamp(0, 1)) * 255).round().to(torch.uint8)
+    return photograph(linear)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import torch
 from rich.progress import track
 
 from tumble import decompose, files, predict, refine, relight, run, tree
@@ -11,7 +10,7 @@ from tumble.capture import Capture
 from tumble.datasets import folder
 from tumble.environment import Environment
 from tumble.files import BadFile
-from tumble.images import srgb_from_linear
+from tumble.images import photograph
 from tumble.recipes import Recipe
 from tumble.trajectory import Trajectory
 
@@ -77,8 +76,7 @@ def relight_run(out: Path, env: Path, pictures: Path, *, fast: bool) -> None:
     draw = relight.preview if fast else relight.relight
     views = draw(cfg, asset, light, still, asset.camera)
     for number, linear in enumerate(track(views, f"relighting under {env.stem}", len(still), transient=True)):
-        values = (srgb_from_linear(linear.clamp(0, 1)) * 255).round().to(torch.uint8)
-        files.write_png(pictures / f"{number:04}.png", values.numpy())
+        files.write_png(pictures / f"{number:04}.png", photograph(linear).numpy())
 
 
 def finished(out: Path) -> Asset:

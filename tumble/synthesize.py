@@ -21,7 +21,7 @@ from tumble.camera import Camera
 from tumble.capture import BACKGROUND, OBJECT
 from tumble.environment import Environment
 from tumble.files import BadFile
-from tumble.images import srgb_from_linear
+from tumble.images import photograph
 from tumble.se3 import SE3, SO3
 from tumble.settings import ELEVATION, LIGHT, Setting, distance_for, shared_views, sphere_views, trajectory
 from tumble.trajectory import Trajectory, opengl_from_opencv
@@ -279,7 +279,7 @@ def _render(studio: _Studio, shot: _Shot, number: int) -> None:
         coverage = _render_truth(studio, shot, seed)
     mask = np.where(coverage >= 0.5, OBJECT, BACKGROUND).astype(np.uint8)
     files.write_png(out / "masks" / shot.name, mask[..., None])
-    files.write_png(out / "images" / shot.name, photograph(pixels))
+    _write_photograph(out / "images" / shot.name, pixels)
 
 
 def _render_truth(studio: _Studio, shot: _Shot, seed: int) -> np.ndarray:
@@ -290,7 +290,7 @@ def _render_truth(studio: _Studio, shot: _Shot, seed: int) -> np.ndarray:
         files.write_exr(truth / name / exr, getattr(view, name), half=name != "depth")
     for light in (name for name in studio.scenes if name not in ("", "probe")):
         pixels, _ = studio.photograph(light, shot, options.truth_samples, seed, "object")
-        files.write_png(truth / "relit" / light / shot.name, photograph(pixels))
+        _write_photograph(truth / "relit" / light / shot.name, pixels)
     return view.coverage
 
 
@@ -299,10 +299,8 @@ def _maps(options: Options) -> tuple[str, ...]:
     return tuple(name for name in capture_writer.MAPS if options.material == "original" or name != "roughness")
 
 
-def photograph(radiance: np.ndarray) -> np.ndarray:
-    """sRGB code values of linear radiance: clipped at 1, rounded to 8 bits."""
-    linear = torch.from_numpy(radiance).clamp(0, 1)
-    return (srgb_from_linear(linear) * 255).round().to(torch.uint8).numpy()
+def _write_photograph(path: Path, radiance: np.ndarray) -> None:
+    files.write_png(path, photograph(torch.from_numpy(radiance)).numpy())
 
 
 # Documents ------------------------------------------------------------------------------------------------------------

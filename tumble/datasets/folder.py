@@ -20,7 +20,7 @@ from tumble.camera import Camera
 from tumble.capture import BACKGROUND, OBJECT, REGIONS, UNKNOWN, Capture, Truth, no_views
 from tumble.environment import Environment
 from tumble.files import BadFile
-from tumble.images import linear_from_srgb, srgb_from_linear
+from tumble.images import linear_from_srgb, photograph
 from tumble.trajectory import LIGHTS, Light, Trajectory
 
 TRANSFORMS = "transforms.json"
@@ -225,7 +225,7 @@ def _sized(pixels: np.ndarray, path: Path, camera: Camera) -> np.ndarray:
 def over_black(rgba: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """Straight sRGB colour with alpha, composited over black in linear light, back to sRGB code values."""
     linear = linear_from_srgb(torch.from_numpy(rgba[..., :3] / 255.0)) * torch.from_numpy(rgba[..., 3:] / 255.0)
-    return (srgb_from_linear(linear) * 255).round().to(torch.uint8).numpy()
+    return photograph(linear).numpy()
 
 
 def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
