@@ -198,6 +198,6 @@ def test_crop_box_of_an_empty_mask_is_an_error() -> None:
 
 
 def test_a_photograph_saturates_and_rounds() -> None:
-    linear = torch.tensor([-0.1, 0.0, 0.2140411, 1.0, 7.0])
-    # 0.214 linear is half of sRGB: code value 127.5, rounded to even.
+    linear = torch.tensor([-0.1, 0.0, 0.2158605, 1.0, 7.0])
+    # 128 / 255 is 0.502 in sRGB, and ((0.502 + 0.055) / 1.055)^2.4 = 0.21586.
     assert photograph(linear).tolist() == [0, 0, 128, 255, 255]
