@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.test_hull import silhouettes
-from tumble import capture_writer, evaluate, files, recipes, reconstruct, refine, tree
+from tumble import capture_writer, decompose, evaluate, files, recipes, reconstruct, refine, tree
 from tumble.asset import Asset
 from tumble.capture import OBJECT, Capture, Truth
 from tumble.datasets import folder
@@ -143,3 +143,24 @@ def test_the_third_axis_is_the_smallest_after_training(finished: tuple[Path, Ass
     """Our normal is the third axis by construction; the paper's is that of the smallest scale."""
     scales = finished[1].gaussians.scales
     assert (scales.argmin(-1) == 2).double().mean() > 0.99
+
+
+def test_visibility_is_traced_again_only_when_geometry_has_moved(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = folder.load(capture)
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(taken, refined)
+    cfg = dataclasses.replace(RECIPE.decompose, warmup=0)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    looks: list[int] = []
+    monkeypatch.setattr(decompose, "_look_around", lambda cfg, inputs, state: looks.append(state.step))
+    decompose._look_again(cfg, inputs, state)
+    assert looks == []
+    with torch.no_grad():
+        state.params.gaussians.means.add_(0.5 * state.params.gaussians.scales.amax(-1, keepdim=True))
+    decompose._look_again(cfg, inputs, state)
+    assert looks == [0]
+    state.step = 7
+    decompose._look_again(cfg, inputs, state)
+    assert looks == [0], "looked at every LOOK_EVERY steps"

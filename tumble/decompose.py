@@ -29,10 +29,15 @@ from tumble.rasterize import rasterize
 from tumble.refine import Frame, Refined, frame
 from tumble.se3 import SE3
 from tumble.shade import Bounce, Surface, shade_split, surface
-from tumble.trace import Visibility, build, surface_points, visibility
+from tumble.trace import Visibility, build, moved, surface_points, visibility
 from tumble.trajectory import Trajectory
+from tumble.tree import named_tensors
 
 VERSION = 2
+LOOK_EVERY = 100
+"""Steps between two looks at how far geometry has moved."""
+MOVED = 0.3
+"""Of `trace.moved`, beyond which visibility is traced anew."""
 
 
 @dataclass(frozen=True)
@@ -174,8 +179,18 @@ def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
         for directions in state.memory["directions"]
     ]
     state.memory["bits"] = torch.stack([v.bits for v in seen])
+    state.memory |= {f"traced.{name}": x.detach().clone() for name, x in named_tensors(gaussians).items()}
     if cfg.bounce:
         state.memory["blocker"] = torch.stack([v.blocker for v in seen if v.blocker is not None])
+
+
+def _look_again(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Trace anew when geometry has moved by about the width of a shadow's edge since the last time."""
+    if state.step < cfg.warmup or state.step % LOOK_EVERY:
+        return
+    traced = Gaussians(*(state.memory[f"traced.{name}"] for name in named_tensors(state.params.gaussians)))
+    if moved(traced, state.params.gaussians) > MOVED:
+        _look_around(cfg, inputs, state)
 
 
 def pose(params: Params, inputs: Inputs, number: int) -> SE3:
@@ -199,6 +214,7 @@ def buffers_of(asset: Asset | Params, T_cam_obj: SE3, camera: Camera) -> Buffers
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
     _grow_light(cfg, state)
+    _look_again(cfg, inputs, state)
     params, capture = state.params, inputs.capture
     number = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, number)

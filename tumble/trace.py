@@ -49,19 +49,24 @@ class Tracer:
         return (points + self.offset * normals).detach()
 
     def moved(self, gaussians: Gaussians) -> float:
-        """How far the middle Gaussian has moved since [its own largest standard deviation], or turned [radians].
+        """How far Gaussians have moved since the tree was built: `moved`."""
+        return moved(self.gaussians, gaussians)
 
-        The larger of both medians. Rebuild the tree and what was traced with it beyond about 0.3: a shadow's edge is
-        as wide as a Gaussian. Infinite when their number has changed.
-        """
-        if len(gaussians) != len(self.gaussians):
-            return float("inf")
-        if len(gaussians) == 0:
-            return 0.0
-        with torch.no_grad():
-            shift = (gaussians.means - self.gaussians.means).norm(dim=-1) / self.gaussians.scales.amax(-1)
-            turn = (gaussians.normals - self.gaussians.normals).norm(dim=-1)
-            return max(shift.median().item(), turn.median().item())
+
+@torch.no_grad()
+def moved(before: Gaussians, now: Gaussians) -> float:
+    """How far the middle Gaussian has moved [its own largest standard deviation], or turned [radians].
+
+    The larger of both medians. Rebuild a tree and what was traced with it beyond about 0.3: a shadow's edge is as wide
+    as a Gaussian. Infinite when their number has changed.
+    """
+    if len(now) != len(before):
+        return float("inf")
+    if len(now) == 0:
+        return 0.0
+    shift = (now.means - before.means).norm(dim=-1) / before.scales.amax(-1)
+    turn = (now.normals - before.normals).norm(dim=-1)
+    return max(shift.median().item(), turn.median().item())
 
 
 def build(gaussians: Gaussians, gamma: Float[Tensor, ""]) -> Tracer:
