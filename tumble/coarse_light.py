@@ -4,7 +4,8 @@
 
 where E is irradiance / pi and S the light that a glossy surface mirrors, both of one light: 16 spherical harmonics in
 the env frame, shared by all Gaussians. On hand-held captures a static colour per Gaussian can only fit the mean over
-poses; and albedo and light found here are where stage 3 starts. (Two free lights, one for each lobe, fit no better and leave their tints to chance.)
+poses; and albedo and light found here are where stage 3 starts. Two free lights, one for each lobe, would leave their
+tints to chance.
 """
 
 import math
