@@ -44,7 +44,7 @@ def main() -> None:
     for capture in arguments.captures:
         row = measure(capture, arguments.runs / capture.name, arguments.quality, arguments.seed)
         rows = [old for old in rows if old["made_by"] != row["made_by"] or old["recipe"] != row["recipe"]] + [row]
-        command = f"python -m benchmarks.decomposition CAPTURE... --quality {arguments.quality}"
+        command = f"python -m benchmarks.decomposition CAPTURE... --runs FOLDER --quality {arguments.quality}"
         files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
         shared = row["shared"]
         scores = f"albedo {shared[KEPT[0]]:6.2f}  relit {shared[KEPT[3]]:6.2f}"

@@ -29,8 +29,8 @@ from tumble.rasterize import rasterize
 from tumble.refine import Frame, Refined, frame
 from tumble.se3 import SE3
 from tumble.shade import Bounce, Surface, shade_split, surface
-from tumble.trace import Visibility, build, moved, surface_points, visibility
-from tumble.trajectory import Trajectory
+from tumble.trace import Visibility, build, moved, open_sky, surface_points, visibility
+from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import named_tensors
 
 VERSION = 2
@@ -166,6 +166,8 @@ def _rates(cfg: Config) -> dict[str, float]:
 @torch.no_grad()
 def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace what every Gaussian sees, from the surface that it stands for."""
+    if not cfg.visibility:
+        return
     params, camera = state.params, inputs.capture.camera
     gaussians = params.gaussians
     views = []
@@ -186,7 +188,7 @@ def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
 
 def _look_again(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace anew when geometry has moved by about the width of a shadow's edge since the last time."""
-    if state.step < cfg.warmup or state.step % LOOK_EVERY:
+    if not cfg.visibility or state.step < cfg.warmup or state.step % LOOK_EVERY:
         return
     traced = Gaussians(*(state.memory[f"traced.{name}"] for name in named_tensors(state.params.gaussians)))
     if moved(traced, state.params.gaussians) > MOVED:
@@ -221,7 +223,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     view = buffers_of(params, T_cam_obj, capture.camera)
     truth = frame(capture, number, view.alpha)
     points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, truth, state.rng))
-    R_env_obj = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), capture.light).R_env_obj[0]
+    R_env_obj = env_from_obj(T_cam_obj, capture.light)
     shaded = _shaded(cfg, state, view, points, R_env_obj)
     alpha = points.sample(view.alpha[..., None])
     rendered, photograph = (shaded * alpha)[None], points.sample(truth.image)[None]
@@ -249,12 +251,7 @@ def _draw(cfg: Config, view: Buffers, truth: Frame, rng: torch.Generator) -> Ten
 
 def _shaded(cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj: Tensor) -> Float[Tensor, "p 3"]:
     params = state.params
-    which = state.step % cfg.sets
-    index = view.dominant.flatten()[points.pixels].clamp_min(0).long()
-    bits = state.memory["bits"][which]
-    bits = bits if cfg.visibility else torch.full_like(bits, -1)
-    blocker = state.memory["blocker"][which] if cfg.bounce else None
-    seen = Visibility(state.memory["directions"][which], bits, blocker).gather(index)
+    seen = _seen(cfg, state, view.dominant.flatten()[points.pixels].clamp_min(0).long())
     bounce = Bounce(params.material.albedo.mean(1), params.gaussians.normals) if cfg.bounce else None
     return shade_split(
         points,
@@ -266,6 +263,16 @@ def _shaded(cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj
         f0=params.material.f0,
         bounce=bounce,
     )
+
+
+def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:
+    """What pixels see under this step's set of directions: the same as the Gaussians `index` that they show."""
+    memory, which = state.memory, state.step % cfg.sets
+    directions = memory["directions"][which]
+    if not cfg.visibility:
+        return open_sky(directions, len(index))
+    blocker = memory["blocker"][which] if cfg.bounce else None
+    return Visibility(directions, memory["bits"][which], blocker).gather(index)
 
 
 def _roughness_of(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:

@@ -89,6 +89,8 @@ class Environment:
 
     def rotated(self, R_new_old: Float[Tensor, "3 3"]) -> "Environment":
         """The same light described in a rotated frame: `new.lookup(R_new_old @ d) = old.lookup(d)`, resampled."""
+        if torch.equal(R_new_old, torch.eye(3).to(R_new_old)):
+            return self
         h, w, _ = self.log_radiance.shape
         d_new = texel_directions(h, w, dtype=self._dtype, device=self._device)
         return Environment(self.lookup(d_new @ R_new_old).log())

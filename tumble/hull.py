@@ -57,7 +57,7 @@ def surface(inside: Float[Tensor, "x y z"], n: int, rng: torch.Generator) -> Ori
         raise ValueError("the silhouettes leave nothing standing: are the poses those of these masks?")
     # An edge grid cuts a slanted surface more often per area than a level one: by the sum of the normal's components.
     chance = 1 / normals.abs().sum(-1)
-    chosen = torch.multinomial(chance, min(n, len(positions)), generator=rng)
+    chosen = torch.multinomial(chance.cpu(), min(n, len(positions)), generator=rng).to(positions.device)
     jitter = (torch.rand(len(chosen), 3, generator=rng).to(positions) - 0.5) * (2 / resolution)
     normals = normals[chosen]
     # Move along the surface only, so that points do not line up with the grid.

@@ -34,18 +34,16 @@ def predict(cfg: relight.Config, asset: Asset, capture: Capture, truth: Truth) -
     solid = torch.stack([view.alpha >= SILHOUETTE for view in buffers])
     albedo = torch.stack([view.features["albedo"] for view in buffers]) * solid[..., None]
     normals = torch.stack([normalize(view.normal, dim=-1) for view in buffers]) * solid[..., None]
-    light = asset.environment
-    assert light is not None, "an asset with light"
-    if views.light == "object":
-        light = light.rotated(alignment.R_true_pred.matrix())
+    own = asset.environment
+    assert own is not None, "an asset with light"
     return Prediction(
         albedo=albedo,
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * solid,
         masks=solid,
-        images=_pictures(cfg, asset, _own(asset), views, capture),
+        images=_pictures(cfg, asset, own, views, capture),
         relit=_relit(cfg, asset, albedo, alignment, capture, truth),
-        light=light,
+        light=own.rotated(alignment.R_true_pred.matrix()) if views.light == "object" else own,
         poses=asset.trajectory,
         pose_names=capture.names,
     )
@@ -57,11 +55,6 @@ def aligned(estimated: Trajectory, capture: Capture, truth: Truth) -> Similarity
         xyz = estimated.T_cam_obj.xyz
         return Similarity(xyz.new_ones(()), SO3.identity(dtype=xyz.dtype, device=xyz.device), xyz.new_zeros(3))
     return metrics.align(estimated, truth.poses)
-
-
-def _own(asset: Asset) -> Environment:
-    assert asset.environment is not None, "an asset with light"
-    return asset.environment
 
 
 def _relit(
@@ -79,13 +72,8 @@ def _relit(
     still = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     return {
-        name: _pictures(cfg, scaled, light if _is_identity(R_pred_true) else light.rotated(R_pred_true), still, capture)
-        for name, light in truth.lights.items()
+        name: _pictures(cfg, scaled, light.rotated(R_pred_true), still, capture) for name, light in truth.lights.items()
     }
-
-
-def _is_identity(R: Float[Tensor, "3 3"]) -> bool:
-    return bool(torch.equal(R, torch.eye(3).to(R)))
 
 
 def _pictures(

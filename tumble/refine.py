@@ -21,7 +21,7 @@ from tumble.gaussians import Gaussians, constant_sh, opacity, sdf_from_opacity
 from tumble.loop import State
 from tumble.rasterize import rasterize
 from tumble.se3 import SE3
-from tumble.trajectory import Trajectory
+from tumble.trajectory import Trajectory, env_from_obj
 
 VERSION = 2
 
@@ -231,7 +231,7 @@ def render(
     """One view with stage 2's colour, linear radiance."""
     gaussians = points.gaussians
     if gaussians.sh.shape[1] == 1:
-        R_env_obj = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), trajectory.light).R_env_obj[0]
+        R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
         view = normalize(T_cam_obj.inverse().xyz - gaussians.means, dim=-1)
         albedo = torch.sigmoid(points.albedo_logits)
         colour = coarse_light.radiance(light, albedo, gaussians.normals, view, R_env_obj)
@@ -292,7 +292,7 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     params, camera = state.params, inputs.capture.camera
     n = len(params.points.albedo_logits)
     assert state.optimizer is not None, "init makes one"
-    bad, weight = torch.zeros(n), torch.zeros(n)
+    bad, weight = (params.gamma.new_zeros(n) for _ in range(2))
     numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: cfg.views].tolist()
     for number in numbers:
         T_cam_obj = pose(params, inputs, number)

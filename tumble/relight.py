@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.asset import Asset
+from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.decompose import buffers_of
 from tumble.directions import fibonacci_sphere
@@ -18,7 +19,7 @@ from tumble.environment import Environment
 from tumble.importance import GlossyBounce, light_sampler, relight_surface
 from tumble.material import TEMPERATURE
 from tumble.prefilter import prefilter
-from tumble.shade import shade_split, surface
+from tumble.shade import Surface, shade_split, surface
 from tumble.trace import build, open_sky
 from tumble.trajectory import Trajectory
 
@@ -55,9 +56,7 @@ def relight(
     sampler = light_sampler(environment)
     bounce = GlossyBounce(material.albedo.mean(1), material.roughness.mean(1, keepdim=True), prefilter(environment))
     generator = torch.Generator().manual_seed(seed)
-    for T_cam_obj, R_env_obj in zip(_poses(trajectory), trajectory.R_env_obj, strict=True):
-        view = buffers_of(asset, T_cam_obj, camera)
-        points = surface(view, T_cam_obj, camera, alpha_min=cfg.alpha_min)
+    for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
         shaded = relight_surface(
             points,
             points.sample(view.features["albedo"]),
@@ -83,9 +82,7 @@ def preview(
     assert material is not None, "an asset with material"
     prefiltered = prefilter(environment)
     directions = fibonacci_sphere(cfg.preview_directions).to(asset.gaussians.means)
-    for T_cam_obj, R_env_obj in zip(_poses(trajectory), trajectory.R_env_obj, strict=True):
-        view = buffers_of(asset, T_cam_obj, camera)
-        points = surface(view, T_cam_obj, camera, alpha_min=cfg.alpha_min)
+    for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
         shaded = shade_split(
             points,
             points.sample(view.features["albedo"]),
@@ -107,5 +104,11 @@ def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
     return replace(asset, material=replace(material, albedo_logits=logits))
 
 
-def _poses(trajectory: Trajectory) -> Iterator:
-    return (trajectory.T_cam_obj[i] for i in range(len(trajectory)))
+def _surfaces(
+    cfg: Config, asset: Asset, trajectory: Trajectory, camera: Camera
+) -> Iterator[tuple[Buffers, Surface, Float[Tensor, "3 3"]]]:
+    """What each frame shows, and how its light is turned."""
+    for i, R_env_obj in enumerate(trajectory.R_env_obj):
+        T_cam_obj = trajectory.T_cam_obj[i]
+        view = buffers_of(asset, T_cam_obj, camera)
+        yield view, surface(view, T_cam_obj, camera, alpha_min=cfg.alpha_min), R_env_obj

@@ -24,7 +24,7 @@ from tumble.files import BadFile
 from tumble.images import photograph
 from tumble.se3 import SE3, SO3
 from tumble.settings import ELEVATION, LIGHT, Setting, distance_for, shared_views, sphere_views, trajectory
-from tumble.trajectory import Trajectory, opengl_from_opencv
+from tumble.trajectory import Light, env_from_obj, opengl_from_opencv
 
 SATURATED = 0.01
 """Share of the object's pixels that the exposure lets saturate."""
@@ -116,14 +116,13 @@ class _Studio:
     unlit: tuple[Any, Any]
     scenes: dict[str, Any] = field(default_factory=dict)
 
-    def photograph(self, light: str, shot: _Shot, samples: int, seed: int, frame: str) -> tuple[np.ndarray, np.ndarray]:
+    def photograph(
+        self, light: str, shot: _Shot, samples: int, seed: int, frame: Light
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Linear radiance and coverage of a shot; `frame` says what the light stands still with."""
-        T = Trajectory(
-            SE3(shot.T_cam_obj.wxyz[None], shot.T_cam_obj.xyz[None]),
-            "camera" if frame == "camera" else "object",
-        )
+        R_env_obj = env_from_obj(shot.T_cam_obj, frame)
         scene = self.scenes[light]
-        return pathtracer.radiance(scene, shot.T_cam_obj, self.camera, T.R_env_obj[0], samples=samples, seed=seed)
+        return pathtracer.radiance(scene, shot.T_cam_obj, self.camera, R_env_obj, samples=samples, seed=seed)
 
 
 def synthesize(model: Path, out: Path, options: Options) -> Path:
@@ -225,8 +224,7 @@ def _capture_light(options: Options) -> Environment:
     # The turntable's camera looks down by its elevation, so in its frame the room is pitched up.
     pitch = ELEVATION if options.setting == "turntable" else 0.0
     R_env_room = SO3.exp(torch.tensor([pitch, 0.0, 0.0], dtype=torch.float64)) @ yaw
-    light = _light(options.env)
-    return light if abs(float(R_env_room.angle())) < 1e-9 else light.rotated(R_env_room.matrix().float())
+    return _light(options.env).rotated(R_env_room.matrix().float())
 
 
 def _sources(options: Options) -> dict[str, Environment]:
@@ -250,7 +248,7 @@ def _expose(studio: _Studio, sources: dict[str, Environment], shots: list[_Shot]
     return wanted
 
 
-def _exposure(studio: _Studio, light: Environment, probes: list[_Shot], frame: str) -> float:
+def _exposure(studio: _Studio, light: Environment, probes: list[_Shot], frame: Light) -> float:
     """The factor on the light that lets `SATURATED` of the object's pixels saturate, from up to 16 of the shots."""
     studio.scenes["probe"] = pathtracer.lit_scene(studio.shapes, light, studio.options.path_depth)
     brightest = []

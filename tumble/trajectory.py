@@ -24,6 +24,14 @@ def opengl_from_opencv(like: Tensor) -> Float[Tensor, "3 3"]:
     return torch.diag(like.new_tensor([1.0, -1.0, -1.0]))
 
 
+def env_from_obj(T_cam_obj: SE3, light: Light) -> Float[Tensor, "*b 3 3"]:
+    """`R_env_obj` of any poses: what the word `light` means; rotation only, because the light is far away (eq. 3)."""
+    R_cam_obj = T_cam_obj.rotation.matrix()
+    if light == "camera":
+        return opengl_from_opencv(R_cam_obj) @ R_cam_obj
+    return torch.eye(3, dtype=R_cam_obj.dtype, device=R_cam_obj.device).expand_as(R_cam_obj)
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Object pose per frame, and the frame in which the environment does not move."""
@@ -48,10 +56,7 @@ class Trajectory:
     @property
     def R_env_obj(self) -> Float[Tensor, "t 3 3"]:
         """Object to environment; rotation only, because the light is far away (eq. 3)."""
-        R_cam_obj = self.T_cam_obj.rotation.matrix()
-        if self.light == "camera":
-            return opengl_from_opencv(R_cam_obj) @ R_cam_obj
-        return torch.eye(3, dtype=R_cam_obj.dtype, device=R_cam_obj.device).expand_as(R_cam_obj)
+        return env_from_obj(self.T_cam_obj, self.light)
 
     @property
     def camera_positions(self) -> Float[Tensor, "t 3"]:
@@ -64,4 +69,4 @@ class Trajectory:
     def select(self, frames: Sequence[int] | Tensor) -> "Trajectory":
         """The poses of some frames, in the order given."""
         index = torch.as_tensor(frames, dtype=torch.long, device=self.T_cam_obj.xyz.device)
-        return Trajectory(SE3(self.T_cam_obj.wxyz[index], self.T_cam_obj.xyz[index]), self.light)
+        return Trajectory(self.T_cam_obj[index], self.light)
