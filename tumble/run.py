@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import safetensors
 import torch
 from torch import Tensor
 
@@ -162,15 +161,10 @@ def _is_done(folder: Path, own_key: str) -> bool:
 
 def _store(output: Any, folder: Path, about: dict[str, Any]) -> None:
     """Write the output, then its key, then drop the checkpoint: a key never stands beside another's output."""
-    partial = folder / (OUT + ".partial")
     with loop.writing(folder / OUT):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DONE).unlink(missing_ok=True)
-        try:
-            tree.save(output, folder / OUT)
-        except (OSError, safetensors.SafetensorError):
-            partial.unlink(missing_ok=True)  # safetensors before 0.8 leave it behind
-            raise
+        tree.save(output, folder / OUT)
         files.write_json(folder / DONE, about)
         (folder / CHECKPOINT).unlink(missing_ok=True)
 

@@ -18,7 +18,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from tumble import __version__
+from tumble import __version__, files
 
 T = TypeVar("T")
 
@@ -51,12 +51,10 @@ def detach(tree: T) -> T:
 
 def save(tree: object, path: Path) -> None:
     """Write a tree as one safetensors file; the file appears whole or not at all."""
-    tensors = {name: value.detach().cpu().contiguous() for name, value in named_tensors(tree).items()}
-    header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_facts(tree))}
-    partial = path.with_name(path.name + ".partial")
     # Leaves may share storage (views of one parameter); safetensors wants each to own its bytes.
-    safetensors.torch.save_file({k: v.clone() for k, v in tensors.items()}, partial, metadata=header)
-    partial.replace(path)
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in named_tensors(tree).items()}
+    header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_facts(tree))}
+    files.write_whole(path, lambda partial: safetensors.torch.save_file(tensors, partial, metadata=header))
 
 
 def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
