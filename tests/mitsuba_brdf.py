@@ -52,11 +52,15 @@ def _register() -> None:
             a2 = self.roughness**4
             return a2 / (math.pi * dr.square(dr.square(noh) * (a2 - 1) + 1))
 
+        def _stretched(self, cosine: Any) -> Any:
+            """2 x / G1(x), Smith's."""
+            a2 = self.roughness**4
+            return cosine + dr.sqrt(a2 + (1 - a2) * dr.square(cosine))
+
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             nol, nov, noh, voh = self._cosines(si, wo)
-            k = (self.roughness + 1) ** 2 / 8
             fresnel = self.f0 + (1 - self.f0) * (1 - voh) ** 5
-            geometry = 4 * (nol * (1 - k) + k) * (nov * (1 - k) + k)
+            geometry = self._stretched(nol) * self._stretched(nov)
             value = self.albedo / math.pi + self._ndf(noh) * fresnel / geometry
             return mi.Spectrum(dr.select(active & (nol > 0) & (nov > 0), value * nol, 0))
 

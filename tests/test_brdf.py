@@ -33,10 +33,11 @@ def printed_ggx(wi: list, wo: list, n: list, r: float, f0: float) -> float:
     nol, nov, noh, voh = dot(n, wi), dot(n, wo), dot(n, h), dot(wo, h)
     if nol <= 0 or nov <= 0:
         return 0.0
-    a2, k = r**4, (r + 1) ** 2 / 8
+    a2 = r**4
     D = a2 / (math.pi * (noh * noh * (a2 - 1) + 1) ** 2)
     F = f0 + (1 - f0) * (1 - voh) ** 5
-    G = nol / (nol * (1 - k) + k) * nov / (nov * (1 - k) + k)
+    # Walter 2007, equation 34.
+    G = math.prod(2 / (1 + math.sqrt(1 + a2 * (1 - x * x) / (x * x))) for x in (nol, nov))
     return D * F * G / (4 * nol * nov)
 
 
@@ -90,7 +91,7 @@ def test_lambert_sends_back_exactly_its_albedo() -> None:
     torch.testing.assert_close(reflected, albedo, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize(("roughness", "excess"), [(0.1, 1.137), (0.2, 1.110), (0.3, 1.085)])
+@pytest.mark.parametrize(("roughness", "excess"), [(0.1, 1.482), (0.2, 1.423), (0.3, 1.306)])
 def test_a_white_surface_returns_more_than_it_gets(roughness: float, excess: float) -> None:
     """Known and kept: the paper adds the lobes without taking the specular share from the diffuse one."""
     wi, area = directions.fibonacci_hemisphere(1 << 17, dtype=DOUBLE)
@@ -264,5 +265,5 @@ def test_split_sum_tables_are_the_same_each_time_and_share_out_no_more_than_all(
     assert torch.equal(table, brdf.split_sum_table())
     assert brdf.split_sum_table(16).shape == (16, 16, 2)
     assert table.min() >= 0
-    # Sums of 4096 numbers in float32.
-    assert table.sum(-1).max() <= 1 + 1e-5
+    # 4096 half vectors miss the integral by up to 1e-4 where the eye is near the horizon.
+    assert table.sum(-1).max() <= 1 + 2e-4

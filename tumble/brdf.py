@@ -36,8 +36,9 @@ def ggx(
 ) -> Float[Tensor, "*#b 1"]:
     """Specular lobe D F G / (4 nol nov) (eq. 12), 0 where light or eye are below the horizon.
 
-    D is GGX, F is Schlick's with the power 5 (its exponential fit differs by less than 4e-3), and G is Schlick's
-    approximation of Smith's with k = (r + 1)^2 / 8, whose nol nov cancel against the denominator.
+    D is GGX, F is Schlick's with the power 5 (its exponential fit differs by less than 4e-3), and G is Smith's for GGX
+    (Walter 2007, which the paper cites), whose nol nov cancel against the denominator. Its relatives take Schlick's
+    fit of G with k = (r + 1)^2 / 8, made for lamps: under a sky it halves what a surface sends back at grazing angles.
     """
     rough = _rough(roughness, wo)
     nol, nov = _cosine(n, wi), _cosine(n, wo)
@@ -60,7 +61,8 @@ def evaluate(
     """Sum of both lobes (paper section 4.3), for `wi` above the horizon.
 
     The paper does not take the specular share from the diffuse one: with f0 = 0.04 a white surface sends back up to
-    1.11 of a uniform light at roughness 0.2, 1.15 at 0.05 (test_a_white_surface_returns_more_than_it_gets).
+    1.42 of a uniform light at roughness 0.2, seen 8 degrees above its horizon, and 1.04 face to face
+    (test_a_white_surface_returns_more_than_it_gets).
     """
     return lambert(albedo) + ggx(wi, wo, n, roughness=roughness, f0=f0)
 
@@ -177,5 +179,10 @@ def _schlick(voh: Tensor) -> Tensor:
 
 def _visibility(nol: Tensor, nov: Tensor, rough: Tensor) -> Tensor:
     """G / (4 nol nov), finite down to the horizon and not used below."""
-    k = (rough + 1).square() / 8
-    return 0.25 / ((nol.clamp_min(0) * (1 - k) + k) * (nov.clamp_min(0) * (1 - k) + k))
+    a2 = rough**4
+
+    def stretched(cosine: Tensor) -> Tensor:
+        x = cosine.clamp_min(0)
+        return x + (a2 + (1 - a2) * x.square()).sqrt()
+
+    return 1 / (stretched(nol) * stretched(nov))

@@ -216,11 +216,11 @@ class Backend(Protocol):
             L_o = 4 pi / d  sum_j (albedo / pi + f_j) L_j max(n.w_j, 0)
             f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = f0 + (1 - f0) (1 - v.h)^5
             t = (|n x H|^2 + a^2 (n.H)^2) / |H|^2,  H = v + w_j,  |H|^2 = 2 (1 + v.w_j),  v.h = |H| / 2
-            g(x) = max(x, 0) (1 - k) + k,  k = (r + 1)^2 / 8,  r = max(roughness, ROUGHNESS_MIN)
+            g(x) = (x + sqrt(a^2 + (1 - a^2) x^2)) / 2 for x > 0, else a / 2,  r = max(roughness, ROUGHNESS_MIN)
 
         (t is the usual (n.h)^2 (a^2 - 1) + 1, written so that a narrow lobe survives 32 bits.)
         Differentiable in normal, albedo, roughness, view and both radiances; normal and view as free vectors
-        in the formulas above. |H| = 0 (v = -w) contributes nothing.
+        in the formulas above. f is 0 for an eye below the horizon (n.v <= 0), and where |H| = 0 (v = -w).
 
         Args:
             normal: Unit normals.

@@ -31,8 +31,14 @@ class Point:
     n_v: float
     r: float
     aa: float
-    k: float
     g_v: float
+
+
+@wp.func
+@no_type_check
+def smith_root(x: float, aa: float) -> float:
+    """Smith's g(x) = (x + root) / 2."""
+    return wp.sqrt(aa + (1.0 - aa) * x * x)
 
 
 @wp.func
@@ -44,8 +50,8 @@ def point_at(normal: wp.array[wp.vec3], roughness: wp.array[float], view: wp.arr
     p.n_v = wp.dot(p.n, p.v)
     p.r = wp.max(roughness[i], ROUGHNESS_MIN)
     p.aa = p.r * p.r * p.r * p.r
-    p.k = (p.r + 1.0) * (p.r + 1.0) * 0.125
-    p.g_v = wp.max(p.n_v, 0.0) * (1.0 - p.k) + p.k
+    facing = wp.max(p.n_v, 0.0)
+    p.g_v = 0.5 * (facing + smith_root(facing, p.aa))
     return p
 
 
@@ -74,12 +80,12 @@ def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
     o.w = w
     o.n_w = n_w
     o.HH = 2.0 + 2.0 * wp.dot(p.v, w)
-    o.exists = o.HH > 1.0e-6
+    o.exists = o.HH > 1.0e-6 and p.n_v > 0.0
     if not o.exists:
         return o
     o.C = wp.cross(p.n, p.v + w)
     o.t_h2 = wp.dot(o.C, o.C) + p.aa * (p.n_v + n_w) * (p.n_v + n_w)
-    o.g_w = n_w * (1.0 - p.k) + p.k
+    o.g_w = 0.5 * (n_w + smith_root(n_w, p.aa))
     o.vh = 0.5 * wp.sqrt(o.HH)
     m = 1.0 - o.vh
     o.F = f0 + (1.0 - f0) * m * m * m * m * m
@@ -154,7 +160,6 @@ class PointSums:
     albedo: wp.vec3
     g_v: float
     n_v: float
-    k: float
     aa: float
 
 
@@ -168,13 +173,14 @@ def lobe_adjoint(p: Point, o: Lobe, f0: float, v_f: float, v_n_w: float, sum: Po
     n_H = p.n_v + o.n_w
     v_n_H = 2.0 * v_t_h2 * p.aa * n_H
     to.g_v += v_log_f
-    to.k -= v_log_f / o.g_w * (1.0 - o.n_w)
-    to.aa += v_log_f / p.aa + v_t_h2 * n_H * n_H
+    v_g_w = -v_log_f / o.g_w
+    root = 2.0 * o.g_w - o.n_w
+    to.aa += v_log_f / p.aa + v_t_h2 * n_H * n_H + v_g_w * (1.0 - o.n_w * o.n_w) / (4.0 * root)
     to.n_v += v_n_H
     m = 1.0 - o.vh
     v_HH = 2.0 * v_log_f / o.HH - v_f * o.rest * 5.0 * (1.0 - f0) * m * m * m * m / (8.0 * o.vh)
     v_C = 2.0 * v_t_h2 * o.C
-    to.n += wp.cross(p.v + o.w, v_C) + (v_n_w + v_n_H - v_log_f / o.g_w * (1.0 - p.k)) * o.w
+    to.n += wp.cross(p.v + o.w, v_C) + (v_n_w + v_n_H + v_g_w * 0.5 * (1.0 + (1.0 - p.aa) * o.n_w / root)) * o.w
     to.v += wp.cross(v_C, p.n) + 2.0 * v_HH * o.w
     return to
 
@@ -186,9 +192,11 @@ def point_adjoint(p: Point, sum: PointSums, roughness: float) -> vec32:
     row = vec32()
     v_g_v = -sum.g_v / p.g_v
     v_n_v = sum.n_v
+    facing = wp.max(p.n_v, 0.0)
+    root = 2.0 * p.g_v - facing
     if p.n_v >= 0.0:
-        v_n_v += v_g_v * (1.0 - p.k)
-    v_k = sum.k + v_g_v * (1.0 - wp.max(p.n_v, 0.0))
+        v_n_v += v_g_v * 0.5 * (1.0 + (1.0 - p.aa) * facing / root)
+    v_aa = sum.aa + v_g_v * (1.0 - facing * facing) / (4.0 * root)
     v_n = sum.n + v_n_v * p.v
     v_v = sum.v + v_n_v * p.n
     for a in range(3):
@@ -196,7 +204,7 @@ def point_adjoint(p: Point, sum: PointSums, roughness: float) -> vec32:
         row[3 + a] = v_v[a]
         row[6 + a] = sum.albedo[a]
     if roughness >= ROUGHNESS_MIN:
-        row[9] = 4.0 * p.r * p.r * p.r * sum.aa + 0.25 * (p.r + 1.0) * v_k
+        row[9] = 4.0 * p.r * p.r * p.r * v_aa
     return row
 
 

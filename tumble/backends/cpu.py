@@ -123,7 +123,9 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_results: Any) -> tuple[Tensor | None, ...]:
         r, inputs = ctx.raster, ctx.saved_tensors[: len(_INPUTS)]
         seeds = [None if v is None else v.contiguous() for v in v_results[: len(_SEEDED)]]
-        gradients = [torch.empty_like(x) for x in inputs[:6]]
+        # Where geometry and pose are given, half of the work is for nobody.
+        whole = any((*ctx.needs_input_grad[:5], *ctx.needs_input_grad[6:9]))
+        gradients = [torch.empty_like(x) if whole or x is inputs[5] else None for x in inputs[:6]]
         camera = torch.empty(CAMERA)
         kept = point(r, dict(zip((f"v_{name}" for name in _SEEDED), seeds, strict=True)), v_camera=camera)
         kept += point(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
@@ -133,6 +135,8 @@ class _Rasterize(torch.autograd.Function):
             camera_parts=torch.empty(r.threads * CAMERA),
         )
         _native.library().raster_adjoint(ctypes.byref(r))
+        if not whole:
+            return (*gradients, *(None for _ in range(6)))
         R, t, focal = camera.split([9, 3, 4])
         return (*gradients, R.view(3, 3), t, focal, None, None, None)
 

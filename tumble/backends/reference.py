@@ -274,16 +274,15 @@ def shade(
         standing = ~unpack(visibility, d) & (blocker >= 0)
         arriving = torch.where(standing[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
     a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
-    k = (roughness.clamp(min=ROUGHNESS_MIN)[:, None] + 1) ** 2 / 8
     n_w = normal @ directions.T
     n_v = (normal * view).sum(-1, keepdim=True)
     HH = 2 * (1 + view @ directions.T)
-    exists = HH > 1e-6
+    exists = (HH > 1e-6) & (n_v > 0)
     HH = torch.where(exists, HH, 1)
     H = view[:, None] + directions
     t = (torch.linalg.cross(normal[:, None], H).square().sum(-1) + a * a * (n_v + n_w) ** 2) / HH
     fresnel = f0 + (1 - f0) * (1 - 0.5 * HH.sqrt()) ** 5
-    g_v, g_w = (x.clamp(min=0) * (1 - k) + k for x in (n_v, n_w))
+    g_v, g_w = (0.5 * (x + (a * a + (1 - a * a) * x * x).sqrt()) for x in (n_v.clamp(min=0), n_w.clamp(min=0)))
     specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
     lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]
     return albedo / math.pi * lit.sum(1) + torch.einsum("pd,pdc->pc", specular, lit)

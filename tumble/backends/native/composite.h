@@ -263,6 +263,14 @@ INLINE void add_channels(float* to, const vf* w, const float (*rows)[N]) {
     }
 }
 
+// A Gaussian's share of its corners' gradients.
+template <int C>
+INLINE void add_corners(float* out, vf w, const Corners& c, const Seeds<C>& s) {
+    vf wu = w * c.u, w1 = w - wu, w11 = wu * c.v, w01 = w1 * c.v;
+    const vf parts_of_w[4] = {w1 - w01, wu - w11, w01, w11};
+    add_channels<4>(out + GEOMETRY + PADDED<6>, parts_of_w, s.feature_rows);
+}
+
 template <int C>
 static void adjoint_block(const Raster& r, const Block& b, const int* list, int count, float* parts) {
     Seeds<C> s;
@@ -299,9 +307,7 @@ static void adjoint_block(const Raster& r, const Block& b, const int* list, int 
             v_dx = zu * f[UX] + zv * f[VX], v_dy = zu * f[UY] + zv * f[VY];
             x[G_UX] = zu * p.dx, x[G_UY] = zu * p.dy, x[G_EU] = v_u * zeta_1;
             x[G_VX] = zv * p.dx, x[G_VY] = zv * p.dy, x[G_EV] = v_v * zeta_1;
-            vf wu = w * c.u, w1 = w - wu, w11 = wu * c.v, w01 = w1 * c.v;
-            const vf parts_of_w[4] = {w1 - w01, wu - w11, w01, w11};
-            add_channels<4>(out + GEOMETRY + PADDED<6>, parts_of_w, s.feature_rows);
+            add_corners<C>(out, w, c, s);
         }
         add_channels<1>(out + GEOMETRY, &w, s.fixed_rows);
         rem -= w * value;
@@ -317,6 +323,24 @@ static void adjoint_block(const Raster& r, const Block& b, const int* list, int 
         x[G_CY] = -(v_dy + f[KB] * Kx + 2.0f * f[KC] * Ky + v_l * f[BY]);
         x[G_KAPPA] = v_q * p.K, x[G_OPACITY] = v_alpha * p.G, x[G_PZ] = v_depth * zeta;
         for (int j = 0; j < GEOMETRY; j += LANES) store(out + j, load(out + j) + sums_of(x + j));
+        T -= w;
+        if (!any(T >= r.T_min)) break;
+    }
+}
+
+// The same for the corners alone, where nobody asks for the geometry's gradient: its weights are given.
+template <int C>
+static void corner_adjoint_block(const Raster& r, const Block& b, const int* list, int count, float* parts) {
+    Seeds<C> s;
+    seed<C>(r, b, s);
+    vf T = keep(b.inside, splat(1.0f));
+    for (int i = 0; i < count; i++) {
+        const float* f = r.record + (i64)list[i] * r.record_size;
+        Peak p;
+        if (!peak_at(f, b, T >= r.T_min, r.alpha_min, r.alpha_max, p)) continue;
+        vf w = p.alpha * T;
+        Corners c = corners_at(f, p, p.l * p.r, lift(f, p));
+        add_corners<C>(parts + (i64)list[i] * r.gradient_size, w, c, s);
         T -= w;
         if (!any(T >= r.T_min)) break;
     }
@@ -369,6 +393,7 @@ static void adjoint_share(Raster& r, int share) {
     clear(parts, (i64)4 * r.n * r.gradient_size);
     for_blocks(r, share, [&](const Block& b, const int* list, int count) {
         if (b.corner) prefetch_tile(r, b.tile + r.threads);
-        if (count) adjoint_block<C>(r, b, list, count, parts);
+        if (count && r.v_means) adjoint_block<C>(r, b, list, count, parts);
+        if (count && !r.v_means) corner_adjoint_block<C>(r, b, list, count, parts);
     });
 }

@@ -352,6 +352,7 @@ static void project_adjoint_share(Raster& r, int share) {
             for (int k = 0; k < 4; k++, corner += r.corner_width)
                 for (int ch = 0; ch < r.c; ch++) v_corners[k * r.c + ch] = corner[ch];
         }
+        if (!r.v_means) continue;
         vf g[GEOMETRY + 6];
         for (int j = 0; j < GEOMETRY + 6; j++) g[j] = load(lanes[j]);
         vi drawn = load(drawn_lanes) > 0.5f;

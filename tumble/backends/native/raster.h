@@ -37,7 +37,7 @@ struct Raster {
     int *touched, *dominant;
     float* weight_parts;
     int* touched_parts;
-    // Gradients: in, per share, out.
+    // Gradients: in, per share, out. Without v_means only those of the corners are made.
     const float *v_rgb, *v_alpha, *v_depth, *v_depth_var, *v_normal, *v_features;
     float *parts, *camera_parts;
     float *v_means, *v_quats, *v_scales, *v_opacity, *v_sh, *v_corners, *v_camera;

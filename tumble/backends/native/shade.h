@@ -21,8 +21,10 @@ struct Shade {
 
 // One point, lane-independent.
 struct Point {
-    float n[3], v[3], C[3], n_v, r, a, aa, k, g_v, scale;   // C = n x v
+    float n[3], v[3], C[3], n_v, r, a, aa, g_v, slope_v, scale;   // C = n x v, slope_v = dg_v / dn_v
 };
+// Smith's g(x) = (x + root) / 2 with root = sqrt(aa + (1 - aa) x^2).
+INLINE vf smith_root(vf x, float aa) { return vsqrt(aa + (1 - aa) * x * x); }
 INLINE Point point_at(const Shade& s, i64 p) {
     Point o;
     for (int i = 0; i < 3; i++) o.n[i] = s.normal[3 * p + i], o.v[i] = s.view[3 * p + i];
@@ -30,15 +32,16 @@ INLINE Point point_at(const Shade& s, i64 p) {
     o.C[2] = o.n[0] * o.v[1] - o.n[1] * o.v[0];
     o.n_v = o.n[0] * o.v[0] + o.n[1] * o.v[1] + o.n[2] * o.v[2];
     o.r = fmax2(s.roughness[p], s.roughness_min);
-    o.a = o.r * o.r, o.aa = o.a * o.a, o.k = (o.r + 1) * (o.r + 1) * 0.125f;
-    o.g_v = fmax2(o.n_v, 0) * (1 - o.k) + o.k;
+    o.a = o.r * o.r, o.aa = o.a * o.a;
+    float facing = fmax2(o.n_v, 0), root = smith_root(splat(facing), o.aa)[0];
+    o.g_v = 0.5f * (facing + root), o.slope_v = 0.5f + 0.5f * (1 - o.aa) * facing / root;
     o.scale = 12.566370614f / s.n_directions;
     return o;
 }
 
 // One point under a vector of directions.
 struct Lobe {
-    vf w[3], n_w, HH, C[3], n_H, inv_num, t_num, vh, m, m4, F, g_w, rest, f;   // f = F rest
+    vf w[3], n_w, HH, C[3], n_H, inv_num, t_num, vh, m, m4, F, root_w, g_w, rest, f;   // f = F rest
     vi exists;
 };
 INLINE vf cosine(const Shade& s, const Point& p, int j, vf* w) {
@@ -47,13 +50,14 @@ INLINE vf cosine(const Shade& s, const Point& p, int j, vf* w) {
 }
 INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
     o.HH = 2.0f + 2.0f * (p.v[0] * o.w[0] + p.v[1] * o.w[1] + p.v[2] * o.w[2]);
-    o.exists = o.HH > 1e-6f;
+    o.exists = (o.HH > 1e-6f) & (splat(p.n_v) > 0.0f);
     o.HH = pick(o.exists, o.HH, splat(1.0f));
     o.C[0] = p.n[1] * o.w[2] - p.n[2] * o.w[1] + p.C[0], o.C[1] = p.n[2] * o.w[0] - p.n[0] * o.w[2] + p.C[1];
     o.C[2] = p.n[0] * o.w[1] - p.n[1] * o.w[0] + p.C[2];
     o.n_H = o.n_w + p.n_v;
     o.t_num = o.C[0] * o.C[0] + o.C[1] * o.C[1] + o.C[2] * o.C[2] + p.aa * o.n_H * o.n_H;   // t |H|^2
-    o.g_w = vmax(o.n_w, vf{}) * (1 - p.k) + p.k;
+    vf facing = vmax(o.n_w, vf{});
+    o.root_w = smith_root(facing, p.aa), o.g_w = 0.5f * (facing + o.root_w);
     o.vh = 0.5f * vsqrt(o.HH), o.m = 1.0f - o.vh;
     vf m2 = o.m * o.m;
     o.m4 = m2 * m2;
@@ -106,15 +110,15 @@ static void shade_share(const Shade& s, int share) {
 
 // Sums over directions that make a point's gradient.
 struct PointSums {
-    vf n[3], v[3], albedo[3], g_v, n_v, k, a;
+    vf n[3], v[3], albedo[3], g_v, n_v, aa, a;
 };
 
 INLINE void lobe_adjoint(const Shade& s, const Point& p, const Lobe& b, vf v_f, vf v_n_w, PointSums& sum) {
     vf over_f = v_f * b.f, v_num = -2.0f * over_f / b.t_num;   // d/d(t |H|^2)
     sum.g_v += over_f;
     vf v_g_w = -over_f / b.g_w, facing = vmax(b.n_w, vf{});
-    sum.k += v_g_w * (1.0f - facing);
-    v_n_w += v_g_w * (1 - p.k);
+    sum.aa += v_g_w * (1.0f - facing * facing) / (4.0f * b.root_w);
+    v_n_w += v_g_w * (0.5f + 0.5f * (1 - p.aa) * facing / b.root_w);
     sum.a += over_f * (2.0f / p.a) + v_num * (2.0f * p.a) * b.n_H * b.n_H;
     vf v_n_H = v_num * (2.0f * p.aa) * b.n_H;
     v_n_w += v_n_H, sum.n_v += v_n_H;
@@ -171,9 +175,10 @@ static void shade_adjoint_share(const Shade& s, int share) {
                 for (int ch = 0; ch < 3 && at >= 0; ch++) v_blocker[3 * (i64)at + ch] += lanes[ch][l];
             }
         }
-        float v_g_v = -sum_of(sum.g_v) / o.g_v, v_n_v = sum_of(sum.n_v) + (o.n_v >= 0 ? v_g_v * (1 - o.k) : 0);
-        float v_k = sum_of(sum.k) + v_g_v * (1 - fmax2(o.n_v, 0));
-        float v_r = sum_of(sum.a) * 2 * o.r + v_k * (o.r + 1) * 0.25f;
+        float v_g_v = -sum_of(sum.g_v) / o.g_v, v_n_v = sum_of(sum.n_v) + (o.n_v >= 0 ? v_g_v * o.slope_v : 0);
+        float facing = fmax2(o.n_v, 0), root = 2 * o.g_v - facing;
+        float v_aa = sum_of(sum.aa) + v_g_v * (1 - facing * facing) / (4 * root);
+        float v_r = sum_of(sum.a) * 2 * o.r + v_aa * 4 * o.a * o.r;
         s.v_roughness[p] = s.roughness[p] >= s.roughness_min ? v_r : 0;
         for (int i = 0; i < 3; i++) {
             s.v_normal[3 * p + i] = sum_of(sum.n[i]) + v_n_v * o.v[i];
