@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels import machine
-from tumble import evaluate, files
-from tumble.recipes import QUALITIES
-from tumble.reconstruct import predict_run, reconstruct
+from tumble import files
+from tumble.recipes import ABLATIONS, QUALITIES, Recipe
+from tumble.reconstruct import evaluate_run, reconstruct
 from tumble.synthesize import NOTE
 
 KEPT = (
@@ -37,27 +37,32 @@ def main() -> None:
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--runs", type=Path, required=True)
     parser.add_argument("--quality", choices=QUALITIES, default="draft")
+    parser.add_argument("--ablation", choices=ABLATIONS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     arguments = parser.parse_args()
     rows = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
     for capture in arguments.captures:
-        row = measure(capture, arguments.runs / capture.name, arguments.quality, arguments.seed)
+        recipe = replace(QUALITIES[arguments.quality], seed=arguments.seed)
+        about = {"quality": arguments.quality, "seed": arguments.seed}
+        if arguments.ablation:
+            recipe, about = ABLATIONS[arguments.ablation](recipe), about | {"ablation": arguments.ablation}
+        row = measure(capture, arguments.runs / "-".join([capture.name, *map(str, about.values())]), recipe, about)
         rows = [old for old in rows if old["made_by"] != row["made_by"] or old["recipe"] != row["recipe"]] + [row]
-        command = f"python -m benchmarks.decomposition CAPTURE... --runs FOLDER --quality {arguments.quality}"
+        command = "python -m benchmarks.decomposition CAPTURE... --runs FOLDER [--quality, --ablation, --seed]"
         files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
         shared = row["shared"]
         scores = f"albedo {shared[KEPT[0]]:6.2f}  relit {shared[KEPT[3]]:6.2f}"
         print(f"{capture.name:60} {scores}  {row['run_seconds']:.0f} s", flush=True)
 
 
-def measure(capture: Path, run: Path, quality: str, seed: int) -> dict[str, Any]:
+def measure(capture: Path, run: Path, recipe: Recipe, about: dict[str, Any]) -> dict[str, Any]:
     """One row: reconstruct if need be, predict, score."""
     begun = time.perf_counter()
-    reconstruct(capture, run, replace(QUALITIES[quality], seed=seed))
+    reconstruct(capture, run, recipe)
     seconds = time.perf_counter() - begun
     begun = time.perf_counter()
-    report = evaluate.run(predict_run(run, capture), capture, run)
+    report = evaluate_run(run, capture, run)
     note = files.read_json(capture / NOTE)
     regions = {
         region: {key: round(scores[key], 4) for key in KEPT if key in scores}
@@ -65,7 +70,7 @@ def measure(capture: Path, run: Path, quality: str, seed: int) -> dict[str, Any]
     }
     return {
         "made_by": {"model": note["model"], **note["options"]},
-        "recipe": {"quality": quality, "seed": seed},
+        "recipe": about,
         "run_seconds": round(seconds, 1),
         "score_seconds": round(time.perf_counter() - begun, 1),
         "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,

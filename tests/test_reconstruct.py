@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.test_hull import silhouettes
-from tumble import capture_writer, decompose, evaluate, files, recipes, reconstruct, refine, tree
+from tumble import average, capture_writer, decompose, evaluate, files, loop, recipes, reconstruct, refine, tree
 from tumble.asset import Asset
 from tumble.capture import OBJECT, Capture, Truth
 from tumble.datasets import folder
@@ -119,6 +119,38 @@ def test_a_run_is_scored_with_known_poses_as_they_are(finished: tuple[Path, Asse
     assert (finished[0] / "sheet.png").is_file()
 
 
+def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same run against the same truth, with and without given poses: its trajectory is the true one, nearly."""
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare)
+    document = files.read_json(bare / folder.TRANSFORMS)
+    for frame in document["frames"]:
+        if frame["split"] == "train":
+            del frame["transform_matrix"]
+    files.write_json(bare / folder.TRANSFORMS, document)
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    loads: list[Path] = []
+    load = folder.load
+    monkeypatch.setattr(folder, "load", lambda path: loads.append(path) or load(path))
+    free = reconstruct.evaluate_run(run, bare, run)
+    assert loads == [bare], "a capture is read once"
+    given = reconstruct.evaluate_run(run, capture, run)
+    assert "rotation alone" in free["notes"][0]
+    assert "poses were given" in given["notes"][0]
+    (run / "1-track").mkdir()
+    found = reconstruct.evaluate_run(run, capture, run)
+    assert "rotation alone" in found["notes"][0], "a run that estimated poses has a frame of its own"
+    for region, scores in given["regions"].items():
+        for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_fg_srgb"):
+            # Rays are drawn anew.
+            assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.3), key
+        key = "normal.mean_fg_degrees"
+        assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.5)
+
+
 def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path) -> None:
     taken = folder.load(capture)
     bare = Capture(taken.images, taken.masks, taken.camera, taken.names, taken.light)
@@ -164,3 +196,26 @@ def test_visibility_is_traced_again_only_when_geometry_has_moved(
     state.step = 7
     decompose._look_again(cfg, inputs, state)
     assert looks == [0], "looked at every LOOK_EVERY steps"
+
+
+def test_averaging_finds_the_colour_that_every_frame_shows(finished: tuple[Path, Asset], capture: Path) -> None:
+    """A surface that looks the same in all frames has that look as its albedo."""
+    taken = folder.load(capture)
+    grey = torch.where(taken.masks[..., None] == OBJECT, 128, 0).to(torch.uint8).repeat(1, 1, 1, 3)
+    flat = dataclasses.replace(taken, images=grey)
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    asset = loop.drive(average, average.Config(), decompose.Inputs(flat, refined), seed=0)
+    found = decompose.buffers_of(asset, refined.trajectory.T_cam_obj[0], taken.camera)
+    # The linear value of code 128; an eighth of a frame's colour may come from its soft edge.
+    inside = found.alpha > 0.99
+    assert inside.sum() > 20
+    torch.testing.assert_close(found.features["albedo"][inside].median(), torch.tensor(0.2159), atol=0.01, rtol=0)
+
+
+def test_without_corners_a_gaussian_has_one_material(finished: tuple[Path, Asset], capture: Path) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    cfg = dataclasses.replace(RECIPE.decompose, corners=False)
+    asset = loop.drive(decompose, cfg, decompose.Inputs(folder.load(capture), refined), seed=0)
+    albedo = asset.material.albedo
+    assert torch.equal(albedo, albedo[:, :1].expand_as(albedo))
+    assert finished[1].material.albedo.std(1).max() > 1e-3

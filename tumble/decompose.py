@@ -7,6 +7,7 @@ radiance changes with the pose). Visibility is cached per Gaussian over several 
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -28,12 +29,12 @@ from tumble.prefilter import prefilter
 from tumble.rasterize import rasterize
 from tumble.refine import Frame, Refined, frame
 from tumble.se3 import SE3
-from tumble.shade import Bounce, Surface, shade_split, surface
+from tumble.shade import AveragedBounce, Bounce, Surface, shade_split, surface
 from tumble.trace import Visibility, build, moved, open_sky, surface_points, visibility
 from tumble.trajectory import Trajectory, env_from_obj
-from tumble.tree import named_tensors
+from tumble.tree import detach, named_tensors
 
-VERSION = 2
+VERSION = 3
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 MOVED = 0.3
@@ -93,8 +94,11 @@ class Config:
     """Brightest albedo at the start (95 %); the light takes up the rest. Their product is all that stage 2 knows."""
     visibility: bool = True
     """Whether the object shadows itself."""
-    bounce: bool = True
-    """Whether the object lights itself."""
+    bounce: Literal["none", "average", "frame"] = "frame"
+    """How the object lights itself. average: with its mean colour over all frames, as in the paper; frame: with the
+    light of the frame, for that of a point changes as the object turns."""
+    corners: bool = True
+    """Whether material varies within a Gaussian, between its corners."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
 
@@ -127,7 +131,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     refined = inputs.refined
     # One factor for all channels: a saturated object has a channel that is dark for good reason.
     share = cfg.brightness / refined.albedo.amax(-1).quantile(0.95)
-    albedo = (refined.albedo * share).clamp(0.02, 0.98)
+    # Printed red has a green of 0.004: a start well above it would cost 0.6 dB, for the logit has far to go.
+    albedo = (refined.albedo * share).clamp(0.003, 0.98)
     light = coarse_light.environment(refined.light, cfg.rows)
     material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
     params = Params(
@@ -177,12 +182,12 @@ def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
     points = surface_points(gaussians, views, alpha_min=0.5)
     tracer = build(gaussians, params.gamma)
     seen = [
-        visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce)
+        visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce != "none")
         for directions in state.memory["directions"]
     ]
     state.memory["bits"] = torch.stack([v.bits for v in seen])
     state.memory |= {f"traced.{name}": x.detach().clone() for name, x in named_tensors(gaussians).items()}
-    if cfg.bounce:
+    if cfg.bounce != "none":
         state.memory["blocker"] = torch.stack([v.blocker for v in seen if v.blocker is not None])
 
 
@@ -197,7 +202,8 @@ def _look_again(cfg: Config, inputs: Inputs, state: State) -> None:
 
 def pose(params: Params, inputs: Inputs, number: int) -> SE3:
     """`T_cam_obj` of one frame."""
-    return SE3.exp(params.poses[number]) @ inputs.refined.trajectory.T_cam_obj[number]
+    base = inputs.refined.trajectory.T_cam_obj[number]
+    return SE3.exp(params.poses[number]) @ base if params.poses.requires_grad else base
 
 
 def buffers_of(asset: Asset | Params, T_cam_obj: SE3, camera: Camera) -> Buffers:
@@ -213,18 +219,32 @@ def buffers_of(asset: Asset | Params, T_cam_obj: SE3, camera: Camera) -> Buffers
     return replace(view, normal=view.normal + view.features["offset"])
 
 
+def uncornered(params: Params) -> Params:
+    """The same with one material per Gaussian, the mean of its corners."""
+
+    def mean(x: Tensor) -> Tensor:
+        return x.mean(1, keepdim=True).expand_as(x)
+
+    m = params.material
+    material = Material(mean(m.albedo_logits), mean(m.roughness_logits), mean(m.normal_offset), m.f0_logit)
+    return replace(params, material=material)
+
+
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
     _grow_light(cfg, state)
     _look_again(cfg, inputs, state)
     params, capture = state.params, inputs.capture
+    if state.step < cfg.warmup:
+        # Not yet trained: half of the rasterizer's backward pass is for nobody.
+        params = replace(params, gaussians=detach(params.gaussians), poses=params.poses.detach())
     number = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, number)
-    view = buffers_of(params, T_cam_obj, capture.camera)
+    view = buffers_of(params if cfg.corners else uncornered(params), T_cam_obj, capture.camera)
     truth = frame(capture, number, view.alpha)
     points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, truth, state.rng))
     R_env_obj = env_from_obj(T_cam_obj, capture.light)
-    shaded = _shaded(cfg, state, view, points, R_env_obj)
+    shaded = _shaded(cfg, state, params, view, points, R_env_obj)
     alpha = points.sample(view.alpha[..., None])
     rendered, photograph = (shaded * alpha)[None], points.sample(truth.image)[None]
     terms = {
@@ -249,10 +269,10 @@ def _draw(cfg: Config, view: Buffers, truth: Frame, rng: torch.Generator) -> Ten
     return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
 
 
-def _shaded(cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj: Tensor) -> Float[Tensor, "p 3"]:
-    params = state.params
+def _shaded(
+    cfg: Config, state: State, params: Params, view: Buffers, points: Surface, R_env_obj: Tensor
+) -> Float[Tensor, "p 3"]:
     seen = _seen(cfg, state, view.dominant.flatten()[points.pixels].clamp_min(0).long())
-    bounce = Bounce(params.material.albedo.mean(1), params.gaussians.normals) if cfg.bounce else None
     return shade_split(
         points,
         points.sample(view.features["albedo"]),
@@ -261,8 +281,16 @@ def _shaded(cfg: Config, state: State, view: Buffers, points: Surface, R_env_obj
         R_env_obj,
         seen,
         f0=params.material.f0,
-        bounce=bounce,
+        bounce=_bounce(cfg, params),
     )
+
+
+def _bounce(cfg: Config, params: Params) -> Bounce | AveragedBounce | None:
+    if cfg.bounce == "none":
+        return None
+    if cfg.bounce == "average":
+        return AveragedBounce(params.gaussians.sh[:, 0] / math.sqrt(4 * math.pi))
+    return Bounce(params.material.albedo.mean(1), params.gaussians.normals)
 
 
 def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:
@@ -271,7 +299,7 @@ def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:
     directions = memory["directions"][which]
     if not cfg.visibility:
         return open_sky(directions, len(index))
-    blocker = memory["blocker"][which] if cfg.bounce else None
+    blocker = memory["blocker"][which] if cfg.bounce != "none" else None
     return Visibility(directions, memory["bits"][which], blocker).gather(index)
 
 
@@ -312,7 +340,7 @@ def _grow_light(cfg: Config, state: State) -> None:
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable object."""
-    params = state.params
+    params = state.params if cfg.corners else uncornered(state.params)
     T_cam_obj = SE3.exp(params.poses) @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,
