@@ -12,18 +12,19 @@ PACKAGE = Path(__file__).parents[1] / "tumble"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS = [
-    {"tree", "named", "files"},
+    {"tree", "named", "files", "weights", "schedule"},
     {"se3", "directions", "harmonics", "images", "video", "backends"},
     {"brdf", "camera", "trajectory"},
     {"gaussians", "material", "environment", "buffers", "coarse_light"},
-    {"capture", "asset"},
-    {"rasterize", "trace", "volume"},
+    {"capture", "asset", "match"},
+    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels"},
     {"prefilter", "shade", "importance", "mesh", "hull"},
-    {"losses", "optim", "densify", "fields", "posenets", "metrics", "lpips", "matching"},
+    {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching"},
     {"loop"},
-    {"track", "lift", "refine", "decompose", "relight"},
+    {"track", "lift", "refine", "decompose", "average", "relight"},
     {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
-    | {"scoresheet", "evaluate", "export", "report", "viewer", "doctor", "demo", "demo_assets"},
+    | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "check"}
+    | {"scoresheet", "evaluate", "bake", "export", "report", "viewer", "doctor", "demo", "demo_assets"},
     {"recipes", "run", "reconstruct"},
     {"cli", "__main__"},
 ]
