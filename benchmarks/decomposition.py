@@ -26,6 +26,7 @@ KEPT = (
     "relit.psnr_fg_srgb",
     "relit.psnr_full_srgb",
     "image.psnr_fg_srgb",
+    "image.psnr_full_srgb",
     "normal.mean_fg_degrees",
     "roughness.rmse_fg",
     "silhouette.iou",
