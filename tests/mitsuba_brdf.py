@@ -52,15 +52,12 @@ def _register() -> None:
             a2 = self.roughness**4
             return a2 / (math.pi * dr.square(dr.square(noh) * (a2 - 1) + 1))
 
-        def _stretched(self, cosine: Any) -> Any:
-            """2 x / G1(x), Smith's."""
-            a2 = self.roughness**4
-            return cosine + dr.sqrt(a2 + (1 - a2) * dr.square(cosine))
-
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             nol, nov, noh, voh = self._cosines(si, wo)
             fresnel = self.f0 + (1 - self.f0) * (1 - voh) ** 5
-            geometry = self._stretched(nol) * self._stretched(nov)
+            # Smith's: 2 x / G1(x) for either direction.
+            a2 = self.roughness**4
+            geometry = (nol + dr.sqrt(a2 + (1 - a2) * nol * nol)) * (nov + dr.sqrt(a2 + (1 - a2) * nov * nov))
             value = self.albedo / math.pi + self._ndf(noh) * fresnel / geometry
             return mi.Spectrum(dr.select(active & (nol > 0) & (nov > 0), value * nol, 0))
 

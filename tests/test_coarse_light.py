@@ -55,3 +55,19 @@ def test_irradiance_and_highlight_come_from_one_light() -> None:
     error = (found.lookup(fine) - radiance).abs()
     assert error.mean() < 0.15
     torch.testing.assert_close(found.integral() / (4 * math.pi), light.glossy(n).mean(0), atol=0.02, rtol=0)
+
+
+def test_the_colour_and_its_gradients_are_those_of_the_formula() -> None:
+    rng = torch.Generator().manual_seed(0)
+    like = {"generator": rng, "dtype": torch.float64}
+    n, view = (torch.nn.functional.normalize(torch.randn(8, 3, **like), dim=-1) for _ in range(2))
+    # Both sides of the horizon; and a matrix that is no rotation, for its nine numbers are taken as free.
+    n_v = (n * view).sum(-1, keepdim=True)
+    assert 0 < (n_v > 0).sum() < 8
+    coefficients, albedo, R = torch.randn(16, 3, **like), torch.rand(8, 3, **like), torch.randn(3, 3, **like)
+    light = CoarseLight(coefficients)
+    fresnel = 0.04 + 0.96 * (1 - n_v.clamp(0, 1)) ** 5
+    expected = albedo * light.diffuse(n @ R.T) + fresnel * light.glossy((2 * n_v * n - view) @ R.T)
+    torch.testing.assert_close(coarse_light.radiance(light, albedo, n, view, R), expected)
+    inputs = [x.requires_grad_() for x in (coefficients, albedo, n, view, R)]
+    assert torch.autograd.gradcheck(lambda c, *rest: coarse_light.radiance(CoarseLight(c), *rest), inputs)

@@ -41,6 +41,18 @@ def test_the_normal_is_the_third_local_axis() -> None:
     assert torch.equal(gaussians.scales, torch.ones(1, 3))
 
 
+def test_normals_and_their_gradients_are_those_of_the_rotation() -> None:
+    rng = torch.Generator().manual_seed(0)
+    quats = torch.randn(9, 4, generator=rng, dtype=torch.float64).requires_grad_()
+
+    def normals(q: torch.Tensor) -> torch.Tensor:
+        return Gaussians(q[:, :3], q, q[:, :3], q[:, 0], q[:, None, :3]).normals
+
+    gaussians = Gaussians(quats[:, :3], quats, quats[:, :3], quats[:, 0], quats[:, None, :3])
+    torch.testing.assert_close(normals(quats), gaussians.R_obj_local[..., 2])
+    assert torch.autograd.gradcheck(normals, quats)
+
+
 def test_a_constant_material_has_the_values_asked_for() -> None:
     material = Material.constant(2, torch.tensor([0.1, 0.5, 0.8]), 0.3)
     torch.testing.assert_close(material.albedo, torch.tensor([0.1, 0.5, 0.8]).expand(2, 4, 3))

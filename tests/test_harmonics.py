@@ -10,7 +10,7 @@ from scipy import special
 from torch import Tensor
 
 from tumble.directions import fibonacci_sphere, texel_directions, texel_solid_angles
-from tumble.harmonics import basis, irradiance_coefficients, project
+from tumble.harmonics import basis, irradiance_coefficients, project, series
 
 DOUBLE = torch.float64
 
@@ -103,3 +103,12 @@ def test_irradiance_of_a_window_is_met_within_a_tenth() -> None:
 def test_irradiance_takes_fewer_degrees() -> None:
     c = torch.ones(4, 3)
     torch.testing.assert_close(irradiance_coefficients(c)[:, 0], torch.tensor([3.0, 2.0, 2.0, 2.0]) * math.pi / 3)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_series_is_the_basis_times_coefficients_with_its_gradients(degree: int) -> None:
+    d = fibonacci_sphere(9, dtype=DOUBLE).requires_grad_()
+    rng = torch.Generator().manual_seed(0)
+    c = torch.randn((degree + 1) ** 2, 3, generator=rng, dtype=DOUBLE).requires_grad_()
+    torch.testing.assert_close(series(c, d), basis(d, degree) @ c)
+    assert torch.autograd.gradcheck(series, (c, d))

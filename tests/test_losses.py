@@ -26,6 +26,17 @@ def test_equal_pictures_cost_nothing_and_unknown_pixels_do_not_count() -> None:
     assert losses.photometric(other, picture, torch.ones_like(valid), ssim_weight=0.2) > 0.01
 
 
+def test_a_window_of_a_picture_costs_what_the_picture_does() -> None:
+    """Black around; the window reaches the picture's top, and has room for SSIM's on the other sides."""
+    torch.manual_seed(0)
+    rendered, photograph = torch.zeros(2, 40, 50, 3, dtype=torch.float64)
+    rendered[:8, 20:29], photograph[:9, 21:28] = torch.rand(8, 9, 3), torch.rand(9, 7, 3)
+    valid = torch.ones(40, 50, 1)
+    whole = losses.photometric(rendered, photograph, valid, ssim_weight=0.2)
+    part = [x[:19, 10:39] for x in (rendered, photograph, valid)]
+    torch.testing.assert_close(losses.photometric(*part, ssim_weight=0.2, size=(40, 50)), whole)
+
+
 def test_only_saturated_pixels_forgive_brightness() -> None:
     linear = torch.tensor([[[1.5, 1.5, 0.2]]], requires_grad=True)
     photograph = torch.tensor([[[1.0, 0.9, 1.0]]])
@@ -105,6 +116,27 @@ def test_gaussians_off_the_surface_by_their_own_distance_project_to_nothing() ->
     assert losses.projection(moved, seen, depth, CAMERA, T_cam_obj, reach=0.1) == pytest.approx(0.05, abs=1e-4)
     far = Gaussians(means + 0.5 * n, quats, gaussians.log_scales, sdf, gaussians.sh)
     assert losses.projection(far, seen, depth, CAMERA, T_cam_obj, reach=0.1) == 0
+
+
+def test_what_a_view_does_not_show_or_lies_behind_it_is_not_projected() -> None:
+    T_cam_obj = SE3.from_rotation(SO3.exp(torch.tensor([0.2, 0.1, -0.3])), torch.tensor([0.0, 0.0, 4.0]))
+    T_cam_obj = SE3(T_cam_obj.wxyz.double(), T_cam_obj.xyz.double())
+    rng = torch.Generator().manual_seed(0)
+    means = 0.2 * torch.randn(6, 3, generator=rng, dtype=torch.float64)
+    means[4] = T_cam_obj.inverse().xyz  # in the camera itself
+    means[5] *= -30
+    sdf, quats = means[:, 0] * 0.1, torch.randn(6, 4, generator=rng, dtype=torch.float64)
+    seen = torch.tensor([True, True, False, True, True, True])
+    depth = torch.full((32, 40), 4.0, dtype=torch.float64)
+
+    def loss(means: torch.Tensor, sdf: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
+        gaussians = Gaussians(means, quats, means, sdf, means[:, None])
+        return losses.projection(gaussians, seen, depth, CAMERA, T_cam_obj, reach=1.0)
+
+    inputs = [x.detach().requires_grad_() for x in (means, sdf, quats)]
+    x_cam = T_cam_obj @ (means - sdf[:, None] * Gaussians(means, quats, means, sdf, means[:, None]).normals)
+    assert loss(*inputs).item() == pytest.approx(float((x_cam[[0, 1, 3], 2] - 4).abs().sum() / 5))
+    assert torch.autograd.gradcheck(loss, inputs)
 
 
 def test_depth_without_spread_costs_nothing() -> None:

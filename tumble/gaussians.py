@@ -6,6 +6,7 @@ Object frame, object radius = 1. The third local axis is the *normal*, signed ou
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -37,7 +38,7 @@ class Gaussians:
     @property
     def normals(self) -> Float[Tensor, "n 3"]:
         """Outward unit normals, object frame."""
-        return self.R_obj_local[..., 2]
+        return _ThirdAxis.apply(self.quats)
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
@@ -46,6 +47,28 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+
+class _ThirdAxis(torch.autograd.Function):
+    """The third column of the rotations of quaternions of any length but 0: quadratic in q, over |q|^2."""
+
+    @staticmethod
+    def forward(ctx: Any, quats: Tensor) -> Tensor:
+        w, x, y, z = q = quats.mT.contiguous()
+        length2 = (q * q).sum(0)
+        axis = torch.stack([x * z + w * y, y * z - w * x, w * w + z * z]).mul_(2 / length2)
+        axis[2] -= 1
+        ctx.save_for_backward(q, length2, axis)
+        return axis.mT
+
+    @staticmethod
+    def backward(ctx: Any, v_axis: Tensor) -> Tensor:  # type: ignore[override]
+        q, length2, axis = ctx.saved_tensors
+        w, x, y, z = q
+        a, b, c = v = v_axis.mT.contiguous()
+        quadratic = torch.stack([a * y - b * x + 2 * c * w, a * z - b * w, a * w + b * z, a * x + b * y + 2 * c * z])
+        along = (v * axis).sum(0) + c
+        return ((quadratic - along * q) * (2 / length2)).mT
 
 
 def opacity(sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor, " n"]:

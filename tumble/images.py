@@ -3,6 +3,8 @@
 Pixel centres lie at +0.5, so a resized picture covers the same area. Values are linear RGB unless a name says sRGB.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
@@ -21,10 +23,24 @@ def srgb_from_linear(linear: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
     Negative values, which the power cannot take, become 0, without gradient. Values above 1 follow the same power.
     """
-    linear = linear.clamp_min(0)
-    # The power has no finite gradient at 0: keep it away from there also where it is not used.
-    power = 1.055 * linear.clamp_min(LINEAR_KNEE) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= LINEAR_KNEE, 12.92 * linear, power)
+    return _SrgbFromLinear.apply(linear)
+
+
+class _SrgbFromLinear(torch.autograd.Function):
+    """The curve, whose derivative needs no second power."""
+
+    @staticmethod
+    def forward(ctx: Any, linear: Tensor) -> Tensor:
+        power = linear.clamp_min(LINEAR_KNEE).log_().mul_(1 / 2.4).exp_().mul_(1.055).sub_(0.055)
+        srgb = torch.where(linear <= LINEAR_KNEE, 12.92 * linear.clamp_min(0), power)
+        ctx.save_for_backward(linear, srgb)
+        return srgb
+
+    @staticmethod
+    def backward(ctx: Any, v: Tensor) -> Tensor:  # type: ignore[override]
+        linear, srgb = ctx.saved_tensors
+        slope = (srgb + 0.055) / (2.4 * linear.clamp_min(LINEAR_KNEE))
+        return v * torch.where(linear <= LINEAR_KNEE, 12.92 * (linear >= 0), slope)
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -75,11 +91,46 @@ def ssim_map(
     if min(x.shape[:2]) < window:
         raise ValueError(f"a picture of {x.shape[1]} x {x.shape[0]} is smaller than the window of {window} pixels")
     c1, c2 = ((k * range) ** 2 for k in STABILISERS)
-    moments = torch.stack([x, y, x * x + y * y, x * y])
-    mean_x, mean_y, power, product = _blur(moments, _gaussian(window, sigma).to(x))
-    means, mean_power = mean_x * mean_y, mean_x.square() + mean_y.square()
-    similar = (2 * means + c1) * (2 * (product - means) + c2)
-    return similar / ((mean_power + c1) * (power - mean_power + c2))
+    return _Similarity.apply(planes(x), planes(y), _gaussian(window, sigma), c1, c2).movedim(0, -1)
+
+
+class _Similarity(torch.autograd.Function):
+    """`ssim_map` of planes `[c h w]`, with its derivative written out: a third of the time."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, y: Tensor, weight: list[float], c1: float, c2: float) -> Tensor:
+        moments = torch.stack([x, y, x * x + y * y, x * y]).flatten(0, 1)
+        mean_x, mean_y, power, product = _blur(moments, weight).unflatten(0, (4, -1))
+        both, squares = mean_x * mean_y, mean_x.square() + mean_y.square()
+        upper = 2 * both + c1, 2 * (product - both) + c2
+        lower = squares + c1, power - squares + c2
+        similarity = upper[0] * upper[1] / (lower[0] * lower[1])
+        ctx.weight = weight
+        ctx.save_for_backward(x, y, mean_x, mean_y, *upper, *lower, similarity)
+        return similarity
+
+    @staticmethod
+    def backward(ctx: Any, v: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        x, y, mean_x, mean_y, a1, a2, b1, b2, similarity = ctx.saved_tensors
+        v_ratio, v_similarity = 2 * v / (b1 * b2), v * similarity
+        across, along = v_ratio * (a2 - a1), 2 * v_similarity * (1 / b2 - 1 / b1)
+        shared = [-v_similarity / b2, v_ratio * a1]
+        wanted = [ctx.needs_input_grad[0], ctx.needs_input_grad[1]]
+        own = [across * theirs + along * mine for mine, theirs in ((mean_x, mean_y), (mean_y, mean_x))]
+        own = [gradient for gradient, want in zip(own, wanted, strict=True) if want]
+        # The window is symmetric, so that its adjoint is itself, on planes with room for it.
+        room = functional.pad(torch.cat(own + shared), 4 * [len(ctx.weight) - 1])
+        back = iter(_blur(room, ctx.weight).split(len(x)))
+        first, second = (next(back) if want else None for want in wanted)
+        v_power, v_product = back
+        v_x = None if first is None else first + 2 * x * v_power + y * v_product
+        v_y = None if second is None else second + 2 * y * v_power + x * v_product
+        return v_x, v_y, None, None, None
+
+
+def planes(x: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "c h w"]:
+    """Each channel by itself in memory: whatever mixes channels is then several times as fast."""
+    return x.movedim(-1, 0).contiguous()
 
 
 def gradients(x: Float[Tensor, "h w c"]) -> tuple[Float[Tensor, "h w-1 c"], Float[Tensor, "h-1 w c"]]:
@@ -132,21 +183,24 @@ def crop(x: Shaped[Tensor, "h w *c"], box: Box) -> Shaped[Tensor, "i j *c"]:
     return x[top : top + height, left : left + width]
 
 
-def _gaussian(window: int, sigma: float) -> Float[Tensor, "{window}"]:
+def _gaussian(window: int, sigma: float) -> list[float]:
     offset = torch.arange(window, dtype=torch.float64) - (window - 1) / 2
     weight = (-0.5 * (offset / sigma).square()).exp()
-    return weight / weight.sum()
+    return (weight / weight.sum()).tolist()
 
 
-def _blur(x: Float[Tensor, "n h w c"], weight: Float[Tensor, " k"]) -> Float[Tensor, "n i j c"]:
-    """Filter rows and columns with the same weights, only where they fit."""
-    n, h, w, c = x.shape
-    # As channels of one picture: fourteen times as fast as a batch of pictures with one channel.
-    planes = x.movedim(-1, 1).reshape(1, n * c, h, w)
-    weights = weight.expand(n * c, 1, -1)
-    blurred = functional.conv2d(planes, weights[..., None], groups=n * c)
-    blurred = functional.conv2d(blurred, weights[..., None, :], groups=n * c)
-    return blurred.reshape(n, c, *blurred.shape[2:]).movedim(1, -1)
+def _blur(x: Float[Tensor, "n h w"], weight: list[float]) -> Float[Tensor, "n i j"]:
+    """Filter rows and columns with the same weights, only where they fit.
+
+    By shifted sums: a convolution of another size each time is prepared anew each time.
+    """
+    for axis in (1, 2):
+        size = x.shape[axis] - len(weight) + 1
+        blurred = x.narrow(axis, 0, size) * weight[0]
+        for i, w in enumerate(weight[1:], 1):
+            blurred.add_(x.narrow(axis, i, size), alpha=w)
+        x = blurred
+    return x
 
 
 def _overlaps(old: int, new: int) -> Float[Tensor, "{new} {old}"]:

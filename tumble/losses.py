@@ -7,13 +7,15 @@ enter no term.
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import grid_sample, pad
 
 from tumble.camera import Camera
 from tumble.gaussians import Gaussians
-from tumble.images import srgb_from_linear, ssim
+from tumble.images import planes, srgb_from_linear, ssim_map
 from tumble.se3 import SE3
 
+SSIM_MARGIN = 10
+"""Pixels by which the window of `images.ssim_map` reaches beyond one of its pixels, both sides together."""
 SATURATED = 254 / 255
 """Code value from which a photograph only says "at least this bright"."""
 
@@ -24,7 +26,7 @@ def developed(linear: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
     The sRGB curve goes on beyond 1, so that a pixel rendered too bright has a gradient; only where the photograph is
     saturated itself does a brighter rendering count as equal.
     """
-    srgb = srgb_from_linear(linear.clamp_min(0))
+    srgb = srgb_from_linear(linear)
     return torch.where((photograph >= SATURATED) & (srgb > photograph), photograph, srgb)
 
 
@@ -34,10 +36,19 @@ def photometric(
     valid: Float[Tensor, "h w 1"],
     *,
     ssim_weight: float,
+    size: tuple[int, int] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) L1 + w (1 - SSIM) over the picture (eq. 9)."""
+    """(1 - w) L1 + w (1 - SSIM) over the picture (eq. 9).
+
+    Args:
+        size: Height and width of the picture where only a window of it is given, outside of which both are black, as
+            is a margin of `SSIM_MARGIN` inside unless the picture ends there: the result is that of the whole picture.
+    """
+    height, width = size or rendered.shape[:2]
     rendered, photograph = rendered * valid, photograph * valid
-    return (1 - ssim_weight) * (rendered - photograph).abs().mean() + ssim_weight * (1 - ssim(rendered, photograph))
+    difference = (rendered - photograph).abs().sum() / (3 * height * width)
+    unlike = (1 - ssim_map(rendered, photograph)).sum() / (3 * (height - SSIM_MARGIN) * (width - SSIM_MARGIN))
+    return (1 - ssim_weight) * difference + ssim_weight * unlike
 
 
 def silhouette(
@@ -54,16 +65,24 @@ def silhouette(
 def surface_normals(
     depth: Float[Tensor, "h w"], covered: Bool[Tensor, "h w"], camera: Camera, T_cam_obj: SE3
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Normals of the depth map by central differences, object frame, and where all four neighbours are covered."""
-    x_cam = camera.unproject(camera.pixel_centers(), depth)
-    right = x_cam[1:-1, 2:] - x_cam[1:-1, :-2]
-    down = x_cam[2:, 1:-1] - x_cam[:-2, 1:-1]
-    # In OpenCV axes right x down points away from the camera.
-    n_cam = normalize(torch.linalg.cross(down, right), dim=-1)
-    known = covered[1:-1, 1:-1] & covered[1:-1, 2:] & covered[1:-1, :-2] & covered[2:, 1:-1] & covered[:-2, 1:-1]
-    pad = (1, 1, 1, 1)
-    n_obj = torch.nn.functional.pad((n_cam @ T_cam_obj.rotation.matrix()).movedim(-1, 0), pad).movedim(0, -1)
-    return n_obj, torch.nn.functional.pad(known, pad)
+    """Normals of the depth map by central differences, object frame, and where all four neighbours are covered.
+
+    With x = z (X, Y, 1) on the ray through a pixel, the cross product of the differences along both axes of the image
+    is a positive multiple of (p, q, -1 - p X - q Y), where p = fx (z_right - z_left) / (z_right + z_left) and q alike.
+    """
+    inner = covered[1:-1, 1:-1] & covered[1:-1, 2:] & covered[1:-1, :-2] & covered[2:, 1:-1] & covered[:-2, 1:-1]
+    known = pad(inner, (1, 1, 1, 1))
+    fx, fy, cx, cy = camera.fx_fy_cx_cy.to(depth)
+    height, width = depth.shape
+    X = (torch.arange(1, width - 1).to(depth) + (0.5 - cx)) / fx
+    Y = ((torch.arange(1, height - 1).to(depth) + (0.5 - cy)) / fy)[:, None]
+    right, left, below, above = depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]
+    p = fx * (right - left) / torch.where(inner, right + left, 1.0)
+    q = fy * (below - above) / torch.where(inner, below + above, 1.0)
+    n_cam = torch.stack([p, q, -1 - p * X - q * Y])
+    n_cam = n_cam / n_cam.square().sum(0).sqrt()  # never zero; torch's norm is slow over an outer axis
+    n_obj = T_cam_obj.rotation.matrix().mT @ n_cam.flatten(1)
+    return pad(n_obj.unflatten(1, p.shape), (1, 1, 1, 1)).movedim(0, -1), known
 
 
 def normal_consistency(
@@ -72,7 +91,10 @@ def normal_consistency(
     known: Bool[Tensor, "h w"],
 ) -> Float[Tensor, ""]:
     """1 - cosine between rendered normals and those of the rendered depth (eq. 10), averaged over the whole picture."""
-    return ((1 - (normalize(normal, dim=-1) * from_depth).sum(-1)) * known).mean()
+    # One plane per axis: sums over short rows are slow.
+    a, b = planes(normal), planes(from_depth)
+    cosine = (a * b).sum(0) / a.square().sum(0).clamp_min(1e-24).sqrt()
+    return ((1 - cosine) * known).mean()
 
 
 def variance(depth_var: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
@@ -82,8 +104,9 @@ def variance(depth_var: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
 
 def effective_rank(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     """Penalty on needles: 0 for discs and balls (eq. 12), with the mean thickness added, which is what flattens."""
-    share = torch.softmax(2 * log_scales, -1)
-    entropy = -(share * share.clamp_min(1e-12).log()).sum(-1)
+    # Three long rows: softmax over many short ones takes most of a millisecond.
+    log_share = (2 * log_scales.mT.contiguous()).log_softmax(0)
+    entropy = -(log_share.exp() * log_share).sum(0)
     needle = (-(entropy.exp() - 1).clamp_min(1e-4).log()).clamp_min(0)
     return needle.mean() + log_scales[:, 2].exp().mean()
 
@@ -114,10 +137,16 @@ def projection(
         depth: Rendered depth; no gradient flows to it.
         reach: Differences beyond this are another surface and do not count [object radius].
     """
-    x_cam = T_cam_obj @ (gaussians.means - gaussians.sdf[:, None] * gaussians.normals)[seen]
-    uv = camera.project(x_cam)
-    size = uv.new_tensor([camera.width, camera.height])
-    at = (uv / size * 2 - 1)[None, None]
-    surface = torch.nn.functional.grid_sample(depth.detach()[None, None], at.detach(), align_corners=False)[0, 0, 0]
-    error = (surface - x_cam[:, 2]).abs()
-    return torch.where((error < reach) & (surface > 0), error, 0.0).sum() / max(1, int(seen.sum()))
+    offset = gaussians.sdf[:, None] * gaussians.normals
+    R_cam_obj = T_cam_obj.rotation.matrix()
+    z = (gaussians.means - offset) @ R_cam_obj[2] + T_cam_obj.xyz[2]
+    with torch.no_grad():
+        xy = (gaussians.means - offset) @ R_cam_obj[:2].mT + T_cam_obj.xyz[:2]
+        uv = camera.project(torch.cat([xy, z[:, None]], -1))
+        at = (uv / uv.new_tensor([camera.width, camera.height]) * 2 - 1)[None, None]
+        surface = grid_sample(depth[None, None], at, align_corners=False)[0, 0, 0]
+        error = surface - z
+        counts = seen & (error.abs() < reach) & (surface > 0)
+        share = torch.where(counts, error.sign(), 0.0) / seen.sum().clamp_min(1)
+        surface = torch.where(counts, surface, 0.0)
+    return (share * (surface - z)).sum()

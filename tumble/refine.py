@@ -18,6 +18,7 @@ from tumble.camera import Camera
 from tumble.capture import OBJECT, UNKNOWN, Capture
 from tumble.coarse_light import CoarseLight
 from tumble.gaussians import Gaussians, constant_sh, opacity, sdf_from_opacity
+from tumble.images import crop, crop_box, planes
 from tumble.loop import State
 from tumble.rasterize import rasterize
 from tumble.se3 import SE3
@@ -216,7 +217,9 @@ def _facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
 
 def pose(params: Params, inputs: Inputs, number: int) -> SE3:
     """`T_cam_obj` of one frame."""
-    return SE3.exp(params.poses[number]) @ inputs.trajectory.T_cam_obj[number]
+    base = inputs.trajectory.T_cam_obj[number]
+    # Poses that are left as given have tangents of 0, which take a hundred small tensors to say nothing.
+    return SE3.exp(params.poses[number]) @ base if params.poses.requires_grad else base
 
 
 def render(
@@ -273,18 +276,37 @@ def _terms(
 ) -> dict[str, Tensor]:
     weights, gaussians = cfg.weights, params.points.gaussians
     ramp = min(1.0, progress / cfg.ramp)
+    full, size, seen, depth = camera, (camera.height, camera.width), view.weight > 0, view.depth
+    view, truth, camera, share = _window(view, truth, camera)
     image = losses.developed(view.rgb, truth.image)
     from_depth, known = losses.surface_normals(view.depth, view.alpha > 0.5, camera, T_cam_obj)
-    seen = view.weight > 0
     return {
-        "render": losses.photometric(image, truth.image, truth.valid, ssim_weight=cfg.ssim),
-        "mask": weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
-        "normal": ramp * weights.normal * losses.normal_consistency(view.normal, from_depth, known),
-        "variance": ramp * weights.variance * losses.variance(view.depth_var),
+        "render": losses.photometric(image, truth.image, truth.valid, ssim_weight=cfg.ssim, size=size),
+        "mask": share * weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
+        "normal": share * ramp * weights.normal * losses.normal_consistency(view.normal, from_depth, known),
+        "variance": share * ramp * weights.variance * losses.variance(view.depth_var),
         "rank": weights.rank * losses.effective_rank(gaussians.log_scales),
         "gamma": weights.gamma * losses.sharpness(gaussians.sdf, params.gamma, floor=cfg.gamma_floor) * 1e-2,
-        "proj": weights.proj * losses.projection(gaussians, seen, view.depth, camera, T_cam_obj, reach=0.1),
+        "proj": weights.proj * losses.projection(gaussians, seen, depth, full, T_cam_obj, reach=0.1),
     }
+
+
+def _window(view: Buffers, truth: Frame, camera: Camera) -> tuple[Buffers, Frame, Camera, float]:
+    """The part of a view beyond which rendering and photograph are black, and its share of the picture.
+
+    Means over the picture are those over the window times the share: often a third of the work.
+    """
+    shown = (view.alpha.detach() > 0) | (truth.image > 0).any(-1) | (truth.mask > 0)
+    if not shown.any():
+        return view, truth, camera, 1.0
+    box = crop_box(shown, losses.SSIM_MARGIN)
+    cut = replace(
+        view,
+        **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
+        rgb=planes(crop(view.rgb, box)).movedim(0, -1),
+    )
+    seen = Frame(planes(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box))
+    return cut, seen, camera.cropped(*box), box[2] * box[3] / shown.numel()
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ motions, `(v, omega)`. `exp` is smooth everywhere; `log` up to the half turn, wh
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, overload
 
 import torch
@@ -96,13 +97,11 @@ class SO3:
 
     def matrix(self) -> Float[Tensor, "*b 3 3"]:
         """Rotation matrices, `R @ x_b = x_a` for column vectors."""
-        w, x, y, z = self.wxyz.unbind(-1)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return torch.stack([torch.stack(row, -1) for row in rows], -2)
+        q = self.wxyz
+        products = (q[..., :, None] * q[..., None, :]).flatten(-2)
+        # Of few tensors: a stage takes the matrix of a single pose several times per step.
+        of_products, constant = _matrix_of_products(q.dtype, q.device)
+        return (products @ of_products + constant).unflatten(-1, (3, 3))
 
     def inverse(self) -> "SO3":
         """`R_b_a`."""
@@ -261,6 +260,22 @@ def umeyama(x_b: Float[Tensor, "n 3"], y_a: Float[Tensor, "n 3"]) -> tuple[Float
     # trace(R^T covariance): singular values summed, the last negative where a reflection would fit better.
     scale = (R_a_b * covariance).sum() / centred_b.square().sum(-1).mean()
     return scale, SO3.from_matrix(R_a_b), mean_a - scale * (R_a_b @ mean_b)
+
+
+@cache
+def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "16 9"], Float[Tensor, "9"]]:
+    """How the entries of a rotation matrix, row by row, follow from the products of all pairs of w, x, y, z."""
+    w, x, y, z = range(4)
+    terms = [
+        [(y, y, -2), (z, z, -2)], [(x, y, 2), (w, z, -2)], [(x, z, 2), (w, y, 2)],
+        [(x, y, 2), (w, z, 2)], [(x, x, -2), (z, z, -2)], [(y, z, 2), (w, x, -2)],
+        [(x, z, 2), (w, y, -2)], [(y, z, 2), (w, x, 2)], [(x, x, -2), (y, y, -2)],
+    ]  # fmt: skip
+    table = torch.zeros(4, 4, 9, dtype=dtype, device=device)
+    for entry, sums in enumerate(terms):
+        for i, j, factor in sums:
+            table[i, j, entry] = factor
+    return table.flatten(0, 1), torch.eye(3, dtype=dtype, device=device).flatten()
 
 
 def _smooth(x2: Tensor, series: tuple[float, ...], closed: Callable[[Tensor], Tensor]) -> Tensor:
