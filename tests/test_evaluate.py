@@ -127,7 +127,7 @@ def the_truth(path: Path) -> Prediction:
 def score(capture_path: Path, **changes: Any) -> dict[str, Any]:
     """The scores of the truth with some parts changed; without LPIPS, which takes most of the time."""
     changed = dataclasses.replace(the_truth(capture_path), **changes)
-    return evaluate.compare(changed, *load(capture_path), [], units="arbitrary")
+    return evaluate.compare(changed, *load(capture_path), [])
 
 
 def everything(report: dict[str, Any]) -> dict[str, float]:
@@ -295,11 +295,10 @@ def test_in_metres_the_tolerance_is_ten_centimetres(tmp_path: Path) -> None:
     assert report["capture"]["units"] == "m"
 
 
-def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_unit_is_refused(tmp_path: Path, perfect_path: Path) -> None:
     inches = rewritten(tmp_path, lambda document: document.update(units="inch"))
-    the_truth(inches).write(tmp_path / "mine")
     with pytest.raises(BadFile, match=r"transforms\.json.*'inch'.*m, arbitrary"):
-        evaluate.run(tmp_path / "mine", inches, tmp_path / "out")
+        evaluate.run(perfect_path, inches, tmp_path / "out")
 
 
 def test_positions_on_a_line_are_not_scored_and_the_report_says_why(tmp_path: Path) -> None:

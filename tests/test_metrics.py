@@ -446,6 +446,47 @@ def test_lost_frames_count_as_wrong_rotations() -> None:
     assert scores["rotation_below_2_percent"] == pytest.approx(75)
 
 
+def test_the_longest_run_ends_at_bad_and_at_lost_frames() -> None:
+    """Frame 5 is turned by 40 degrees, frames 8 and 9 are lost: of 0 1 2 3 4 | 6 7 | 10 11 the first run is longest."""
+    truth = a_path(12)
+    kept = [0, 1, 2, 3, 4, 5, 6, 7, 10, 11]
+    offset = torch.zeros(10, 6, dtype=torch.float64)
+    offset[5, 3] = math.radians(40)
+    predicted = Trajectory(SE3.exp(offset) @ truth.select(kept).T_cam_obj, "camera")
+    scores = metrics.rotation_scores(predicted, truth.select(kept), kept, lost=2)
+    assert scores["rotation_longest_run_percent"] == pytest.approx(100 * 5 / 12)
+    scores = metrics.rotation_scores(truth, truth)
+    assert scores["rotation_longest_run_percent"] == 100
+
+
+def test_registration_puts_the_object_where_cameras_see_it() -> None:
+    """Under drift, shown points stay nearer to the true ones than after the alignment of camera positions."""
+    truth = a_path(40)
+    drift = torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None] * torch.tensor([0.0, 0.2, 0.1], dtype=torch.float64)
+    zero = torch.zeros(40, 3, dtype=torch.float64)
+    predicted = disguised(Trajectory(truth.T_cam_obj @ SE3.from_rotation(SO3.exp(drift), zero), "camera"))
+    x_true = torch.randn(50, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    disguise = metrics.align(truth, disguised(truth))
+    x_pred = disguise.scale * (disguise.R_true_pred @ x_true) + disguise.shift
+
+    def off(found: metrics.Similarity) -> float:
+        shown = found.to_prediction(truth).T_cam_obj[:, None] @ x_pred * found.scale
+        return float((shown - truth.T_cam_obj[:, None] @ x_true).norm(dim=-1).mean())
+
+    assert off(metrics.register(predicted, truth)) < 0.02
+    assert off(metrics.align(predicted, truth)) > 0.05
+
+
+def test_registration_needs_an_object_that_turns() -> None:
+    still = a_path(10).select([0] * 10)
+    with pytest.raises(ValueError, match="hardly turns"):
+        metrics.register(still, still)
+    slow = SO3.exp(torch.linspace(0, 1e-3, 10, dtype=torch.float64)[:, None] * torch.tensor([0.0, 1, 0]).double())
+    path = Trajectory(SE3.from_rotation(slow, torch.tensor([0.0, 0, 4]).double()), "camera")
+    with pytest.raises(ValueError, match="hardly turns"):
+        metrics.register(path, path)
+
+
 def test_one_bad_frame_spoils_the_two_motions_that_touch_it() -> None:
     """Frame 4 of 11, turned by 3 degrees, or shifted by 0.2, before the camera: two of ten motions are off by that."""
     truth = a_path(11)

@@ -6,6 +6,7 @@ what they show, else "sphere" (format.md).
 """
 
 from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, UInt8
@@ -17,6 +18,8 @@ from tumble.trajectory import Light, Trajectory
 
 OBJECT, UNKNOWN, BACKGROUND = 255, 128, 0
 REGIONS = ("shared", "sphere")
+Units = Literal["m", "arbitrary"]
+UNITS: tuple[str, ...] = get_args(Units)
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,12 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def select(self, frames: list[int]) -> "Capture":
+        """Some of the frames, in the order given."""
+        names = tuple(self.names[i] for i in frames)
+        trajectory = self.trajectory.select(frames) if self.trajectory else None
+        return Capture(self.images[frames], self.masks[frames], self.camera, names, self.light, trajectory)
 
 
 @dataclass(frozen=True)
@@ -77,9 +86,22 @@ class Truth:
     """The lights of `relit`, object frame."""
     poses: Trajectory | None = None
     """True poses of the training frames."""
+    pose_names: tuple[str, ...] = ()
+    """Names of the training frames that `poses` belong to, in order; empty: of all."""
+    units: Units = "arbitrary"
+    """Of the poses: metres, or nobody knows."""
+    setting: str | None = None
+    """A label for reports: "handheld", "turntable", "dome"."""
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def posed(self, capture: Capture) -> dict[str, int]:
+        """The training frames of its capture that have a true pose, in order, with their place in `poses`."""
+        if self.poses is None:
+            return {}
+        places = {name: place for place, name in enumerate(self.pose_names or capture.names)}
+        return {name: places[name] for name in capture.names if name in places}
 
     def views(self, region: str) -> list[int]:
         """Indices of the evaluation views of one region, in order."""

@@ -5,6 +5,7 @@ docs/metrics.md why. The number of a region is the mean of its views' numbers; r
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,12 @@ from torch import Tensor
 
 from tumble import __version__, files, lpips, metrics, scoresheet
 from tumble.capture import REGIONS, UNKNOWN, Capture, Truth
-from tumble.datasets import folder
+from tumble.datasets import which
 from tumble.files import BadFile
 from tumble.prediction import Prediction
 
 SMALLEST = 11
 """Least height and width of a capture that can be scored [pixels]."""
-UNITS = ("m", "arbitrary")
 TOLERANCE_METRES, TOLERANCE_SHARE = 0.1, 0.1
 """Position error at which a frame is worth nothing: 10 cm, or without metres 10 % of the mean camera distance."""
 IDENTITY = 1e-3
@@ -57,6 +57,7 @@ PROTOCOLS = {
     "rotation_below_2_percent": "training frames with a rotation error below 2 degrees, lost frames wrong [%]",
     "rotation_below_5_percent": "training frames with a rotation error below 5 degrees, lost frames wrong [%]",
     "rotation_below_10_percent": "training frames with a rotation error below 10 degrees, lost frames wrong [%]",
+    "rotation_longest_run_percent": "most training frames in a row with a rotation error below 10 degrees [% of all]",
 }
 PREFIXES = {
     "albedo": "predicted albedo times albedo_scale (per-channel median of truth / prediction, foreground of all views)",
@@ -67,43 +68,68 @@ PREFIXES = {
 }
 
 
-def run(prediction: Path, capture: Path, out: Path, *, vgg: Path | None = None) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Subject:
+    """A capture with the truth that predictions about it are scored against."""
+
+    path: Path
+    capture: Capture
+    truth: Truth
+
+
+def subject(path: Path) -> Subject:
+    """Read a capture that can be scored, in any layout of `datasets`.
+
+    Raises:
+        BadFile: A file breaks a rule, or there is no truth.
+    """
+    reader = which(path)
+    capture, truth = reader.load(path), reader.load_truth(path)
+    if truth is None:
+        raise BadFile(path, "has no truth to score against", "no evaluation views, no true light, no true poses")
+    if min(capture.camera.height, capture.camera.width) < SMALLEST:
+        raise BadFile(path, f"has pictures smaller than {SMALLEST} x {SMALLEST}", "SSIM has no window to fit in")
+    return Subject(path, capture, truth)
+
+
+def run(
+    prediction: Path,
+    capture: Path | Subject,
+    out: Path,
+    *,
+    vgg: Path | None = None,
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
     """Score a prediction against the truth of a capture; write report.json and sheet.png, and return the report.
 
     Args:
         prediction: Folder of docs/prediction.md. What it lacks is noted in the report and not scored.
-        capture: Capture folder with truth (docs/format.md).
+        capture: Where the capture with its truth is, or what `subject` read there.
         out: Folder for report.json and sheet.png; made when it is not there, and untouched when anything fails.
         vgg: LPIPS weights of VGG-16 (.npz or .safetensors); adds `lpips_*_vgg` to the AlexNet numbers.
+        notes: Sentences that belong into the report, on how the prediction was made.
 
     Raises:
         BadFile: A file of either folder breaks a rule, or the capture has no truth.
     """
-    frames, truth = folder.load(capture), folder.load_truth(capture)
-    if truth is None:
-        raise BadFile(capture, "has no truth to score against", "no evaluation views, no true light, no true poses")
-    if min(frames.camera.height, frames.camera.width) < SMALLEST:
-        raise BadFile(capture, f"has pictures smaller than {SMALLEST} x {SMALLEST}", "SSIM has no window to fit in")
-    predicted = Prediction.read(prediction, frames, truth)
-    about = _about(capture, frames, truth)
+    known = subject(capture) if isinstance(capture, Path) else capture
+    predicted = Prediction.read(prediction, known.capture, known.truth)
     networks = [lpips.read()] + ([lpips.read(vgg)] if vgg else [])
-    scores = compare(predicted, frames, truth, networks, units=about["units"])
-    report = {"tumble": __version__, "prediction": prediction.resolve().name, "capture": about, **scores}
-    picture = scoresheet.draw(report, predicted, truth)
+    scores = compare(predicted, known.capture, known.truth, networks)
+    scores["notes"] = [*notes, *scores["notes"]]
+    report = {"tumble": __version__, "prediction": prediction.resolve().name, "capture": _about(known), **scores}
+    picture = scoresheet.draw(report, predicted, known.truth)
     files.write_png(out / "sheet.png", picture)
     files.write_json(out / "report.json", report)
     return report
 
 
 @torch.no_grad()
-def compare(
-    predicted: Prediction, capture: Capture, truth: Truth, networks: Sequence[lpips.Network], *, units: str
-) -> dict[str, Any]:
+def compare(predicted: Prediction, capture: Capture, truth: Truth, networks: Sequence[lpips.Network]) -> dict[str, Any]:
     """All scores of a prediction: by region, light, poses, by view; with their protocols and notes on what is absent.
 
     Args:
         networks: For LPIPS, one or more.
-        units: "m" when the capture's poses are in metres, else "arbitrary".
     """
     notes = _absences(predicted, truth)
     scale = _scale(predicted, truth, notes)
@@ -115,7 +141,7 @@ def compare(
         "albedo_scale": None if scale is None else scale.tolist(),
         "regions": {region: _mean([rows[i] for i in truth.views(region)]) for region in REGIONS if truth.views(region)},
         "light": {f"light.{key}": value for key, value in light.items()},
-        "poses": _pose_scores(predicted, capture, truth, units, notes),
+        "poses": _pose_scores(predicted, capture, truth, notes),
     }
     keys = {key for part in (*scores["regions"].values(), scores["light"], scores["poses"]) for key in part}
     return {
@@ -141,21 +167,17 @@ def protocol(key: str) -> str | None:
     return "; ".join(sentence for sentence in sentences if sentence)
 
 
-def _about(capture: Path, frames: Capture, truth: Truth) -> dict[str, Any]:
+def _about(known: Subject) -> dict[str, Any]:
     """What was scored: facts of the capture, none of them about the machine."""
-    path = capture / folder.TRANSFORMS
-    document = files.read_json(path)
-    units = document.get("units", "arbitrary")
-    if units not in UNITS:
-        raise BadFile(path, f'"units" is {units!r}', f"it is one of {', '.join(UNITS)}")
+    capture, truth = known.capture, known.truth
     return {
-        "name": capture.resolve().name,
-        "setting": document.get("setting"),
-        "light": frames.light,
-        "units": units,
-        "width": frames.camera.width,
-        "height": frames.camera.height,
-        "frames": len(frames),
+        "name": known.path.resolve().name,
+        "setting": truth.setting,
+        "light": capture.light,
+        "units": truth.units,
+        "width": capture.camera.width,
+        "height": capture.camera.height,
+        "frames": len(capture),
         "views": {region: len(truth.views(region)) for region in REGIONS},
     }
 
@@ -232,20 +254,24 @@ def _view_scores(
     return scores
 
 
-def _pose_scores(predicted: Prediction, capture: Capture, truth: Truth, units: str, notes: list[str]) -> dict[str, Any]:
-    """Scores of the estimated training poses, with the alignment that was found."""
+def _pose_scores(predicted: Prediction, capture: Capture, truth: Truth, notes: list[str]) -> dict[str, Any]:
+    """Scores of the estimated training poses that have a true one, with the alignment that was found."""
     if predicted.poses is None or truth.poses is None:
         return {}
-    frames = [capture.names.index(name) for name in predicted.pose_names]
-    if len(frames) < 2:
+    places = truth.posed(capture)
+    shared = [i for i, name in enumerate(predicted.pose_names) if name in places]
+    if len(shared) < 2:
         notes.append("poses: not scored, one pose is always right after alignment")
         return {}
-    true, lost = truth.poses.select(frames), len(capture) - len(frames)
+    number = {name: i for i, name in enumerate(places)}
+    names = [predicted.pose_names[i] for i in shared]
+    frames, lost = [number[name] for name in names], len(places) - len(shared)
+    poses, true = predicted.poses.select(shared), truth.poses.select([places[name] for name in names])
     distance = float(torch.linalg.vector_norm(truth.poses.camera_positions, dim=-1).mean())
-    tolerance = TOLERANCE_METRES if units == "m" else TOLERANCE_SHARE * distance
+    tolerance = TOLERANCE_METRES if truth.units == "m" else TOLERANCE_SHARE * distance
     try:
-        alignment = metrics.align(predicted.poses, true)
-        aligned = alignment.to_truth(predicted.poses)
+        alignment = metrics.align(poses, true)
+        aligned = alignment.to_truth(poses)
         positions: dict[str, Any] = metrics.position_scores(aligned, true, tolerance=tolerance, lost=lost)
         positions["alignment"] = _describe(alignment, distance)
         scale = float(alignment.scale)
@@ -253,12 +279,12 @@ def _pose_scores(predicted: Prediction, capture: Capture, truth: Truth, units: s
         notes.append(f"poses: positions not scored; {reason}")
         positions, scale = {"ate": None, "auc_percent": None, "alignment": None}, None
     scores = {
-        "posed_frames": len(frames),
+        "posed_frames": len(shared),
         "lost_frames": lost,
         "tolerance": tolerance,
         **positions,
-        **metrics.relative_scores(predicted.poses, true, frames, scale=scale),
-        **metrics.rotation_scores(predicted.poses, true, lost=lost),
+        **metrics.relative_scores(poses, true, frames, scale=scale),
+        **metrics.rotation_scores(poses, true, frames, lost=lost),
     }
     return {f"poses.{key}": value for key, value in scores.items()}
 

@@ -35,6 +35,8 @@ BRIGHTEST = 10.0
 """Radiance at which both lights are clipped: one lamp of a thousand must not be the whole error."""
 LOG_FLOOR = 1e-3
 """Share of the true light's mean luminance under which a texel counts as black in logarithms."""
+TRACKED = 10.0
+"""Rotation error under which a frame counts as tracked [degrees]."""
 LEAST_SPREAD = 0.01
 """Second over first singular value of the camera positions under which they count as a line: errors of one percent of
 its length would turn the aligned path about it at will."""
@@ -224,6 +226,32 @@ def align(predicted: Trajectory, truth: Trajectory) -> Similarity:
         raise ValueError(f"the predicted camera positions: {error}") from None
 
 
+def register(predicted: Trajectory, truth: Trajectory) -> Similarity:
+    """The similarity to show true views of a reconstruction with: it fits what cameras see, not where they stand.
+
+    The rotation is that of `rotation_scores`, alone; scale and shift then bring the point that the cameras look at
+    nearest to its true place before them. `align` pays for errors of orientation with scale and shift.
+
+    Raises:
+        ValueError: The poses do not determine it: the object hardly turns.
+    """
+    R_cam_true, R_cam_pred = truth.T_cam_obj.rotation.matrix(), predicted.T_cam_obj.rotation.matrix()
+    R_true_pred = mean_rotation(truth.T_cam_obj.rotation.inverse() @ predicted.T_cam_obj.rotation)
+    # Nearest to all optical axes: an error of orientation moves no other point less.
+    across, off = R_cam_pred[:, :2].flatten(0, 1), predicted.T_cam_obj.xyz[:, :2].flatten()
+    x_pred = torch.linalg.lstsq(across, -off[:, None]).solution[:, 0]
+    x_cam = predicted.T_cam_obj @ x_pred
+    unit = torch.linalg.vector_norm(x_cam, dim=-1).mean()
+    # scale x_cam = R_cam_true x_true + xyz, in every frame.
+    columns = torch.cat([x_cam[..., None] / unit, -R_cam_true], -1).flatten(0, 1)
+    spread = torch.linalg.svdvals(columns)
+    if spread[3] <= LEAST_SPREAD * spread[0]:
+        raise ValueError("the object hardly turns: its size and its distance cannot be told apart")
+    solution = torch.linalg.lstsq(columns, truth.T_cam_obj.xyz.flatten()[:, None]).solution[:, 0]
+    scale, x_true = solution[0] / unit, solution[1:]
+    return Similarity(scale, R_true_pred, x_true - scale * (R_true_pred @ x_pred))
+
+
 def position_scores(aligned: Trajectory, truth: Trajectory, *, tolerance: float, lost: int = 0) -> dict[str, float]:
     """Errors of camera positions in the true object frame, after alignment.
 
@@ -237,10 +265,14 @@ def position_scores(aligned: Trajectory, truth: Trajectory, *, tolerance: float,
     return {"ate": float(errors.square().mean().sqrt()), "auc_percent": 100 * float(worth)}
 
 
-def rotation_scores(predicted: Trajectory, truth: Trajectory, *, lost: int = 0) -> dict[str, float]:
+def rotation_scores(
+    predicted: Trajectory, truth: Trajectory, frames: Sequence[int] | None = None, *, lost: int = 0
+) -> dict[str, float]:
     """Errors of orientations after a rotation of the object frame alone (chordal mean) [degrees].
 
-    The percentages are of all frames, `lost` ones counted as wrong.
+    Args:
+        frames: Numbers of the poses' frames among those that have a true pose, rising; from 0 when left out.
+        lost: Frames without a predicted pose; the percentages, which are of all frames, count them as wrong.
     """
     R_pred_cam, R_true_cam = (t.T_cam_obj.rotation.inverse() for t in (predicted, truth))
     R_true_pred = mean_rotation(R_true_cam @ R_pred_cam.inverse())
@@ -250,7 +282,18 @@ def rotation_scores(predicted: Trajectory, truth: Trajectory, *, lost: int = 0) 
         "rotation_mean_degrees": float(errors.mean()),
         "rotation_median_degrees": float(errors.quantile(0.5)),
         **{f"rotation_below_{d}_percent": percent * int((errors < d).sum()) for d in (2, 5, 10)},
+        "rotation_longest_run_percent": percent * _longest_run(frames or range(len(truth)), errors < TRACKED),
     }
+
+
+def _longest_run(frames: Sequence[int], good: Bool[Tensor, " n"]) -> int:
+    """Most good frames in a row, neighbours 1 apart."""
+    longest = run = 0
+    last = -1
+    for number, fine in zip(frames, good.tolist(), strict=True):
+        run = 0 if not fine else run + 1 if number == last + 1 else 1
+        longest, last = max(longest, run), number
+    return longest
 
 
 def relative_scores(
@@ -259,7 +302,8 @@ def relative_scores(
     """Mean error of the motion between consecutive frames: translation [true units] and rotation [degrees].
 
     Args:
-        frames: Numbers of the poses' frames in the capture, rising; only neighbours 1 apart are compared.
+        frames: Numbers of the poses' frames among those that have a true pose, rising; only neighbours 1 apart are
+            compared. A frame that nobody annotated is no gap, one that the tracker lost is.
         scale: True units per predicted unit, from `align`; None when unknown, and so is the translation's error.
     """
     first = [i for i, (a, b) in enumerate(pairwise(frames)) if b == a + 1]

@@ -1,5 +1,8 @@
 """What a decomposed asset says about a capture's evaluation views: the prediction folder of docs/prediction.md."""
 
+import math
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -21,40 +24,78 @@ SILHOUETTE = 0.5
 
 
 @torch.no_grad()
-def predict(cfg: relight.Config, asset: Asset, capture: Capture, truth: Truth) -> Prediction:
+def predict(
+    cfg: relight.Config,
+    asset: Asset,
+    capture: Capture,
+    truth: Truth,
+    alignment: Similarity | None,
+    *,
+    names: tuple[str, ...],
+) -> Prediction:
     """Render a capture's evaluation views from an asset, under its own light and under those of the truth.
 
-    The truth gives the views, the alignment of the trajectories, the lights of relit pictures and the albedo's scale;
-    nothing of it changes the asset.
+    The truth gives the views, the lights of relit pictures and the albedo's scale; nothing of it changes the asset.
+
+    Args:
+        alignment: From `aligned`. Without one, or without evaluation views, the prediction is one of poses and, where
+            its frame is known, of light.
+        names: Training frames that the asset's trajectory belongs to.
     """
-    assert truth.trajectory is not None, "evaluation views have poses"
-    alignment = aligned(asset.trajectory, capture, truth)
+    own = asset.environment
+    assert own is not None, "an asset with light"
+    posed = Prediction(poses=asset.trajectory, pose_names=names)
+    if asset.trajectory.light == "camera":
+        posed = replace(posed, light=own)
+    elif alignment is not None:
+        posed = replace(posed, light=own.rotated(alignment.R_true_pred.matrix()))
+    if alignment is None or truth.trajectory is None or not len(truth):
+        return posed
     views = alignment.to_prediction(truth.trajectory)
     buffers = [buffers_of(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
     solid = torch.stack([view.alpha >= SILHOUETTE for view in buffers])
     albedo = torch.stack([view.features["albedo"] for view in buffers]) * solid[..., None]
     normals = torch.stack([normalize(view.normal, dim=-1) for view in buffers]) * solid[..., None]
-    own = asset.environment
-    assert own is not None, "an asset with light"
-    return Prediction(
+    return replace(
+        posed,
         albedo=albedo,
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * solid,
         masks=solid,
         images=_pictures(cfg, asset, own, views, capture),
         relit=_relit(cfg, asset, albedo, alignment, capture, truth),
-        light=own.rotated(alignment.R_true_pred.matrix()) if views.light == "object" else own,
-        poses=asset.trajectory,
-        pose_names=capture.names,
     )
 
 
-def aligned(estimated: Trajectory, capture: Capture, truth: Truth) -> Similarity:
-    """How the true object frame relates to the asset's: the identity where the poses were given."""
-    if capture.trajectory is not None or truth.poses is None:
+def aligned(
+    estimated: Trajectory, names: tuple[str, ...], capture: Capture, truth: Truth, *, given: bool
+) -> tuple[Similarity | None, str]:
+    """How the true object frame relates to the asset's, from training frames alone, and that in words.
+
+    Args:
+        estimated: The asset's trajectory.
+        names: Its frames.
+        given: Whether the run took the capture's poses: nothing is aligned then.
+    """
+    if given:
         xyz = estimated.T_cam_obj.xyz
-        return Similarity(xyz.new_ones(()), SO3.identity(dtype=xyz.dtype, device=xyz.device), xyz.new_zeros(3))
-    return metrics.align(estimated, truth.poses)
+        same = Similarity(xyz.new_ones(()), SO3.identity(dtype=xyz.dtype, device=xyz.device), xyz.new_zeros(3))
+        return same, "views: rendered in the capture's own object frame, for its poses were given"
+    places = truth.posed(capture)
+    shared = [i for i, name in enumerate(names) if name in places]
+    if truth.poses is None or len(shared) < 2:
+        return None, "views: not rendered, for without true poses of training frames the object frame is unknown"
+    true = truth.poses.select([places[names[i]] for i in shared])
+    try:
+        found = metrics.register(estimated.select(shared), true)
+    except ValueError as reason:
+        return None, f"views: not rendered; {reason}"
+    angle = math.degrees(float(found.R_true_pred.angle()))
+    return found, (
+        f"views: rendered at the true poses, brought into the run's object frame by what aligns its {len(shared)} "
+        f"training poses: rotation alone ({angle:.1f} degrees), then scale ({float(found.scale):.4g}) and shift; "
+        "normals and light turned back by it"
+    )
 
 
 def _relit(

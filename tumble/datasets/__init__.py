@@ -1,4 +1,30 @@
-"""Drop a dataset here: one file with `load(path) -> Capture` and `load_truth(path) -> Truth | None`.
+"""Drop a dataset here: one file that reads one layout.
 
-The two are apart so that a reconstruction cannot read what it is later scored against.
+    LAYOUT                              one line: which files make a path a capture of this kind
+    recognises(path) -> bool            whether they are there
+    load(path) -> Capture               what a reconstruction may see
+    load_truth(path) -> Truth | None    what it is scored against
+
+The last two are apart so that a reconstruction cannot read its own answer.
 """
+
+from pathlib import Path
+from types import ModuleType
+
+from tumble.files import BadFile
+from tumble.named import named, names
+
+
+def which(path: Path) -> ModuleType:
+    """The reader of the layout that a path has.
+
+    Raises:
+        BadFile: It has none that is known, or several; the message lists those there are.
+    """
+    readers = {name: named("datasets", name) for name in names("datasets")}
+    found = [name for name, reader in readers.items() if reader.recognises(path)]
+    if len(found) == 1:
+        return readers[found[0]]
+    layouts = "; ".join(f"{name}: {reader.LAYOUT}" for name, reader in readers.items())
+    rule = "has no layout that is known" if path.is_dir() else "is not a folder"
+    raise BadFile(path, f"has the layouts of {' and '.join(found)}" if found else rule, f"known are {layouts}")

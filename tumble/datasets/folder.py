@@ -17,13 +17,14 @@ from torch import Tensor
 
 from tumble import files
 from tumble.camera import Camera
-from tumble.capture import BACKGROUND, OBJECT, REGIONS, UNKNOWN, Capture, Truth, no_views
+from tumble.capture import BACKGROUND, OBJECT, REGIONS, UNITS, UNKNOWN, Capture, Truth, no_views
 from tumble.environment import Environment
 from tumble.files import BadFile
 from tumble.images import linear_from_srgb, photograph
 from tumble.trajectory import LIGHTS, Light, Trajectory
 
 TRANSFORMS = "transforms.json"
+LAYOUT = f"CAPTURE/{TRANSFORMS} (docs/format.md)"
 RIGID_TOLERANCE = 1e-3
 """Largest deviation of R^T R from the identity: what six printed digits leave, far below a wrong scale or shear."""
 
@@ -43,6 +44,11 @@ class _Document:
 
     def split(self, name: str) -> list[dict[str, Any]]:
         return [frame for frame in self.frames if frame.get("split", "train") == name]
+
+
+def recognises(path: Path) -> bool:
+    """Whether a path is a capture folder."""
+    return (path / TRANSFORMS).is_file()
 
 
 def load(path: Path | str) -> Capture:
@@ -74,7 +80,8 @@ def load_truth(path: Path | str) -> Truth | None:
     light, lights, poses = _light(document), _lights(document, frames), _true_poses(document)
     if not frames and light is None and poses is None:
         return None
-    return Truth(**{**vars(truth), "light": light, "lights": lights, "poses": poses})
+    labels = {"units": _units(document), "setting": document.fields.get("setting")}
+    return Truth(**{**vars(truth), "light": light, "lights": lights, "poses": poses, **labels})
 
 
 # The document ---------------------------------------------------------------------------------------------------------
@@ -117,6 +124,13 @@ def _number(document: _Document, frame: dict[str, Any], name: str) -> float | No
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         raise BadFile(document.path, f'"{name}" is {value!r}, not a number')
     return float(value)
+
+
+def _units(document: _Document) -> str:
+    units = document.fields.get("units", "arbitrary")
+    if units not in UNITS:
+        raise BadFile(document.path, f'"units" is {units!r}', f"it is one of {', '.join(UNITS)}")
+    return units
 
 
 def _name(frame: dict[str, Any]) -> str:
