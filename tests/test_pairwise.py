@@ -1,0 +1,69 @@
+"""Two views of an ellipsoid with known rotation between them."""
+
+import pytest
+import torch
+
+from tests.lopsided import tumbling
+from tumble import pairwise
+from tumble.camera import Camera
+from tumble.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
+from tumble.se3 import SO3
+
+
+@pytest.fixture(scope="module")
+def fits() -> tuple[pairwise.Relative, torch.Tensor]:
+    scene = tumbling(24)
+    rng = torch.Generator().manual_seed(0)
+    matches = [scene.match(t - 1, t, rng) for t in range(1, 24)]
+    found = pairwise.fit(matches, pairwise.silhouettes(scene.capture), scene.capture.camera)
+    R = scene.T_cam_obj.rotation.matrix()
+    return found, R[1:] @ R[:-1].mT
+
+
+def test_the_turn_is_found_the_right_way_round(fits: tuple[pairwise.Relative, torch.Tensor]) -> None:
+    """Two views leave the angle open (bas-relief), not the axis: a mirror image would be off by twice the angle."""
+    found, true = fits
+    angle = SO3.from_matrix(true).angle()
+    off = SO3.from_matrix(found.R_j_i @ true.mT).angle()
+    assert (off < angle).float().mean() > 0.9
+    assert off.rad2deg().median() < 5
+
+
+def test_outliers_do_not_count(fits: tuple[pairwise.Relative, torch.Tensor]) -> None:
+    """Nine of ten matches are right to 0.2 pixels; a few wrong ones fall on a segment by chance."""
+    found, _ = fits
+    share = found.inliers / found.inliers.new_tensor([130.0])
+    assert (share > 0.5).all()
+    assert (found.cost <= found.rival_cost).all()
+
+
+def test_a_turn_about_the_viewing_axis_is_exact() -> None:
+    """In-plane rotation is seen whatever the depths are."""
+    scene = tumbling(2)
+    uv, facing = scene.seen(0)
+    centre = pairwise.silhouettes(scene.capture).centre[0].double()
+    # Turn the pixels about the silhouette's centre, which is near the principal point: then nothing else changes.
+    angle = torch.tensor(0.3, dtype=torch.float64)
+    c, s = angle.cos(), angle.sin()
+    turn = torch.stack([torch.stack([c, -s]), torch.stack([s, c])])
+    match = scene.match(0, 1, torch.Generator().manual_seed(0))
+    turned = (uv[facing] - centre) @ turn.T + centre
+    exact = type(match)(0, 1, uv[facing], turned, torch.ones(int(facing.sum())))
+    shapes = pairwise.silhouettes(scene.capture)
+    same = pairwise.Silhouettes(shapes.centre[[0, 0]], shapes.radius[[0, 0]], shapes.visible[[0, 0]])
+    found = pairwise.fit([exact], same, scene.capture.camera)
+    expected = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64)
+    torch.testing.assert_close(SO3.from_matrix(found.R_j_i[0]).log(), expected, atol=0.02, rtol=0)
+
+
+def test_silhouettes_are_measured() -> None:
+    """A 20 x 10 rectangle; unknown pixels are object, for they hide it; an empty mask is said to be one."""
+    masks = torch.full((2, 64, 64), BACKGROUND, dtype=torch.uint8)
+    masks[0, 30:40, 10:25] = OBJECT
+    masks[0, 30:40, 25:30] = UNKNOWN
+    camera = Camera(torch.tensor([100.0, 100.0, 32.0, 32.0]), 64, 64)
+    images = torch.zeros(2, 64, 64, 3, dtype=torch.uint8)
+    shapes = pairwise.silhouettes(Capture(images, masks, camera, ("a", "b"), "camera"))
+    assert shapes.centre[0].tolist() == [20, 35]
+    assert float(shapes.radius[0]) == pytest.approx(pairwise.ROUNDNESS * (200 / torch.pi) ** 0.5 / 100)
+    assert shapes.visible.tolist() == [True, False]

@@ -1,0 +1,281 @@
+"""The adjustment of surface points and poses to what the frames show (bundle adjustment).
+
+Levenberg-Marquardt with Cauchy's loss; points are eliminated first (Schur complement). Cameras come in *groups* of
+equal size that share no point: many short windows are adjusted side by side as easily as one whole capture, each with
+its own damping.
+
+Two priors hold what pixels say little about: the object's origin stays near the middle of its silhouette, and at about
+the same distance. Everything is float64. Unit of length: the origin's mean distance from the camera, until the gauge is
+fixed at the end of the stage.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from tumble.camera import Camera
+from tumble.se3 import SO3
+from tumble.tracks import Tracks
+
+NOISE = 0.3
+"""Of a good match: what a prior's one sigma weighs against residuals [pixels]."""
+NEAREST = 0.05
+"""Least depth of a point: what comes closer is on its way behind the camera."""
+SHALLOW = 0.15
+"""Half length of the shortest chord through the ball about the object [its radius]."""
+FRONT = 0.6
+"""How far towards the camera a visible point is first believed to be [half chord]."""
+TRUST_FRONT = 0.003
+"""Weight of that belief against the rays of all frames that show the point."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Poses and points that are adjusted; `g` groups of `f` cameras."""
+
+    R: Float[Tensor, "g f 3 3"]
+    """`R_cam_obj`"""
+    t: Float[Tensor, "g f 3"]
+    """The object's origin, camera frame."""
+    X: Float[Tensor, "n 3"]
+    """Points, object frame of their group."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is seen, and what is believed before; `o` observations of `n` points by `g` groups of `f` cameras."""
+
+    camera: Camera
+    tracks: Tracks
+    """With frames counted over all groups: `group * f + frame`."""
+    group: Int64[Tensor, " n"]
+    """Of every point."""
+    weight: Float[Tensor, " o"]
+    """Of every observation."""
+    centre: Float[Tensor, "g f 2"]
+    """Where the object's origin should be seen [pixels]."""
+    centre_sigma: Float[Tensor, "g f"]
+    """[pixels]"""
+    depth_sigma: float
+    """Of the logarithm of the origin's distance about 0."""
+    reach: float
+    """Radius about the origin in which points are expected."""
+
+
+def residuals(problem: Problem, scene: Scene) -> tuple[Float[Tensor, "o 2"], Float[Tensor, "o 3"]]:
+    """Projected minus seen positions [pixels], and the points in the camera frames."""
+    R, t = scene.R.flatten(0, 1)[problem.tracks.frame], scene.t.flatten(0, 1)[problem.tracks.frame]
+    x = torch.einsum("oij,oj->oi", R, scene.X[problem.tracks.point]) + t
+    focal, principal = problem.camera.fx_fy_cx_cy.double().split(2)
+    z = x[:, 2:].clamp_min(NEAREST)
+    return x[:, :2] / z * focal + principal - problem.tracks.uv, x
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations before elimination, and the costs."""
+
+    cost: Float[Tensor, " g"]
+    U: Float[Tensor, "c 6 6"]
+    V: Float[Tensor, "n 3 3"]
+    W: Float[Tensor, "o 6 3"]
+    g_cam: Float[Tensor, "c 6"]
+    g_point: Float[Tensor, "n 3"]
+
+
+def adjust(
+    problem: Problem, scene: Scene, *, steps: int, scale: float, tolerance: float = 1e-4
+) -> tuple[Scene, Float[Tensor, " g"]]:
+    """Adjust poses and points of every group; also its final robust cost [pixels^2].
+
+    Args:
+        scene: The start.
+        steps: Largest number of iterations.
+        scale: Residual at which Cauchy's loss starts to forgive [pixels].
+        tolerance: A group is done when an iteration lowers its cost by less than this share.
+    """
+    links = _links(problem.tracks.point)
+    damping = torch.full((len(scene.R),), 1e-3, dtype=torch.float64)
+    system = _linearise(problem, scene, scale)
+    done = torch.zeros_like(damping, dtype=torch.bool)
+    for _ in range(steps):
+        d_cam, d_point = _solve(problem, scene, system, damping, links)
+        moved = _moved(scene, d_cam, d_point)
+        fresh = _linearise(problem, moved, scale)
+        better = fresh.cost < system.cost
+        done |= better & (system.cost - fresh.cost < tolerance * system.cost)
+        scene, system = _choose(problem, better, (moved, fresh), (scene, system))
+        damping = torch.where(better, 0.2 * damping, 8 * damping).clamp(1e-10, 1e8)
+        if bool((done | (damping > 1e6)).all()):
+            break
+    return scene, system.cost
+
+
+def _links(point: Int64[Tensor, " o"]) -> tuple[Tensor, Tensor]:
+    """All ordered pairs of observations of one point."""
+    order = torch.argsort(point, stable=True)
+    count = torch.bincount(point)
+    begin = torch.cumsum(count, 0) - count
+    size = count[point[order]]
+    first = torch.repeat_interleave(torch.arange(len(order)), size)
+    offset = torch.arange(len(first)) - (torch.cumsum(size, 0) - size)[first]
+    return order[first], order[begin[point[order]][first] + offset]
+
+
+def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
+    g, f = scene.t.shape[:2]
+    focal = problem.camera.fx_fy_cx_cy.double()[:2]
+    residual, x = residuals(problem, scene)
+    squared = residual.square().sum(-1) / scale**2
+    w = problem.weight / (1 + squared)
+    R = scene.R.flatten(0, 1)[problem.tracks.frame]
+    z = x[:, 2].clamp_min(NEAREST)
+    zero = torch.zeros_like(z)
+    J_x = torch.stack(
+        [
+            torch.stack([focal[0] / z, zero, -focal[0] * x[:, 0] / z**2], -1),
+            torch.stack([zero, focal[1] / z, -focal[1] * x[:, 1] / z**2], -1),
+        ],
+        -2,
+    )
+    arm = x - scene.t.flatten(0, 1)[problem.tracks.frame]
+    J_turn = torch.linalg.cross(arm[:, None].expand_as(J_x), J_x)
+    J_cam, J_point = torch.cat([J_turn, J_x], -1), J_x @ R
+    wJ_cam, wJ_point = w[:, None, None] * J_cam, w[:, None, None] * J_point
+    n, c = len(scene.X), g * f
+    U = torch.zeros(c, 6, 6, dtype=torch.float64).index_add_(0, problem.tracks.frame, wJ_cam.mT @ J_cam)
+    V = torch.zeros(n, 3, 3, dtype=torch.float64).index_add_(0, problem.tracks.point, wJ_point.mT @ J_point)
+    g_cam = torch.zeros(c, 6, dtype=torch.float64).index_add_(
+        0, problem.tracks.frame, (wJ_cam * residual[..., None]).sum(1)
+    )
+    g_point = torch.zeros(n, 3, dtype=torch.float64).index_add_(
+        0, problem.tracks.point, (wJ_point * residual[..., None]).sum(1)
+    )
+    loss = problem.weight * scale**2 * torch.log1p(squared)
+    cost = torch.zeros(g, dtype=torch.float64).index_add_(0, problem.group[problem.tracks.point], loss)
+    cost = cost + _camera_priors(problem, scene, U, g_cam)
+    # A point that few pixels hold stays within the object.
+    hold = (NOISE / problem.reach) ** 2
+    V = V + hold * torch.eye(3, dtype=torch.float64)
+    g_point = g_point + hold * scene.X
+    cost = cost.index_add(0, problem.group, hold * scene.X.square().sum(-1))
+    return _System(cost, U, V, wJ_cam.mT @ J_point, g_cam, g_point)
+
+
+def _camera_priors(problem: Problem, scene: Scene, U: Tensor, g_cam: Tensor) -> Float[Tensor, " g"]:
+    """Add the priors of the origin's place to the normal equations in place; their cost."""
+    focal, principal = problem.camera.fx_fy_cx_cy.double().split(2)
+    t = scene.t.flatten(0, 1)
+    z = t[:, 2:].clamp_min(NEAREST)
+    off = (t[:, :2] / z * focal + principal - problem.centre.flatten(0, 1)) / problem.centre_sigma.flatten()[:, None]
+    far = z.log() / problem.depth_sigma
+    rows = torch.zeros(len(t), 3, 3, dtype=torch.float64)
+    scaled = focal / z / problem.centre_sigma.flatten()[:, None]
+    rows[:, 0, 0], rows[:, 1, 1] = scaled[:, 0], scaled[:, 1]
+    rows[:, :2, 2] = -scaled * t[:, :2] / z
+    rows[:, 2, 2] = 1 / (z[:, 0] * problem.depth_sigma)
+    rows, r = NOISE * rows, NOISE * torch.cat([off, far], -1)
+    U[:, 3:, 3:] += rows.mT @ rows
+    g_cam[:, 3:] += torch.einsum("cki,ck->ci", rows, r)
+    return r.square().sum(-1).reshape(scene.t.shape[:2]).sum(1)
+
+
+def _solve(
+    problem: Problem, scene: Scene, system: _System, damping: Float[Tensor, " g"], links: tuple[Tensor, Tensor]
+) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"]]:
+    g, f = scene.t.shape[:2]
+    lam_cam, lam_point = damping.repeat_interleave(f)[:, None], damping[problem.group][:, None]
+    U, V = (
+        H + torch.diag_embed(lam * H.diagonal(dim1=-2, dim2=-1) + 1e-9)
+        for H, lam in ((system.U, lam_cam), (system.V, lam_point))
+    )
+    V_inv = torch.linalg.inv(V)
+    Y = system.W @ V_inv[problem.tracks.point]
+    a, b = links
+    blocks = Y[a] @ system.W[b].mT
+    S = torch.zeros(g * f * f, 6, 6, dtype=torch.float64)
+    S.index_add_(0, problem.tracks.frame[a] * f + problem.tracks.frame[b] % f, -blocks)
+    S = S.reshape(g, f, f, 6, 6)
+    S.diagonal(dim1=1, dim2=2).add_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
+    S = S.permute(0, 1, 3, 2, 4).reshape(g, 6 * f, 6 * f)
+    right = -system.g_cam
+    right = right.index_add(0, problem.tracks.frame, (Y @ system.g_point[problem.tracks.point][..., None])[..., 0])
+    d_cam = torch.linalg.solve(S, right.reshape(g, 6 * f, 1)).reshape(g * f, 6)
+    back = system.g_point.index_add(
+        0, problem.tracks.point, (system.W.mT @ d_cam[problem.tracks.frame][..., None])[..., 0]
+    )
+    return d_cam, -(V_inv @ back[..., None])[..., 0]
+
+
+def _moved(scene: Scene, d_cam: Tensor, d_point: Tensor) -> Scene:
+    g, f = scene.t.shape[:2]
+    turn = SO3.exp(d_cam[:, :3].clamp(-0.5, 0.5)).matrix().reshape(g, f, 3, 3)
+    shift = d_cam[:, 3:].clamp(-0.2, 0.2).reshape(g, f, 3)
+    return Scene(turn @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2))
+
+
+def _choose(
+    problem: Problem, better: Tensor, new: tuple[Scene, _System], old: tuple[Scene, _System]
+) -> tuple[Scene, _System]:
+    """Per group, the new where it is better."""
+    if bool(better.all()):
+        return new
+    f = old[0].t.shape[1]
+    camera, point = better.repeat_interleave(f), better[problem.group]
+    observation = point[problem.tracks.point]
+
+    def pick(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    scene = Scene(
+        *(pick(m, getattr(new[0], k), getattr(old[0], k)) for m, k in ((better, "R"), (better, "t"), (point, "X")))
+    )
+    masks = {"cost": better, "U": camera, "V": point, "W": observation, "g_cam": camera, "g_point": point}
+    system = _System(**{k: pick(m, getattr(new[1], k), getattr(old[1], k)) for k, m in masks.items()})
+    return scene, system
+
+
+def information(problem: Problem, scene: Scene, *, scale: float = 1.0) -> Float[Tensor, "c 6 6"]:
+    """Of every pose (turn, shift) with the points held and without priors, from residuals of one pixel."""
+    return _linearise(problem, scene, scale).U
+
+
+# Points from poses ----------------------------------------------------------------------------------------------------
+
+
+def triangulate(
+    tracks: Tracks,
+    R: Float[Tensor, "c 3 3"],
+    t: Float[Tensor, "c 3"],
+    camera: Camera,
+    radius: Float[Tensor, " c"],
+) -> Float[Tensor, "n 3"]:
+    """Points closest to all their rays, drawn slightly towards where the front of a ball would be.
+
+    Args:
+        tracks: With frames in [0, c).
+        R: `R_cam_obj`
+        t: The object's origin, camera frame.
+        camera: Of all frames.
+        radius: Of the ball about the object, over its distance.
+    """
+    focal, principal = camera.fx_fy_cx_cy.double().split(2)
+    xy = (tracks.uv - principal) / focal
+    ray = torch.nn.functional.normalize(torch.cat([xy, torch.ones_like(xy[:, :1])], -1), dim=-1)
+    R, t = R[tracks.frame], t[tracks.frame]
+    middle = (ray * t).sum(-1)
+    reach = radius[tracks.frame] * t.norm(dim=-1)
+    half2 = reach.square() - t.square().sum(-1) + middle.square()
+    half = torch.maximum(half2, (SHALLOW * reach).square()).sqrt()
+    front = torch.einsum("oji,oj->oi", R, ray * (middle - FRONT * half)[:, None] - t)
+    direction = torch.einsum("oji,oj->oi", R, ray)
+    eye = torch.eye(3, dtype=torch.float64)
+    across = eye - direction[:, :, None] * direction[:, None]
+    centre = -torch.einsum("oji,oj->oi", R, t)
+    A = torch.zeros(tracks.n, 3, 3, dtype=torch.float64)
+    A.index_add_(0, tracks.point, across + TRUST_FRONT * eye)
+    b = torch.zeros(tracks.n, 3, dtype=torch.float64)
+    b.index_add_(0, tracks.point, (across @ centre[..., None])[..., 0] + TRUST_FRONT * front)
+    return torch.linalg.solve(A, b)

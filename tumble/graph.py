@@ -1,0 +1,279 @@
+"""Stage 1, the graph route: poses of all frames at once, from matches and silhouettes.
+
+Rotations of pairs, averaged, say roughly how the object turns. Short windows of frames are then adjusted to matches and
+frontier points and averaged again, twice with growing windows; at last the whole capture is adjusted, with the frontier
+of all pairs of frames found anew in every round. Frames that contradict the others are tried in many other rotations.
+Necker's reversal is met where it arises: every window also starts from its mirror image, and the better one stays.
+
+Unit of length until `finish`: the object's mean distance from the camera.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from tumble import bundle, frontier, pairwise
+from tumble.averaging import average
+from tumble.bundle import Problem, Scene
+from tumble.capture import Capture
+from tumble.frontier import Outlines
+from tumble.gauge import Solution, Tracked, finished
+from tumble.loop import State
+from tumble.match import Match
+from tumble.pairwise import Silhouettes
+from tumble.relocate import Judge, cost, hypotheses, relocate
+from tumble.tracks import Tracks, anchored, build_tracks, joined
+
+VERSION = 1
+ANCHORS = 150
+"""Starting points of tracks per frame."""
+CONTRADICTS = 1.5
+"""Loss of a frame's outline over the median from which the frame is given a second look: alone, with outlines only, a
+good pose gets worse."""
+FORGIVEN = 0.1
+"""Such loss that is always forgiven: a quarter of a pixel."""
+FULL = 1.1
+"""The object's radius over that of the ball about its middling silhouette."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Not in the paper, whose stage 1 is a neural field per frame; values are what measured best."""
+
+    windows: tuple[int, ...] = (6, 12)
+    """Sizes of the windows, rising [frames]."""
+    window_points: int = 80
+    """Most tracks of a window."""
+    schedule: tuple[float, ...] = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5)
+    """Residual at which the loss starts to forgive, per round of windows [pixels]."""
+    rounds: tuple[float, ...] = (5.0, 4.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5)
+    """Likewise, per round of the whole capture."""
+    again: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
+    """Likewise, after frames have been relocated."""
+    relocations: int = 2
+    """How often contradicting frames are given a second look."""
+    frontier: float = 3.0
+    """Weight of a frontier point, of a match 1."""
+    iterations: int = 4
+    """Of the adjustment, per round: then the frontier has moved."""
+    reach: int = 2
+    """Largest distance in time of pairs whose rotation is fitted on its own [frames]."""
+    centre: float = 0.25
+    """How far the origin is seen from the middle of the silhouette [its radius]."""
+    depth: float = 0.1
+    """Change of the object's distance, one sigma of its logarithm."""
+    pairs: int = 3000
+    """Most pairs of frames whose frontier is used at once."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A capture whose poses nobody knows, and all that its frames say; `gather` makes it."""
+
+    capture: Capture
+    matches: Sequence[Match] = field(repr=False)
+    shapes: Silhouettes
+    outline: Outlines
+    tracks: Tracks
+    radius: float
+    """Of the object [its mean distance]."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """What this stage finds."""
+
+    R: Float[Tensor, "t 3 3"]
+    """`R_cam_obj`"""
+    t: Float[Tensor, "t 3"]
+    """The object's origin, camera frame [its mean distance]."""
+
+
+def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
+    """Silhouettes, outlines and tracks of a capture and its matches.
+
+    Raises:
+        ValueError: No frame shows the object.
+    """
+    shapes = pairwise.silhouettes(capture)
+    if not bool(shapes.visible.any()):
+        raise ValueError("no mask has an object pixel: there is nothing to find poses of")
+    area = math.pi * (shapes.radius * _focal(capture) / pairwise.ROUNDNESS).square()
+    tracks = build_tracks(anchored(matches, (area / ANCHORS).sqrt().clamp_min(2.0)))
+    radius = FULL * float(shapes.radius[shapes.visible].median())
+    return Inputs(capture, matches, shapes, frontier.outlines(capture), tracks, radius)
+
+
+def _focal(capture: Capture) -> float:
+    return float(capture.camera.fx_fy_cx_cy[:2].double().prod().sqrt())
+
+
+def plan(cfg: Config) -> list[tuple[str, float]]:
+    """What each step does: the name of the phase and its number."""
+    phases = [("pairs", 0.0), *(("windows", float(size)) for size in cfg.windows)]
+    phases += [("whole", scale) for scale in cfg.rounds]
+    for _ in range(cfg.relocations):
+        phases += [("relocate", 0.7), *(("whole", scale) for scale in cfg.again)]
+    return phases
+
+
+def length(cfg: Config, inputs: Inputs) -> int:
+    return len(plan(cfg))
+
+
+def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
+    """Every frame as the camera would see an object that does not turn, in the middle of its silhouette."""
+    R = torch.eye(3, dtype=torch.float64).repeat(len(inputs.capture), 1, 1)
+    return State(0, Poses(R, _on_axis(inputs.capture, inputs.shapes)), None, rng)
+
+
+def _on_axis(capture: Capture, shapes: Silhouettes) -> Float[Tensor, "t 3"]:
+    """Points at depth 1 in the middle of the silhouettes."""
+    focal, principal = capture.camera.fx_fy_cx_cy.double().split(2)
+    return torch.nn.functional.pad((shapes.centre - principal) / focal, (0, 1), value=1.0)
+
+
+@torch.no_grad()
+def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+    phase, number = plan(cfg)[state.step]
+    phases = {"pairs": _pairs, "windows": _windows, "whole": _whole, "relocate": _relocate}
+    state.params, scalars = phases[phase](cfg, inputs, state, number)
+    return scalars
+
+
+# Phases ---------------------------------------------------------------------------------------------------------------
+
+Outcome = tuple[Poses, dict[str, Tensor | float]]
+
+
+def _pairs(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
+    """Fit near pairs one by one and average their rotations."""
+    near = [m for m in inputs.matches if abs(m.j - m.i) <= cfg.reach and len(m) >= pairwise.LEAST]
+    if not near:
+        return state.params, {"pairs": 0.0}
+    fits = pairwise.fit(near, inputs.shapes, inputs.capture.camera, most=150)
+    weight = (fits.inliers + 1) / (fits.j - fits.i).abs()
+    found = average(fits.i, fits.j, fits.R_j_i, weight, n_frames=len(inputs.capture))
+    return replace(state.params, R=found.R_cam_obj), {"pairs": float(len(fits))}
+
+
+def _windows(cfg: Config, inputs: Inputs, state: State, number: float) -> Outcome:
+    """Adjust overlapping windows, each also from its mirror image, and average the rotations within them."""
+    n, size = len(inputs.capture), min(int(number), len(inputs.capture))
+    first = sorted({*range(0, n - size + 1, max(1, size // 4)), n - size})
+    frames = torch.tensor(first)[:, None] + torch.arange(size)
+    tracks, group = _cut(inputs.tracks, frames, cfg.window_points, state.rng)
+    R = state.params.R[frames]
+    middle = R[:, size // 2, None]
+    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
+    best, least = R, torch.full((len(frames),), torch.inf, dtype=R.dtype)
+    for start in (R, flip @ R @ middle.mT @ flip @ middle):
+        scene = Scene(start, _on_axis(inputs.capture, inputs.shapes)[frames], torch.zeros(0, 3, dtype=R.dtype))
+        for scale in cfg.schedule:
+            scene, price = _round(cfg, inputs, scene, tracks, group, frames, scale)
+        best = torch.where((price < least)[:, None, None, None], scene.R, best)
+        least = torch.minimum(price, least)
+    a, b = torch.triu_indices(size, size, 1)
+    relative = best[:, b] @ best[:, a].mT
+    i, j = frames[:, a].flatten(), frames[:, b].flatten()
+    found = average(i, j, relative.flatten(0, 1), torch.ones(len(i), dtype=R.dtype), n_frames=n)
+    return replace(state.params, R=found.R_cam_obj), {"loss": least.mean()}
+
+
+def _cut(tracks: Tracks, frames: Int64[Tensor, "g f"], most: int, rng: torch.Generator) -> tuple[Tracks, Tensor]:
+    """The longest tracks of every window, with frames counted over all windows; also the window of every point."""
+    size = frames.shape[1]
+    parts, groups = [], []
+    for number, first in enumerate(frames[:, 0].tolist()):
+        part = tracks.select((tracks.frame >= first) & (tracks.frame < first + size))
+        if part.n > most:
+            rank = torch.bincount(part.point) + torch.rand(part.n, generator=rng)
+            chosen = torch.zeros(part.n, dtype=torch.bool)
+            chosen[rank.topk(most).indices] = True
+            part = part.select(chosen[part.point])
+        parts.append(replace(part, frame=part.frame - first + number * size))
+        groups.append(torch.full((part.n,), number))
+    return joined(*parts), torch.cat(groups)
+
+
+def _whole(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
+    """One round of adjusting all frames together."""
+    poses = state.params
+    frames = torch.arange(len(inputs.capture))[None]
+    scene = Scene(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype))
+    group = torch.zeros(inputs.tracks.n, dtype=torch.long)
+    scene, price = _round(cfg, inputs, scene, inputs.tracks, group, frames, scale, state.rng)
+    return Poses(scene.R[0], scene.t[0]), {"loss": price.mean()}
+
+
+def _round(
+    cfg: Config,
+    inputs: Inputs,
+    scene: Scene,
+    tracks: Tracks,
+    group: Tensor,
+    frames: Int64[Tensor, "g f"],
+    scale: float,
+    rng: torch.Generator | None = None,
+) -> tuple[Scene, Float[Tensor, " g"]]:
+    """Find the frontier, triangulate, adjust; also the loss per observation of every group [pixels^2]."""
+    g, f = frames.shape
+    R, t, camera = scene.R.flatten(0, 1), scene.t.flatten(0, 1), inputs.capture.camera
+    a, b = torch.triu_indices(f, f, 1)
+    if rng is not None and len(a) > cfg.pairs:
+        chosen = torch.randperm(len(a), generator=rng)[: cfg.pairs]
+        a, b = a[chosen], b[chosen]
+    begin = torch.arange(g)[:, None] * f
+    pairs = torch.stack([(begin + a).flatten(), (begin + b).flatten()], 1)
+    flat = frames.flatten()
+    touching = frontier.frontier(R, t, camera, inputs.outline[flat], radius=inputs.radius, pairs=pairs)
+    both = joined(tracks, touching)
+    weight = torch.cat([torch.ones(len(tracks)), torch.full((len(touching),), cfg.frontier)]).double()
+    group = torch.cat([group, touching.frame[::2] // f])
+    sigma = cfg.centre * inputs.shapes.radius[frames] * _focal(inputs.capture)
+    problem = Problem(camera, both, group, weight, inputs.shapes.centre[frames], sigma, cfg.depth, 1.5 * inputs.radius)
+    X = bundle.triangulate(both, R, t, camera, inputs.shapes.radius[flat])
+    moved, price = bundle.adjust(problem, Scene(scene.R, scene.t, X), steps=cfg.iterations, scale=scale)
+    total = torch.zeros(g, dtype=torch.float64).index_add_(0, group[both.point], weight)
+    return moved, price / total.clamp_min(1)
+
+
+def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
+    """Try other rotations for every frame that contradicts the rest, outwards from those that agree best."""
+    R, t = state.params.R.clone(), state.params.t.clone()
+    n, camera = len(R), inputs.capture.camera
+
+    def judge(k: int) -> Judge:
+        others = torch.tensor([i for i in range(n) if i != k])
+        others = others[:: max(1, len(others) // 32)]
+        return Judge(
+            (R[others], t[others]), inputs.outline[torch.tensor([k])], inputs.outline[others], camera, inputs.radius
+        )
+
+    before = torch.stack([cost(judge(k).gaps(R[k : k + 1], t[k : k + 1]), scale)[0] for k in range(n)])
+    calm = torch.nn.functional.avg_pool1d(before.nan_to_num(posinf=9.0)[None], 5, 1, 2, count_include_pad=False)[0]
+    seed, usual = int(calm.argmin()), float(before.median())
+    turns, middle = hypotheses(), _on_axis(inputs.capture, inputs.shapes)
+    changed = 0
+    for k in [*range(seed, n), *range(seed - 1, -1, -1)]:
+        if not before[k] > max(CONTRADICTS * usual, FORGIVEN):
+            continue
+        near = [i for i in (k, k - 1, k + 1) if 0 <= i < n]
+        R_try = torch.cat([R[k : k + 1], *(turns @ R[i] for i in near)])
+        t_try = torch.cat([t[k : k + 1], (middle[k] * t[near, 2].mean()).expand(len(R_try) - 1, 3)])
+        (R_new, t_new), after = relocate(judge(k), R_try, t_try, scale=scale)
+        if after < 0.9 * before[k]:
+            R[k], t[k] = R_new, t_new
+            changed += 1
+    return Poses(R, t), {"relocated": float(changed)}
+
+
+@torch.no_grad()
+def finish(cfg: Config, inputs: Inputs, state: State) -> Tracked:
+    """Poses in the object's own unit and frame, its points, and how far to trust them."""
+    solution = Solution(state.params.R, state.params.t, inputs.radius)
+    return finished(inputs.capture, inputs.tracks, inputs.outline, solution)
