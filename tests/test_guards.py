@@ -17,15 +17,17 @@ LAYERS = [
     {"brdf", "camera", "trajectory"},
     {"gaussians", "material", "environment", "buffers", "coarse_light"},
     {"capture", "asset", "match"},
-    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels"},
+    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"},
     {"prefilter", "shade", "importance", "mesh", "hull"},
-    {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching"},
+    {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching"}
+    | {"pairwise", "averaging", "bundle", "relocate", "gauge"},
     {"loop"},
-    {"track", "lift", "refine", "decompose", "average", "relight"},
+    {"track", "lift", "graph", "refine", "decompose", "average", "relight"},
     {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
     | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "check"}
-    | {"scoresheet", "evaluate", "bake", "export", "report", "viewer", "doctor", "demo", "demo_assets"},
-    {"recipes", "run", "reconstruct"},
+    | {"scoresheet", "evaluate", "bake", "export", "viewer", "doctor", "demo_assets"},
+    {"plots", "lamps", "confidence", "rerender", "diagnosis", "gallery"},
+    {"recipes", "run", "report", "reconstruct", "demo"},
     {"cli", "__main__"},
 ]
 """Each row may import only rows above it and itself (design, section 3)."""

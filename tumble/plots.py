@@ -1,0 +1,96 @@
+"""Small pictures made of lines, as SVG that takes its colours from the page."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+RADIUS = 100
+"""Of a drawn globe [SVG units]."""
+
+
+def bars(values: Sequence[float], marks: Sequence[str]) -> str:
+    """One bar per frame from 0 to the largest value, coloured by its mark; empty without values."""
+    top = max((value for value in values if not math.isnan(value)), default=0.0)
+    if top <= 0:
+        return ""
+    shapes = [
+        f'<rect class="b-{mark}" x="{i + 0.1:.1f}" y="{100 * (1 - value / top):.2f}" width="0.8" '
+        f'height="{100 * value / top:.2f}"/>'
+        for i, (value, mark) in enumerate(zip(values, marks, strict=True))
+        if not math.isnan(value)
+    ]
+    about = f"One bar per frame, up to {top:.3g}"
+    return (
+        f'<svg viewBox="0 0 {len(values)} 100" preserveAspectRatio="none" role="img"><title>{about}</title>'
+        f"{''.join(shapes)}</svg>"
+    )
+
+
+def curve(values: Sequence[float]) -> str:
+    """A line through values at equal distances, on a logarithmic scale when all are above zero; empty under two."""
+    if len(values) < 2:
+        return ""
+    y = np.log(values) if min(values) > 0 else np.asarray(values)
+    y = (y - y.min()) / max(float(np.ptp(y)), 1e-9)
+    steps = " L".join(f"{100 * i / (len(y) - 1):.1f} {4 + 92 * (1 - v):.1f}" for i, v in enumerate(y))
+    return f'<svg viewBox="0 0 100 100" preserveAspectRatio="none"><path d="M{steps}"/></svg>'
+
+
+def globes(positions: Float[np.ndarray, "t 3"]) -> str:
+    """Where the camera stood about the object, in the object frame, as seen from two opposite sides, +y up."""
+    d = positions / np.linalg.norm(positions, axis=-1, keepdims=True)
+    width = 4 * RADIUS + 60
+    sides = "".join(_globe(d, turn, 15 + RADIUS + i * (2 * RADIUS + 30)) for i, turn in enumerate((0.5, 0.5 + math.pi)))
+    return f'<svg viewBox="0 0 {width} {2 * RADIUS + 40}" role="img"><title>Camera path</title>{sides}</svg>'
+
+
+def _globe(d: Float[np.ndarray, "t 3"], turn: float, centre: float) -> str:
+    lean = 0.35
+    cos, sin = math.cos(turn), math.sin(turn)
+    R = np.array([[1, 0, 0], [0, math.cos(lean), -math.sin(lean)], [0, math.sin(lean), math.cos(lean)]]) @ np.array(
+        [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]
+    )
+
+    def at(x: np.ndarray) -> str:
+        return f"{centre + RADIUS * x[0]:.1f} {RADIUS + 12 - RADIUS * x[1]:.1f}"
+
+    around = np.linspace(0, 2 * math.pi, 73)
+    rings = [
+        np.stack([math.cos(v) * np.cos(around), np.full_like(around, math.sin(v)), math.cos(v) * np.sin(around)], -1)
+        for v in (-math.pi / 3, -math.pi / 6, 0.0, math.pi / 6, math.pi / 3)
+    ]
+    rings += [
+        np.stack([np.cos(around) * math.cos(u), np.sin(around), np.cos(around) * math.sin(u)], -1)
+        for u in np.arange(6) * math.pi / 6
+    ]
+    lines = "".join(f'<path d="{_front(ring @ R.T, at)}"/>' for ring in rings)
+    shown = d @ R.T
+    track = f'<path d="{_front(shown, at)}"/>'
+    dots = "".join(
+        f'<circle cx="{at(x).split()[0]}" cy="{at(x).split()[1]}" r="3.6" fill="{_colour(i / max(1, len(d) - 1))}"/>'
+        for i, x in enumerate(shown)
+        if x[2] >= 0
+    )
+    return (
+        f'<circle cx="{centre}" cy="{RADIUS + 12}" r="{RADIUS}" fill="var(--tile)" stroke="var(--line)"/>'
+        f'<g fill="none" stroke="var(--line)">{lines}</g>'
+        f'<g fill="none" stroke="var(--soft)" stroke-opacity=".45">{track}</g>{dots}'
+    )
+
+
+def _front(points: Float[np.ndarray, "n 3"], at) -> str:
+    """The parts of a line that lie on the near side."""
+    words, before = [], False
+    for x in points:
+        near = bool(x[2] >= 0)
+        if near:
+            words.append(("L" if before else "M") + at(x))
+        before = near
+    return "".join(words)
+
+
+def _colour(share: float) -> str:
+    """From blue (first frame) over green to orange (last): readable on light and dark."""
+    return f"hsl({215 - 185 * share:.0f} 65% 52%)"
