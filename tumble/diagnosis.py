@@ -54,7 +54,8 @@ def card(frames: Sequence[Frame], health: Health | None, seen: Confidence) -> li
 
 def overall(rows: Sequence[Row]) -> tuple[Verdict, str, str]:
     """The worst verdict, a word and a sentence for it."""
-    worst: Verdict = next((v for v in ("bad", "warn") if any(row.verdict == v for row in rows)), "good")
+    found = {row.verdict for row in rows}
+    worst: Verdict = "bad" if "bad" in found else "warn" if "warn" in found else "good"
     word, sentence = OVERALL[worst]
     names = ", ".join(row.name.lower() for row in rows if row.verdict == worst)
     return worst, word, sentence if worst == "good" else f"{sentence}{names}. The health card says more."
@@ -75,7 +76,7 @@ def _fit(frames: Sequence[Frame]) -> Row:
     off = [frame.name for frame, value in zip(frames, values, strict=True) if value < middle - 6]
     verdict = "warn" if off and verdict == "good" else verdict
     sentence += _list(off, "far worse than the rest; their poses may be wrong")
-    marks = tuple("bad" if value < middle - 6 else "good" for value in values)
+    marks: tuple[Verdict, ...] = tuple("bad" if value < middle - 6 else "good" for value in values)
     return Row("Fit to the photographs", f"{middle:.1f} dB", verdict, sentence, values, marks)
 
 
@@ -111,7 +112,7 @@ def _exposure(frames: Sequence[Frame]) -> Row:
         "white balance, and film again.",
     }[verdict]
     bars = tuple(abs(value - middle) for value in values)
-    marks = tuple(_high(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars)
+    marks: tuple[Verdict, ...] = tuple(_high(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars)
     return Row("Exposure drift", f"{drift:.2f} stops", verdict, sentence, bars, marks)
 
 
@@ -126,7 +127,7 @@ def _lost(health: Health | None) -> Row:
         "bad": "Many frames could not be located. Turn the object more slowly, and keep fingers off its texture.",
         "none": "No frames.",
     }[verdict]
-    marks = tuple("bad" if x else "good" for x in lost)
+    marks: tuple[Verdict, ...] = tuple("bad" if x else "good" for x in lost)
     return Row(
         "Lost frames", f"{sum(lost)} of {len(lost)}", verdict, sentence, tuple(0.15 + 0.85 * x for x in lost), marks
     )
