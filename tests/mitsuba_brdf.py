@@ -35,7 +35,7 @@ def _register() -> None:
     import drjit as dr
 
     class Brdf(mi.BSDF):  # type: ignore[misc, name-defined]
-        """Lambert and GGX as paper section 4.3 has them; sampled by the cosine, half of the time by GGX."""
+        """Lambert and GGX as paper section 4.3 has them, with Fresnel's equations for glass; sampled by the cosine, half of the time by GGX."""
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
@@ -54,7 +54,7 @@ def _register() -> None:
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             nol, nov, noh, voh = self._cosines(si, wo)
-            fresnel = self.f0 + (1 - self.f0) * (1 - voh) ** 5
+            fresnel = self.f0 / 0.04 * mi.fresnel(voh, 1.5)[0]
             # Smith's: 2 x / G1(x) for either direction.
             a2 = self.roughness**4
             geometry = (nol + dr.sqrt(a2 + (1 - a2) * nol * nol)) * (nov + dr.sqrt(a2 + (1 - a2) * nov * nov))

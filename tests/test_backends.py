@@ -372,7 +372,9 @@ def _textbook_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: f
         D = a**2 / (math.pi * (nh**2 * (a**2 - 1) + 1) ** 2)
         # Walter 2007, equation 34.
         G = 4 / (1 + np.sqrt(1 + a**2 * (1 / mu**2 - 1))) / (1 + np.sqrt(1 + a**2 * (1 / nv**2 - 1)))
-        F = f0 + (1 - f0) * (1 - vh) ** 5
+        inside = np.sqrt(1 - (1 - vh**2) / 1.5**2)
+        F = f0 / 0.08 * ((vh - 1.5 * inside) / (vh + 1.5 * inside)) ** 2
+        F += f0 / 0.08 * ((inside - 1.5 * vh) / (inside + 1.5 * vh)) ** 2
         result.append((D * F * G / (4 * mu * nv) * mu).mean() * 2 * math.pi)
     return np.array(result)
 

@@ -110,9 +110,12 @@ def test_another_reader_finds_each_colour_where_it_belongs(folder: Path) -> None
     assert (ball.face_normals[faces] * x.numpy()).sum(1).min() > 0.9 * RADIUS
 
 
-def test_the_index_of_refraction_is_that_of_fresnel() -> None:
-    assert export.ior(0.04) == pytest.approx(1.5)
-    assert export.ior(0.02) == pytest.approx(1.3294, abs=1e-4)
+def test_a_highlight_below_that_of_glass_is_dimmed_and_one_above_has_an_index() -> None:
+    assert export.specular(0.02) == ("KHR_materials_specular", {"specularFactor": 0.5})
+    name, value = export.specular(0.0625)
+    # ((n - 1) / (n + 1))^2 = 1/16.
+    assert name == "KHR_materials_ior"
+    assert value["ior"] == pytest.approx(5 / 3)
 
 
 def test_the_ply_has_the_common_layout(folder: Path, asset: Asset) -> None:

@@ -101,7 +101,7 @@ def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_ba
     gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
     seen = shade.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
     light, tracer = importance.light_sampler(uniform()), build(gaussians, GAMMA)
-    # Specular light on top of white would be more than the furnace holds: no f0, and what Fresnel leaves is small.
+    # Specular light on top of white would be more than the furnace holds: no f0.
     rough = torch.ones(1000, 1)
     bounce = importance.GlossyBounce(torch.ones(1000, 3), rough, prefilter(uniform()))
     found = [
@@ -121,7 +121,7 @@ def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_ba
     ]
     assert found[0].min() < 0.7
     assert found[0].mean() < 0.97
-    # 128 samples leave 3 %, and the Fresnel lobe of f0 = 0 sends back up to 6 % at grazing angles.
+    # 128 samples leave 3 %.
     assert (found[1] - 1).abs().mean() < 0.04
 
 

@@ -34,7 +34,7 @@ from tumble.trace import Visibility, build, moved, open_sky, surface_points, vis
 from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 
-VERSION = 3
+VERSION = 4
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 MOVED = 0.3

@@ -191,8 +191,8 @@ def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, met
         indices, "SCALAR", SHORT if few else INT, target=ELEMENTS
     )
     if abs(f0 - DIELECTRIC) > 1e-4:
-        material["extensions"] = {"KHR_materials_ior": {"ior": ior(f0)}}
-        document["extensionsUsed"] = ["KHR_materials_ior"]
+        name, value = specular(f0)
+        material["extensions"], document["extensionsUsed"] = {name: value}, [name]
     document |= {"bufferViews": buffer.views, "accessors": buffer.accessors, "buffers": [{}]}
     binary = bytes(buffer.data) + b"\0" * (-len(buffer.data) % 4)
     document["buffers"][0]["byteLength"] = len(binary)
@@ -205,9 +205,12 @@ def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, met
     files.write_whole(path, lambda partial: partial.write_bytes(whole))
 
 
-def ior(f0: float) -> float:
-    """Refractive index with a given reflectance at normal incidence (Fresnel)."""
-    return (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))
+def specular(f0: float) -> tuple[str, dict[str, float]]:
+    """What glTF says for a reflectance at normal incidence: below glass a dimmed highlight (as `brdf.fresnel` has it,
+    grazing angles too), above it an index."""
+    if f0 < DIELECTRIC:
+        return "KHR_materials_specular", {"specularFactor": f0 / DIELECTRIC}
+    return "KHR_materials_ior", {"ior": (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))}
 
 
 def _unit32(x: Float[np.ndarray, "n 3"]) -> np.ndarray:

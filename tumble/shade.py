@@ -177,10 +177,7 @@ def shade_split(
     narrow = lobe_visibility(surface, roughness, visibility) * narrow
     black = torch.zeros_like(albedo)
     # The kernel's lobe is linear in f0, which may be learnt.
-    none, full = (
-        _sum(surface.normals, black, roughness, surface.views, visibility, light, bounce, level) for level in (0.0, 1.0)
-    )
-    wide = none + f0 * (full - none)
+    wide = f0 * _sum(surface.normals, black, roughness, surface.views, visibility, light, bounce, 1.0)
     share = ((roughness - NARROW[0]) / (NARROW[1] - NARROW[0])).clamp(0, 1)
     return _diffuse(surface, albedo, visibility, light, bounce) + torch.lerp(narrow, wide, share)
 
@@ -195,8 +192,8 @@ def specular(
 ) -> Float[Tensor, "p 3"]:
     """The specular lobe by the split sum, nothing in the way; unit normals and directions to the eye, object frame."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
-    scale, bias = brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness).split(1, -1)
-    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * (f0 * scale + bias)
+    share = f0 * brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
+    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * share
 
 
 @torch.no_grad()
@@ -217,7 +214,7 @@ def lobe_visibility(surface: Surface, roughness: Float[Tensor, "p 1"], visibilit
 
 
 @cache
-def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size 2"]:
+def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size"]:
     return brdf.split_sum_table().to(device, dtype)
 
 

@@ -214,7 +214,8 @@ class Backend(Protocol):
         """Reflected radiance under d equal-area directions w_j of the whole sphere, Lambert + GGX.
 
             L_o = 4 pi / d  sum_j (albedo / pi + f_j) L_j max(n.w_j, 0)
-            f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = f0 + (1 - f0) (1 - v.h)^5
+            f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = f0 (1 + 24 q(1 - v.h))
+            q(m) = 0.9878 m^3 - 3.8886 m^4 + 9.1922 m^5 - 9.6217 m^6 + 4.3303 m^7  (Fresnel's equations, index 1.5)
             t = (|n x H|^2 + a^2 (n.H)^2) / |H|^2,  H = v + w_j,  |H|^2 = 2 (1 + v.w_j),  v.h = |H| / 2
             g(x) = (x + sqrt(a^2 + (1 - a^2) x^2)) / 2 for x > 0, else a / 2,  r = max(roughness, ROUGHNESS_MIN)
 

@@ -67,6 +67,7 @@ class Lobe:
     t_h2: float
     vh: float
     F: float
+    slope_F: float
     g_w: float
     rest: float
     f: float
@@ -88,7 +89,9 @@ def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
     o.g_w = 0.5 * (n_w + smith_root(n_w, p.aa))
     o.vh = 0.5 * wp.sqrt(o.HH)
     m = 1.0 - o.vh
-    o.F = f0 + (1.0 - f0) * m * m * m * m * m
+    # brdf.fresnel, and its slope in m.
+    o.F = f0 * (1.0 + 24.0 * m * m * m * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
+    o.slope_F = f0 * 24.0 * m * m * (2.9634 + m * (-15.5544 + m * (45.961 + m * (-57.7302 + m * 30.3121))))
     x = o.HH / o.t_h2
     o.rest = p.aa * x * x / (FOUR_PI * p.g_v * o.g_w)
     o.f = o.F * o.rest
@@ -165,7 +168,7 @@ class PointSums:
 
 @wp.func
 @no_type_check
-def lobe_adjoint(p: Point, o: Lobe, f0: float, v_f: float, v_n_w: float, sum: PointSums) -> PointSums:
+def lobe_adjoint(p: Point, o: Lobe, v_f: float, v_n_w: float, sum: PointSums) -> PointSums:
     """Adds one direction's part. v.h and |H| depend on v.w only, |C| and n.H on the rest."""
     to = sum
     v_log_f = v_f * o.f
@@ -177,8 +180,7 @@ def lobe_adjoint(p: Point, o: Lobe, f0: float, v_f: float, v_n_w: float, sum: Po
     root = 2.0 * o.g_w - o.n_w
     to.aa += v_log_f / p.aa + v_t_h2 * n_H * n_H + v_g_w * (1.0 - o.n_w * o.n_w) / (4.0 * root)
     to.n_v += v_n_H
-    m = 1.0 - o.vh
-    v_HH = 2.0 * v_log_f / o.HH - v_f * o.rest * 5.0 * (1.0 - f0) * m * m * m * m / (8.0 * o.vh)
+    v_HH = 2.0 * v_log_f / o.HH - v_f * o.rest * o.slope_F / (8.0 * o.vh)
     v_C = 2.0 * v_t_h2 * o.C
     to.n += wp.cross(p.v + o.w, v_C) + (v_n_w + v_n_H + v_g_w * 0.5 * (1.0 + (1.0 - p.aa) * o.n_w / root)) * o.w
     to.v += wp.cross(v_C, p.n) + 2.0 * v_HH * o.w
@@ -240,7 +242,7 @@ def shade_adjoint(
             v_n_w = wp.dot(seed_diffuse, L) + o.f * specular
             sum.albedo += n_w * INV_PI * wp.cw_mul(seed, L)
             if o.exists:
-                sum = lobe_adjoint(p, o, f0, specular * n_w, v_n_w, sum)
+                sum = lobe_adjoint(p, o, specular * n_w, v_n_w, sum)
             else:
                 sum.n += v_n_w * directions[j]
     add_row(v_points, i, 0, 10, point_adjoint(p, sum, roughness[i]))

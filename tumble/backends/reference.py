@@ -281,7 +281,8 @@ def shade(
     HH = torch.where(exists, HH, 1)
     H = view[:, None] + directions
     t = (torch.linalg.cross(normal[:, None], H).square().sum(-1) + a * a * (n_v + n_w) ** 2) / HH
-    fresnel = f0 + (1 - f0) * (1 - 0.5 * HH.sqrt()) ** 5
+    m = 1 - 0.5 * HH.sqrt()
+    fresnel = f0 * (1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
     g_v, g_w = (0.5 * (x + (a * a + (1 - a * a) * x * x).sqrt()) for x in (n_v.clamp(min=0), n_w.clamp(min=0)))
     specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
     lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]

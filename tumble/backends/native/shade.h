@@ -41,7 +41,7 @@ INLINE Point point_at(const Shade& s, i64 p) {
 
 // One point under a vector of directions.
 struct Lobe {
-    vf w[3], n_w, HH, C[3], n_H, inv_num, t_num, vh, m, m4, F, root_w, g_w, rest, f;   // f = F rest
+    vf w[3], n_w, HH, C[3], n_H, t_num, vh, F, slope_F, root_w, g_w, rest, f;   // f = F rest
     vi exists;
 };
 INLINE vf cosine(const Shade& s, const Point& p, int j, vf* w) {
@@ -58,10 +58,11 @@ INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
     o.t_num = o.C[0] * o.C[0] + o.C[1] * o.C[1] + o.C[2] * o.C[2] + p.aa * o.n_H * o.n_H;   // t |H|^2
     vf facing = vmax(o.n_w, vf{});
     o.root_w = smith_root(facing, p.aa), o.g_w = 0.5f * (facing + o.root_w);
-    o.vh = 0.5f * vsqrt(o.HH), o.m = 1.0f - o.vh;
-    vf m2 = o.m * o.m;
-    o.m4 = m2 * m2;
-    o.F = s.f0 + (1 - s.f0) * o.m * o.m4;
+    o.vh = 0.5f * vsqrt(o.HH);
+    vf m = 1.0f - o.vh, mm = m * m;
+    // brdf.fresnel, and its slope in m.
+    o.F = s.f0 * (1 + 24 * m * mm * (0.9878f + m * (-3.8886f + m * (9.1922f + m * (-9.6217f + m * 4.3303f)))));
+    o.slope_F = s.f0 * 24 * mm * (2.9634f + m * (-15.5544f + m * (45.961f + m * (-57.7302f + m * 30.3121f))));
     vf x = o.HH / o.t_num;
     o.rest = keep(o.exists, (p.aa * 0.0795774715f / p.g_v) * x * x / o.g_w);
     o.f = o.F * o.rest;
@@ -123,7 +124,7 @@ INLINE void lobe_adjoint(const Shade& s, const Point& p, const Lobe& b, vf v_f, 
     vf v_n_H = v_num * (2.0f * p.aa) * b.n_H;
     v_n_w += v_n_H, sum.n_v += v_n_H;
     // f ~ |H|^4 F(|H|); d(v.h)/d|H|^2 = 1 / (8 v.h), and |H|^2 = 2 + 2 v.w.
-    vf v_F = v_f * b.rest, v_HH = 2.0f * over_f / b.HH - v_F * (5.0f * (1 - s.f0)) * b.m4 / (8.0f * b.vh);
+    vf v_F = v_f * b.rest, v_HH = 2.0f * over_f / b.HH - v_F * b.slope_F / (8.0f * b.vh);
     vf v_vw = keep(b.exists, 2.0f * v_HH), H[3], c[3];
     for (int i = 0; i < 3; i++) H[i] = b.w[i] + p.v[i], c[i] = 2.0f * v_num * b.C[i];
     // C = n x H.
