@@ -96,8 +96,9 @@ def opened(address: str, folder: Path, width: int, height: int) -> Iterator[Page
     words = [program, *OPTIONS, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        port = _port(profile / "DevToolsActivePort")
-        yield _page(port, address)
+        page = _page(_port(profile / "DevToolsActivePort"), address)
+        with page.connection:
+            yield page
     finally:
         process.terminate()
         process.wait(30)

@@ -35,7 +35,7 @@ def _register() -> None:
     import drjit as dr
 
     class Brdf(mi.BSDF):  # type: ignore[misc, name-defined]
-        """Lambert and GGX as paper section 4.3 has them, with Fresnel's equations for glass; sampled by the cosine, half of the time by GGX."""
+        """Lambert and GGX as in paper section 4.3, Fresnel's equations for glass; half of the samples by GGX."""
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)

@@ -25,9 +25,9 @@ LAYERS = [
     {"track", "lift", "graph", "refine", "decompose", "average", "relight"},
     {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
     | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "check"}
-    | {"scoresheet", "evaluate", "bake", "export", "viewer", "doctor", "demo_assets"},
+    | {"scoresheet", "evaluate", "bake", "export", "doctor", "demo_assets"},
     {"plots", "lamps", "confidence", "rerender", "diagnosis", "gallery"},
-    {"recipes", "run", "report", "reconstruct", "demo"},
+    {"recipes", "run", "report", "reconstruct", "demo", "viewer"},
     {"cli", "__main__"},
 ]
 """Each row may import only rows above it and itself (design, section 3)."""

@@ -394,6 +394,7 @@ def test_a_roughness_sweep_changes_roughness_alone(pebble: Path, tmp_path: Path)
     ("change", "message"),
     [
         ({"resolution": 33}, "resolution is out of range: 33"),
+        ({"relight": ("a/sun.hdr", "b/sun.hdr")}, "relight needs lights of different names"),
         ({"roughness": 0.0}, "roughness"),
         ({"views": 0}, "views"),
     ],

@@ -39,6 +39,7 @@ def main() -> None:
         "synth": _synth(),
         "check": _check(),
         "run": _run(),
+        "view": view,
         "relight": relight,
         "export": export,
         "report": report,
@@ -157,27 +158,45 @@ def _run():
     return run
 
 
+def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) -> None:
+    """Show a run in the browser, while it goes on and after: cameras, Gaussians, maps, light (extra `view`).
+
+    Args:
+        run: The run directory.
+        host: Which of this machine's addresses answers; 0.0.0.0: all, so that others can look, too.
+        port: The first one to try.
+    """
+    from tumble.viewer import view as serve
+
+    serve(run, host, port)
+
+
 def relight(
-    run: Positional[Path], /, env: Path, out: OptionalFolder = None, turntable: Path | None = None, fast: bool = False
+    run: Positional[Path],
+    /,
+    env: Path,
+    out: OptionalFolder = None,
+    turntable: Path | None = None,
+    fast: bool = False,
+    exposure: float = 0.0,
 ) -> None:
     """Show a reconstructed object under another light, from where the camera saw it.
 
     Args:
         run: The run directory.
         env: The light, a lat-long .hdr or .exr (+y up in the object's frame).
-        out: Where the pictures go; RUN/relit/<name of the light> when left out.
+        out: Where the pictures go; RUN/relit/<name of the light> when left out, numbered where another has that name.
         turntable: A film to write instead (.mp4): the object turns once about its +y axis.
         fast: Prefiltered light without shadows, instead of rays.
+        exposure: How much brighter the pictures are than the light makes them [stops].
     """
     from tumble.reconstruct import film_run, relight_run
 
     if turntable is not None:
-        film_run(run, env, turntable, fast=fast)
+        film_run(run, env, turntable, fast=fast, exposure=exposure)
         print(turntable)
         return
-    where = out or run / "relit" / env.stem
-    relight_run(run, env, where, fast=fast)
-    print(where)
+    print(relight_run(run, env, out, fast=fast, exposure=exposure))
 
 
 def export(

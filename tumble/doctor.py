@@ -79,7 +79,7 @@ def _codec() -> Finding:
 
 
 def _extras() -> Iterator[Finding]:
-    for extra, package in (("viewer", "viser"), ("cluster", "ray")):
+    for extra, package in (("view", "viser"), ("cluster", "ray")):
         if importlib.util.find_spec(package) is None:
             yield Finding(f"extra {extra}", "not installed", f"optional: pip install 'tumble[{extra}]'")
         else:

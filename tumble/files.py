@@ -1,21 +1,26 @@
 """Pictures and tables on disk: PNG, OpenEXR, Radiance HDR and JSON, read with the reason of every refusal.
 
 *Code values* are 8-bit numbers as a file stores them (sRGB for photographs); *radiance* is linear and in float32.
-Every writer makes a file that is whole or absent. Every reader raises `BadFile`, which names the file, the rule it
-broke and the fix, and reads a picture's size before its pixels: more than `MAX_PIXELS` are refused.
+Every writer makes a file that is whole or absent: it fills a *partial* one first, whose name says whose it is. Every
+reader raises `BadFile`, which names the file, the rule it broke and the fix, and reads a picture's size before its
+pixels: more than `MAX_PIXELS` are refused.
 """
 
+import contextlib
+import errno
 import json
 import math
 import os
+import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import OpenEXR
+import safetensors
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
@@ -23,11 +28,19 @@ MAX_PIXELS = 1 << 26
 """Largest picture read: 64 megapixels, an 8k x 8k light map; a larger one is a mistake or an attack."""
 
 
+PARTIAL = ".partial-"
+"""Begins the name of what is being written; the number of the process follows."""
+
+
 class BadFile(ValueError):
     """A file that breaks a rule of its format. The message names the file, the rule and the fix."""
 
     def __init__(self, path: Path, rule: str, fix: str = "") -> None:
         super().__init__(f"{path}: {rule}" + (f" ({fix})" if fix else ""))
+
+
+class Unwritten(OSError):
+    """A file that could not be written. The message names the file, the reason and the fix."""
 
 
 def inside(root: Path, name: str) -> Path:
@@ -42,18 +55,69 @@ def inside(root: Path, name: str) -> Path:
     return path
 
 
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let `write` fill a temporary file beside `path`, then put it in place in one step."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=".partial-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    partial = Path(name)
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the reasons why a file cannot be written into one sentence with the file and the fix.
+
+    Raises:
+        Unwritten: With the number of the system's error, where there is one.
+    """
     try:
-        write(partial)
-        partial.chmod(0o644)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        yield
+    except Unwritten:
+        raise
+    except (OSError, safetensors.SafetensorError) as error:
+        fixes = {
+            errno.ENOSPC: "free some space",
+            errno.EDQUOT: "free some space",
+            errno.EROFS: "choose a folder that can be written",
+            errno.EACCES: "choose a folder that you may write to",
+            errno.EPERM: "choose a folder that you may write to",
+        }
+        number = getattr(error, "errno", None)
+        advice = f"{fixes[number]}, " if number in fixes else ""
+        reason = f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}"
+        told = Unwritten(f"{reason} ({advice}what was finished before is kept; the same command goes on from there)")
+        told.errno = number
+        raise told from error
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Let `write` fill a partial file beside `path`, then put it in place in one step.
+
+    Raises:
+        Unwritten: The disk is full, or the folder may not be written; nothing is left behind.
+    """
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=partial_prefix(), suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        partial = Path(name)
+        try:
+            write(partial)
+            partial.chmod(0o644)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def partial_prefix() -> str:
+    """How the names of this process's partial files begin."""
+    return f"{PARTIAL}{os.getpid()}-"
+
+
+def sweep(folder: Path) -> None:
+    """Remove the partial files and folders that killed processes left under a folder, and what this one left."""
+    if os.name != "posix":
+        return  # nobody tells which processes live
+    for path in list(folder.rglob(f"{PARTIAL}*")):
+        owner = path.name.removeprefix(PARTIAL).partition("-")[0]
+        if owner.isdecimal() and int(owner) != os.getpid() and _alive(int(owner)):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def read_json(path: Path) -> Any:
@@ -119,17 +183,36 @@ def write_exr(path: Path, values: np.ndarray, *, half: bool = False) -> None:
     pixels = np.ascontiguousarray(values, np.float16 if half else np.float32)
     channels = {"Y": pixels[..., 0]} if pixels.shape[2] == 1 else {"RGB": pixels}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    write_whole(path, lambda partial: OpenEXR.File(header, channels).write(str(partial)))
+
+    def write(partial: Path) -> None:
+        try:
+            OpenEXR.File(header, channels).write(str(partial))
+        except RuntimeError as error:
+            # The library's words end with the system's reason.
+            raise OSError(str(error).rpartition('"')[2].strip(" .")) from None
+
+    write_whole(path, write)
 
 
 def write_hdr(path: Path, values: Float32[np.ndarray, "h w 3"]) -> None:
     """Linear radiance as a Radiance RGBE file; a colour keeps about 8 bits under its shared exponent."""
 
     def write(partial: Path) -> None:
-        if not cv2.imwrite(str(partial), values[..., ::-1]):
-            raise OSError(f"could not write {path}")
+        # OpenCV does not notice when the last block does not fit on the disk.
+        if not cv2.imwrite(str(partial), values[..., ::-1]) or cv2.imread(str(partial), cv2.IMREAD_UNCHANGED) is None:
+            raise OSError("is the disk full?")
 
     write_whole(path, write)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def _exists(path: Path) -> None:

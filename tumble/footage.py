@@ -20,7 +20,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from tumble import files, video
+from tumble import datasets, files, video
 from tumble.camera import Camera
 from tumble.capture import OBJECT
 from tumble.datasets import folder
@@ -96,6 +96,14 @@ def open_footage(path: Path, masks: Path | None = None) -> Footage:
     with Image.open(pictures[0]) as first:
         stated = first.getexif().get_ifd(EXIF_IFD).get(EXIF_EQUIVALENT_FOCAL)
     return Footage(path, pictures, mask_files, _positive(stated), None)
+
+
+def is_footage(path: Path) -> bool:
+    """Whether a path is a file, which may be a film, or a folder of pictures that is no capture yet."""
+    if not path.is_dir() or datasets.layouts(path):
+        return path.is_file()
+    inside = path / "images" if (path / "images").is_dir() else path
+    return any(p.suffix.lower() in PICTURES for p in inside.iterdir())
 
 
 def frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[Frame]:

@@ -6,6 +6,8 @@ masks to the edges of the larger picture. The window is the same for all frames,
 with its principal point moved.
 """
 
+import hashlib
+import json
 import math
 import shutil
 import tempfile
@@ -49,7 +51,7 @@ def capture_from_video(path: Path, out: Path, options: Options | None = None) ->
     kept = keep(found, options)
     window = crop_window(found, kept)
     out.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=out.parent))
+    partial = Path(tempfile.mkdtemp(prefix=files.partial_prefix(), dir=out.parent))
     try:
         _write(found, kept, window, partial, options)
         partial.chmod(0o755)
@@ -57,6 +59,16 @@ def capture_from_video(path: Path, out: Path, options: Options | None = None) ->
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return out
+
+
+def origin(path: Path, options: Options) -> dict[str, Any]:
+    """What decides a capture that footage becomes: its content, as a hash, and the options."""
+    digest = hashlib.sha256()
+    inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for one in inside:
+        with one.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return {"footage": digest.hexdigest(), "options": json.loads(json.dumps(vars(options), default=str))}
 
 
 def keep(found: Survey, options: Options) -> list[int]:
@@ -137,15 +149,16 @@ def _write(found: Survey, kept: list[int], window: tuple[int, int, int, int], ou
         report.append(_said(found, i, name))
     document = capture_writer.document(camera, "camera", entries, setting=None, with_light=False)
     preview(found, out / PREVIEW, kept)
-    origin = {
+    provenance = {
         "source": str(found.footage.path),
+        **origin(found.footage.path, options),
         "window_top_left_height_width": window,
         "focal_source": found.lens.source,
         "seed": None if found.seed is None else vars(found.seed),
         "seed_guessed": found.guessed,
         "frames": report,
     }
-    files.write_json(out / PROVENANCE, origin)
+    files.write_json(out / PROVENANCE, provenance)
     files.write_json(out / "transforms.json", document | {"focal_source": found.lens.source})
 
 

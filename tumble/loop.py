@@ -9,7 +9,6 @@ tells whether a file on disk was made with these settings.
 
 import contextlib
 import dataclasses
-import errno
 import hashlib
 import json
 import signal
@@ -150,6 +149,18 @@ def drive(
     return stage.finish(cfg, inputs, state)
 
 
+def peek(path: Path) -> tuple[int, dict[str, Tensor]]:
+    """The step of a checkpoint and its parameters by name, to look at.
+
+    Raises:
+        BadFile: It is not one.
+    """
+    about, tensors = _read(path)
+    return about["step"], {
+        name.removeprefix("params/"): value for name, value in tensors.items() if name.startswith("params/")
+    }
+
+
 def fingerprint(*parts: Any) -> str:
     """sha256 of plain facts and dataclasses of them, as canonical JSON; a dataclass counts with its name."""
 
@@ -162,32 +173,6 @@ def fingerprint(*parts: Any) -> str:
 
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=plain)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn the reasons why a file cannot be written into one sentence with the file and the fix.
-
-    Raises:
-        OSError: With the number of the system's error, where there is one.
-    """
-    try:
-        yield
-    except safetensors.SafetensorError as error:
-        raise OSError(f"{path}: cannot be written: {error}; what was finished before is kept") from error
-    except OSError as error:
-        fixes = {
-            errno.ENOSPC: "free some space",
-            errno.EDQUOT: "free some space",
-            errno.EROFS: "choose a folder that can be written",
-            errno.EACCES: "choose a folder that you may write to",
-            errno.EPERM: "choose a folder that you may write to",
-        }
-        advice = f"{fixes[error.errno]}, " if error.errno in fixes else ""
-        reason = f"{path}: cannot be written: {error.strerror or error}"
-        told = OSError(f"{reason} ({advice}what was finished before is kept; the same command goes on from there)")
-        told.errno = error.errno
-        raise told from error
 
 
 def _step(stage: Stage, cfg: Any, inputs: Any, state: State, checkpoint: Path | None) -> Mapping[str, Tensor | float]:
@@ -216,8 +201,7 @@ def _show(stage: Stage, cfg: Any, inputs: Any, state: State, path: Path) -> None
     with torch.no_grad():
         picture = preview(cfg, inputs, state)
     state.rng.set_state(before)
-    with writing(path):
-        files.write_png(path, picture.cpu().numpy())
+    files.write_png(path, picture.cpu().numpy())
 
 
 # The checkpoint -------------------------------------------------------------------------------------------------------
@@ -243,8 +227,7 @@ def _save(state: State, path: Path, key: str, seconds: float) -> None:
     owned = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
     about = {"key": key, "step": state.step, "seconds": seconds}
     data = safetensors.torch.save(owned, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
-    with writing(path):
-        files.write_whole(path, lambda partial: partial.write_bytes(data))
+    files.write_whole(path, lambda partial: partial.write_bytes(data))
 
 
 def _restore(state: State, path: Path, key: str) -> float:

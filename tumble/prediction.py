@@ -69,7 +69,7 @@ class Prediction:
         Each part is written beside its place first, so that none is ever half there; other files are left alone.
         """
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=path) as partial:
+        with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=path) as partial:
             _write_parts(self, Path(partial))
             for part in PARTS:
                 old, new = path / part, Path(partial) / part

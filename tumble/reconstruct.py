@@ -1,5 +1,7 @@
 """From a capture folder to an asset: the stages in order, kept in a run directory."""
 
+import hashlib
+import itertools
 import math
 import warnings
 from dataclasses import replace
@@ -15,6 +17,7 @@ from tumble import (
     evaluate,
     export,
     files,
+    footage,
     graph,
     ingest,
     matching,
@@ -40,6 +43,7 @@ from tumble.trajectory import Trajectory
 
 ASSET, POSES = "asset.safetensors", "poses.json"
 PREDICTION = "prediction"
+RELIT, LIGHT_NOTE = "relit", "light.json"
 LEAST_TRACKED = 8
 """A capture of which fewer frames have a pose shows too little of the object."""
 FILM_FRAMES, FILM_SIDE, FILM_ELEVATION = 90, 384, math.radians(20)
@@ -50,12 +54,21 @@ def ingested(path: Path, out: Path, options: Options) -> Path:
     """The capture folder to reconstruct: `path` itself, or what became of a film, in the run directory.
 
     Raises:
-        BadFile: The film cannot become a capture.
+        BadFile: The film cannot become a capture, or `out` holds that of another film or of other options.
     """
-    if not path.is_file():
+    if not footage.is_footage(path):
         return path
     made = out / run.CAPTURE
-    return made if made.exists() else ingest.capture_from_video(path, made, options)
+    with run.alone(out):
+        if not made.exists():
+            return ingest.capture_from_video(path, made, options)
+    note = made / ingest.PROVENANCE
+    found, wanted = files.read_json(note) if note.exists() else {}, ingest.origin(path, options)
+    different = [line for name in wanted for line in run.differences(found.get(name), wanted[name], name)]
+    if different:
+        rule = f"holds the capture of another film, or one made in another way: {'; '.join(different)}"
+        raise BadFile(out, rule, "choose another folder with -o, or remove this one")
+    return made
 
 
 def reconstruct(
@@ -76,6 +89,11 @@ def reconstruct(
     capture = which(capture_path).load(capture_path)
     if poses == "estimate":
         capture = replace(capture, trajectory=None)
+    with run.alone(out):
+        return _reconstruct(capture, capture_path, out, recipe)
+
+
+def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe) -> Asset:
     content = run.capture_key(capture)
     opened = run.open(out, capture_path, recipe, content=content)
     trajectory, keys, cfg = capture.trajectory, [content], recipe.refine
@@ -165,10 +183,14 @@ def _predict(out: Path, known: evaluate.Subject) -> str:
     return words
 
 
-def relight_run(out: Path, env: Path, pictures: Path, *, fast: bool) -> None:
-    """Write a run's object under another light as `0000.png`, ..., one per training frame.
+def relight_run(out: Path, env: Path, pictures: Path | None = None, *, fast: bool, exposure: float = 0.0) -> Path:
+    """Write a run's object under another light as `0000.png`, ..., one per training frame; returns their folder.
 
     The light's frame is the object's.
+
+    Args:
+        pictures: Left out: RELIT/<name of the light>, or with a number where another light has that name.
+        exposure: How much brighter the pictures are than the light makes them [stops].
 
     Raises:
         BadFile: There is no finished run in `out`, or the light cannot be read.
@@ -177,14 +199,30 @@ def relight_run(out: Path, env: Path, pictures: Path, *, fast: bool) -> None:
     still = Trajectory(asset.trajectory.T_cam_obj, "object")
     draw = relight.preview if fast else relight.relight
     views = draw(cfg, asset, light, still, asset.camera)
+    pictures = pictures or _relit_folder(out, env)
     for number, linear in enumerate(track(views, f"relighting under {env.stem}", len(still), transient=True)):
-        files.write_png(pictures / f"{number:04}.png", photograph(linear).numpy())
+        files.write_png(pictures / f"{number:04}.png", photograph(2**exposure * linear).numpy())
+    return pictures
 
 
-def film_run(out: Path, env: Path, film: Path, *, fast: bool) -> None:
+def _relit_folder(out: Path, env: Path) -> Path:
+    content = hashlib.sha256(env.read_bytes()).hexdigest()
+    for number in itertools.count(1):
+        folder = out / RELIT / (env.stem if number == 1 else f"{env.stem}-{number}")
+        note = folder / LIGHT_NOTE
+        if not note.is_file() or files.read_json(note).get("sha256") == content:
+            files.write_json(note, {"light": str(env.resolve()), "sha256": content})
+            return folder
+    raise AssertionError("numbers do not end")
+
+
+def film_run(out: Path, env: Path, film: Path, *, fast: bool, exposure: float = 0.0) -> None:
     """Write a film of a run's object that turns once about its +y axis under another light.
 
     Light and camera stand still; at the first frame the light's frame is the object's.
+
+    Args:
+        exposure: How much brighter the frames are than the light makes them [stops].
 
     Raises:
         BadFile: There is no finished run in `out`, or the light cannot be read.
@@ -199,7 +237,7 @@ def film_run(out: Path, env: Path, film: Path, *, fast: bool) -> None:
     draw = relight.preview if fast else relight.relight
     views = draw(cfg, asset, light.rotated(R_gl_obj), turning, camera)
     frames = track(views, f"turning under {env.stem}", FILM_FRAMES, transient=True)
-    video.write_clip(film, (photograph(linear).cpu().numpy() for linear in frames))
+    video.write_clip(film, (photograph(2**exposure * linear).cpu().numpy() for linear in frames))
 
 
 def export_run(out: Path, folder: Path, preset: export.Name, scale_mm: float | None) -> None:

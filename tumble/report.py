@@ -77,8 +77,7 @@ def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Healt
     if not path.exists():
         raise BadFile(path, "is the run's capture and is gone", "say where it is: --capture")
     taken = of_run(which(path).load(path), asset, list(files.read_json(out / "poses.json")), path)
-    lines = (out / run.LOG).read_text("utf-8").splitlines() if (out / run.LOG).is_file() else []
-    story = Story(path.stem, [json.loads(line) for line in lines if line], known["recipe"])
+    story = Story(path.stem, run.records(out), known["recipe"])
     with tempfile.TemporaryDirectory() as folder:
         glb = model(asset, Path(folder))
         build(asset, taken, glb, story, health, out / REPORT)

@@ -1,15 +1,17 @@
 """A run directory: the recipe, the log, and one folder per stage with what it made.
 
-    runs/mug/  recipe.json  log.jsonl  1-track/  2-refine/  3-decompose/
+    runs/mug/  recipe.json  log.jsonl  1-track/  2-refine/  3-decompose/       while a process works in it: .lock
     2-refine/  out.safetensors  stage.json  preview.png         while it trains: state.safetensors
 
 A *key* is a hash of all that decides a result: the stage and its version, its settings, the seed, and the keys of what
 it reads. A stage whose result is there under its key is not run again. Truth never enters a key.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import json
+import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,6 +28,7 @@ from tumble.files import BadFile
 CAPTURE = "capture"
 """The capture that a film became, in the run directory."""
 RECIPE, LOG, OUT, DONE, CHECKPOINT = "recipe.json", "log.jsonl", "out.safetensors", "stage.json", "state.safetensors"
+LOCK = ".lock"
 CHECKPOINTS = 20
 """A stage saves at most about this often: one on a GPU makes hundreds of steps in the time a save takes."""
 
@@ -37,6 +40,57 @@ class Run:
     path: Path
     recipe: Any
     """A frozen dataclass of the stages' settings, with a `seed`."""
+
+
+@contextlib.contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Work in a run directory in which no other process works; what a killed one left half-written is cleared away.
+
+    The lock is the system's, on a file in the directory: it ends with this process, however that ends.
+
+    Raises:
+        BadFile: Another process works in it.
+        OSError: The folder cannot be written.
+    """
+    _refuse_file(path)
+    if os.name != "posix":
+        yield  # other systems lack this kind of lock
+        return
+    made = not path.exists()
+    handle = _locked(path)
+    try:
+        files.sweep(path)
+        yield
+    finally:
+        (path / LOCK).unlink(missing_ok=True)
+        os.close(handle)
+        if made and not any(path.iterdir()):
+            path.rmdir()
+
+
+def _locked(path: Path) -> int:
+    """The handle of a run directory's lock, which is this process's alone."""
+    import fcntl
+
+    while True:
+        with files.writing(path / LOCK):
+            path.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(handle, 32).decode(errors="replace")
+            os.close(handle)
+            fix = "wait until it ends, or choose another folder with -o"
+            raise BadFile(path, f"is being worked in by another process, {owner}", fix) from None
+        except OSError:
+            return handle  # a file system without locks
+        # The process before this one removes the file before it lets go of the lock.
+        if (path / LOCK).exists() and os.path.samestat(os.stat(path / LOCK), os.fstat(handle)):
+            os.truncate(handle, 0)
+            os.write(handle, str(os.getpid()).encode())
+            return handle
+        os.close(handle)
 
 
 def open(path: Path, capture_path: Path, recipe: Any, *, content: str = "") -> Run:
@@ -59,11 +113,9 @@ def open(path: Path, capture_path: Path, recipe: Any, *, content: str = "") -> R
         "recipe": _plain(recipe),
     }
     file = path / RECIPE
-    if path.exists() and not path.is_dir():
-        raise BadFile(path, "is a file", "a run is a folder: choose another with -o")
-    if not path.exists() or not any(inside.name != CAPTURE for inside in path.iterdir()):
-        with loop.writing(file):
-            files.write_json(file, wanted)
+    _refuse_file(path)
+    if not path.exists() or not any(inside.name not in (CAPTURE, LOCK) for inside in path.iterdir()):
+        files.write_json(file, wanted)
         return Run(path, recipe)
     if not file.is_file():
         raise BadFile(path, "is there already and is no run", "choose another folder with -o")
@@ -71,11 +123,16 @@ def open(path: Path, capture_path: Path, recipe: Any, *, content: str = "") -> R
     if not isinstance(found, dict) or not {"capture", "recipe"} <= found.keys():
         raise BadFile(file, "is no recipe of a run", "choose another folder with -o")
     compared = ["recipe", "capture.content" if content and _at(found, "capture.content") else "capture.path"]
-    different = [line for name in compared for line in _differences(_at(found, name), _at(wanted, name), name)]
+    different = [line for name in compared for line in differences(_at(found, name), _at(wanted, name), name)]
     if different:
         rule = f"holds another run: {'; '.join(different)}"
         raise BadFile(path, rule, "choose another folder with -o, or remove this one")
     return Run(path, recipe)
+
+
+def _refuse_file(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise BadFile(path, "is a file", "a run is a folder: choose another with -o")
 
 
 def stage(run: Run, number: int, name: str, stage: loop.Stage, cfg: Any, inputs: Any, input_keys: Sequence[str]) -> Any:
@@ -116,6 +173,8 @@ def stage(run: Run, number: int, name: str, stage: loop.Stage, cfg: Any, inputs:
         about = {"stage": name, "version": stage.VERSION, "seed": seed, "inputs": list(input_keys)}
         _store(output, folder, {"key": own_key, **about, "config": _plain(cfg)})
         log(run, {"name": name, "event": "done", "seconds": round(time.perf_counter() - begun, 3)})
+    if (folder / CHECKPOINT).exists():
+        (folder / CHECKPOINT).unlink()  # of a process that was killed right after the last write
     return tree.load(_output_class(stage), folder / OUT, _device(inputs))
 
 
@@ -147,8 +206,21 @@ def log(run: Run, record: dict[str, Any]) -> None:
         OSError: The log cannot be written.
     """
     line = json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **record})
-    with loop.writing(run.path / LOG), (run.path / LOG).open("a", encoding="utf-8") as file:
-        file.write(line + "\n")
+    with files.writing(run.path / LOG), (run.path / LOG).open("ab+") as file:
+        # A killed process may have left half a line.
+        whole = not file.tell() or not file.seek(-1, os.SEEK_END) or file.read() == b"\n"
+        file.write(b"" if whole else b"\n")
+        file.write(f"{line}\n".encode())
+
+
+def records(path: Path) -> list[dict[str, Any]]:
+    """What the log of a run directory holds; a line that a killed process left half-written does not count."""
+    lines = (path / LOG).read_text("utf-8", errors="replace").splitlines() if (path / LOG).is_file() else []
+    found = []
+    for line in lines:
+        with contextlib.suppress(json.JSONDecodeError):
+            found.append(json.loads(line))
+    return [record for record in found if isinstance(record, dict)]
 
 
 # One stage's folder ---------------------------------------------------------------------------------------------------
@@ -163,7 +235,7 @@ def _is_done(folder: Path, own_key: str) -> bool:
 
 def _store(output: Any, folder: Path, about: dict[str, Any]) -> None:
     """Write the output, then its key, then drop the checkpoint: a key never stands beside another's output."""
-    with loop.writing(folder / OUT):
+    with files.writing(folder / OUT):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DONE).unlink(missing_ok=True)
         tree.save(output, folder / OUT)
@@ -202,8 +274,8 @@ def _at(document: Any, name: str) -> Any:
     return document
 
 
-def _differences(there: Any, here: Any, name: str) -> list[str]:
+def differences(there: Any, here: Any, name: str) -> list[str]:
     """One line for each value that differs between two documents, by its dotted name."""
     if not (isinstance(there, dict) and isinstance(here, dict)):
         return [] if there == here else [f"{name} is {there!r} there and {here!r} here"]
-    return [line for k in {**there, **here} for line in _differences(there.get(k), here.get(k), f"{name}.{k}")]
+    return [line for k in {**there, **here} for line in differences(there.get(k), here.get(k), f"{name}.{k}")]

@@ -92,6 +92,9 @@ class Options:
         }
         if broken := [name for name, kept in rules.items() if not kept]:
             raise ValueError(f"{broken[0]} is out of range: {getattr(self, broken[0])} (see tumble synth --help)")
+        stems = [Path(name).stem for name in self.relight]
+        if len(set(stems)) < len(stems):
+            raise ValueError(f"relight needs lights of different names, these are {', '.join(stems)}: rename one")
 
 
 @dataclass(frozen=True)

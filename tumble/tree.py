@@ -19,8 +19,10 @@ import torch
 from torch import Tensor
 
 from tumble import __version__, files
+from tumble.files import BadFile
 
 T = TypeVar("T")
+REMEDY = "remove it, and give the command that made it again"
 
 
 def map(fn: Callable[[Tensor], Tensor], tree: T) -> T:
@@ -61,17 +63,21 @@ def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
     """Read a tree of class `cls`.
 
     Raises:
-        ValueError: The file holds another class, or lacks a field; the message names both.
+        BadFile: The file is damaged, holds another class, or lacks a field; the message names both.
     """
-    with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
-        header = file.metadata() or {}
-        if header.get("type") != cls.__name__:
-            raise ValueError(f"{path}: holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}")
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     try:
+        with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
+            header = file.metadata() or {}
+            if header.get("type") != cls.__name__:
+                rule = f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}"
+                raise BadFile(path, rule, REMEDY)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
         return _build(cls, tensors, json.loads(header["facts"]), "")
+    except safetensors.SafetensorError as error:
+        raise BadFile(path, f"is damaged: {error}", REMEDY) from None
     except KeyError as missing:
-        raise ValueError(f"{path}: lacks {missing}, a field of {cls.__name__}; written by another version?") from None
+        rule = f"lacks {missing}, a field of {cls.__name__}; written by another version?"
+        raise BadFile(path, rule, REMEDY) from None
 
 
 def _fields(tree: object) -> dict[str, Any]:

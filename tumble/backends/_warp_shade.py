@@ -67,7 +67,7 @@ class Lobe:
     t_h2: float
     vh: float
     F: float
-    slope_F: float
+    slope: float
     g_w: float
     rest: float
     f: float
@@ -91,7 +91,7 @@ def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
     m = 1.0 - o.vh
     # brdf.fresnel, and its slope in m.
     o.F = f0 * (1.0 + 24.0 * m * m * m * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
-    o.slope_F = f0 * 24.0 * m * m * (2.9634 + m * (-15.5544 + m * (45.961 + m * (-57.7302 + m * 30.3121))))
+    o.slope = f0 * 24.0 * m * m * (2.9634 + m * (-15.5544 + m * (45.961 + m * (-57.7302 + m * 30.3121))))
     x = o.HH / o.t_h2
     o.rest = p.aa * x * x / (FOUR_PI * p.g_v * o.g_w)
     o.f = o.F * o.rest
@@ -180,7 +180,7 @@ def lobe_adjoint(p: Point, o: Lobe, v_f: float, v_n_w: float, sum: PointSums) ->
     root = 2.0 * o.g_w - o.n_w
     to.aa += v_log_f / p.aa + v_t_h2 * n_H * n_H + v_g_w * (1.0 - o.n_w * o.n_w) / (4.0 * root)
     to.n_v += v_n_H
-    v_HH = 2.0 * v_log_f / o.HH - v_f * o.rest * o.slope_F / (8.0 * o.vh)
+    v_HH = 2.0 * v_log_f / o.HH - v_f * o.rest * o.slope / (8.0 * o.vh)
     v_C = 2.0 * v_t_h2 * o.C
     to.n += wp.cross(p.v + o.w, v_C) + (v_n_w + v_n_H + v_g_w * 0.5 * (1.0 + (1.0 - p.aa) * o.n_w / root)) * o.w
     to.v += wp.cross(v_C, p.n) + 2.0 * v_HH * o.w

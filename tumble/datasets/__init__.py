@@ -21,10 +21,18 @@ def which(path: Path) -> ModuleType:
     Raises:
         BadFile: It has none that is known, or several; the message lists those there are.
     """
-    readers = {name: named("datasets", name) for name in names("datasets")}
-    found = [name for name, reader in readers.items() if reader.recognises(path)]
+    readers, found = _readers(), layouts(path)
     if len(found) == 1:
         return readers[found[0]]
-    layouts = "; ".join(f"{name}: {reader.LAYOUT}" for name, reader in readers.items())
+    known = "; ".join(f"{name}: {reader.LAYOUT}" for name, reader in readers.items())
     rule = "has no layout that is known" if path.is_dir() else "is not a folder"
-    raise BadFile(path, f"has the layouts of {' and '.join(found)}" if found else rule, f"known are {layouts}")
+    raise BadFile(path, f"has the layouts of {' and '.join(found)}" if found else rule, f"known are {known}")
+
+
+def layouts(path: Path) -> list[str]:
+    """Names of the layouts that a path has."""
+    return [name for name, reader in _readers().items() if reader.recognises(path)]
+
+
+def _readers() -> dict[str, ModuleType]:
+    return {name: named("datasets", name) for name in names("datasets")}

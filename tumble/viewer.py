@@ -1,0 +1,289 @@
+"""A run in the browser (extra `view`), while it goes on and after: cameras, Gaussians and their maps, the light.
+
+The world is the object's frame, +y up. Nodes: `/object` (Gaussians, or the points of stage 1), `/cameras/NAME`,
+`/path`, `/light` (a sphere of the light's colours, turned as the light stood in the chosen frame).
+"""
+
+import math
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from tumble import export, files, gallery, loop, run, tree
+from tumble.asset import Asset
+from tumble.capture import Capture
+from tumble.datasets import which
+from tumble.directions import texel_directions
+from tumble.environment import Environment
+from tumble.files import BadFile
+from tumble.gauge import Tracked
+from tumble.gaussians import Gaussians, opacity
+from tumble.images import resize_area, srgb_from_linear
+from tumble.material import Material
+from tumble.refine import Refined
+from tumble.se3 import SO3
+from tumble.trajectory import Trajectory
+
+SECONDS = 2.0
+"""Between two looks at the run."""
+CAMERAS, THUMBNAIL = 48, 96
+"""Cameras drawn at most, and the longer side of their photographs [pixels]."""
+SKY, SKY_ROWS, SKY_TEXEL = 12.0, 48, 0.85
+"""Radius of the sphere of light, beyond the cameras [object radius], its rows of points, and their size."""
+ASSET = "asset.safetensors"
+SOURCES = (
+    ASSET,
+    f"3-decompose/{run.CHECKPOINT}",
+    f"2-refine/{run.OUT}",
+    f"2-refine/{run.CHECKPOINT}",
+    f"1-track/{run.OUT}",
+)
+"""Where geometry is, the latest first."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a run directory shows at one moment; None where it does not know yet."""
+
+    stage: str
+    """Where the geometry is from, in words."""
+    gaussians: Gaussians | None = None
+    gamma: Float[Tensor, ""] | None = None
+    points: Float[Tensor, "n 3"] | None = None
+    """Of stage 1, before there are Gaussians; object frame."""
+    colours: dict[str, Float[Tensor, "n 3"]] = field(default_factory=dict)
+    """sRGB by the name of a map."""
+    trajectory: Trajectory | None = None
+    environment: Environment | None = None
+
+
+def look(out: Path, capture: Capture | None) -> Look:
+    """What is there: of an unfinished run the last checkpoint.
+
+    Raises:
+        BadFile: A file of the run is damaged.
+    """
+    source = next((name for name in SOURCES if (out / name).is_file()), "")
+    trajectory = _trajectory(out, capture)
+    if source == ASSET:
+        asset = tree.load(Asset, out / ASSET)
+        assert asset.material is not None, "an asset with material"
+        lit = torch.stack([torch.from_numpy(export.splats(asset, 1.0)[f"f_dc_{i}"]) for i in range(3)], -1)
+        colours = {"as photographed": 0.5 + export.SH_DC * lit} | _maps(asset.gaussians, asset.material)
+        shown = asset.gaussians, asset.gamma, None, colours, asset.trajectory, asset.environment
+        return Look("finished", *shown)
+    if source.startswith("3") or source.endswith(f"2-refine/{run.CHECKPOINT}"):
+        return _checkpoint(out / source, trajectory)
+    if source.startswith("2"):
+        refined = tree.load(Refined, out / source)
+        colours = {"albedo": srgb_from_linear(refined.albedo)} | _normals(refined.gaussians)
+        return Look("stage 2 finished", refined.gaussians, refined.gamma, None, colours, trajectory)
+    if source:
+        tracked = tree.load(Tracked, out / source)
+        colours = {"as photographed": srgb_from_linear(tracked.colours)}
+        return Look("stage 1 finished", points=tracked.points, colours=colours, trajectory=trajectory)
+    return Look("nothing yet", trajectory=trajectory)
+
+
+def _checkpoint(path: Path, trajectory: Trajectory | None) -> Look:
+    """A stage in training."""
+    step, params = loop.peek(path)
+    parts: dict[str, dict[str, Tensor]] = {}
+    for name, value in params.items():
+        part, _, leaf = name.removeprefix("points.").partition(".")
+        parts.setdefault(part, {})[leaf] = value
+    gaussians, gamma = Gaussians(**parts["gaussians"]), params["gamma"]
+    if "material" not in parts:
+        colours = {"albedo": srgb_from_linear(torch.sigmoid(params["points.albedo_logits"]))} | _normals(gaussians)
+        return Look(f"stage 2, step {step}", gaussians, gamma, None, colours, trajectory)
+    colours = _maps(gaussians, Material(**parts["material"]))
+    environment = Environment(**parts["environment"])
+    return Look(f"stage 3, step {step}", gaussians, gamma, None, colours, trajectory, environment)
+
+
+def _maps(gaussians: Gaussians, material: Material) -> dict[str, Float[Tensor, "n 3"]]:
+    albedo, rough = srgb_from_linear(material.albedo.mean(1)), material.roughness.mean(1, keepdim=True)
+    return {"albedo": albedo, "roughness": rough.expand(-1, 3)} | _normals(gaussians)
+
+
+def _normals(gaussians: Gaussians) -> dict[str, Float[Tensor, "n 3"]]:
+    return {"normals": 0.5 + 0.5 * gaussians.normals}
+
+
+def _trajectory(out: Path, capture: Capture | None) -> Trajectory | None:
+    """Of the frames that are used; those whose pose is lost are left out."""
+    if not (out / "1-track" / run.OUT).is_file():
+        return None if capture is None else capture.trajectory
+    tracked = tree.load(Tracked, out / "1-track" / run.OUT)
+    return tracked.trajectory.select(torch.where(~tracked.health.lost)[0])
+
+
+def _names(out: Path, capture: Capture) -> tuple[str, ...]:
+    """Of the frames of the trajectory."""
+    if not (out / "1-track" / run.OUT).is_file():
+        return capture.names
+    lost = tree.load(Tracked, out / "1-track" / run.OUT).health.lost.tolist()
+    return tuple(name for name, gone in zip(capture.names, lost, strict=True) if not gone)
+
+
+def progress(out: Path) -> str:
+    """What the log says last, as a line."""
+    records = [record for record in run.records(out) if "name" in record]
+    if not records:
+        return "no stage has begun"
+    last = records[-1]
+    if "step" not in last:
+        words = {"start": "begins", "done": f"finished after {last.get('seconds', 0):.0f} s"}
+        return f"{last['name']} {words.get(last.get('event', ''), 'finished')}"
+    metrics = ", ".join(f"{key} {value:.3g}" for key, value in last["metrics"].items() if value is not None)
+    return f"{last['name']}: step {last['step']} of {last['of']}, {last['eta']:.0f} s to go; {metrics}"
+
+
+# The browser ----------------------------------------------------------------------------------------------------------
+
+
+class Window:
+    """A server whose page follows a run; a class, because it remembers what the page shows."""
+
+    def __init__(self, out: Path, host: str, port: int) -> None:
+        viser = _viser()
+        if not out.is_dir() or not ((out / run.RECIPE).is_file() or (out / run.LOCK).exists()):
+            raise BadFile(out, "is no run", "give the folder of a `tumble run`, which may still be going on")
+        self.out, self.stamp, self.look = out, (), Look("nothing yet")
+        self.capture: Capture | None = None
+        self.names: tuple[str, ...] = ()
+        self.server = viser.ViserServer(host=host, port=port, label=f"tumble {out.name}", verbose=False)
+        self.server.scene.set_up_direction("+y")
+        self.server.scene.configure_fog(1.0, 2.0, enabled=False)
+        self.server.initial_camera.position = (0.9, 0.9, 2.4)
+        gui = self.server.gui
+        self.state = gui.add_markdown("")
+        self.map = gui.add_dropdown("Colour", ("as photographed",))
+        self.frame = gui.add_slider("Frame", 0, 1, 1, 0)
+        self.photograph = gui.add_image(np.zeros((8, 8, 3), np.uint8), label="Photograph")
+        self.panorama = gui.add_image(np.zeros((8, 16, 3), np.uint8), label="Light")
+        self.sky = gui.add_checkbox("Light around the object", True)
+        self.map.on_update(lambda _: self._object())
+        self.frame.on_update(lambda _: self._choose())
+        self.sky.on_update(lambda _: self._choose())
+        self.refresh()
+
+    @property
+    def address(self) -> str:
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def refresh(self) -> None:
+        """Show what is there now."""
+        stamp = tuple((self.out / name).stat().st_mtime_ns for name in SOURCES if (self.out / name).is_file())
+        if self.capture is None and (self.out / run.RECIPE).is_file():
+            self.capture = _capture(self.out)
+        if (stamp, self.capture is None) != self.stamp:
+            self.stamp = stamp, self.capture is None
+            self.look = look(self.out, self.capture)
+            self._cameras()
+            self.map.options = tuple(self.look.colours) or ("as photographed",)
+            self._object()
+            self._light()
+            self._choose()
+        self.state.content = f"**{self.look.stage}**\n\n{progress(self.out)}"
+
+    def _object(self) -> None:
+        found = self.look
+        if not found.colours:
+            return
+        chosen = found.colours.get(self.map.value, next(iter(found.colours.values())))
+        colours = chosen.clamp(0, 1).detach().numpy()
+        if found.gaussians is None:
+            assert found.points is not None, "colours of something"
+            self.server.scene.add_point_cloud("/object", found.points.numpy(), colours, point_size=0.02)
+            return
+        gaussians, gamma = found.gaussians, found.gamma
+        assert gamma is not None, "Gaussians come with their sharpness"
+        axes = gaussians.R_obj_local * gaussians.scales[:, None]
+        centres, covariances, alpha = gaussians.means, axes @ axes.mT, opacity(gaussians.sdf, gamma)[:, None]
+        parts = (x.detach().numpy() for x in (centres, covariances))
+        self.server.scene.add_gaussian_splats("/object", *parts, colours, alpha.detach().numpy())
+
+    def _cameras(self) -> None:
+        trajectory, capture = self.look.trajectory, self.capture
+        if trajectory is None or capture is None:
+            return
+        self.names = _names(self.out, capture)
+        self.frame.max = len(self.names) - 1
+        T_obj_cam, camera = trajectory.T_cam_obj.inverse(), capture.camera
+        fov = 2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1]))
+        for i in np.linspace(0, len(self.names) - 1, min(CAMERAS, len(self.names))).round().astype(int):
+            self.server.scene.add_camera_frustum(
+                f"/cameras/{self.names[i]}",
+                fov,
+                camera.width / camera.height,
+                scale=0.2,
+                thickness=0.008,
+                color=(60, 110, 200),
+                image=_small(capture, self.names[i]),
+                wxyz=T_obj_cam.wxyz[i].numpy(),
+                position=T_obj_cam.xyz[i].numpy(),
+            )
+        self.server.scene.add_spline_catmull_rom("/path", T_obj_cam.xyz.numpy(), thickness=0.01, color=(60, 110, 200))
+
+    def _light(self) -> None:
+        if self.look.environment is None:
+            return
+        picture = gallery.panorama(self.look.environment, SKY_ROWS)
+        self.panorama.image = gallery.panorama(self.look.environment, 96)
+        around = SKY * texel_directions(SKY_ROWS, 2 * SKY_ROWS).reshape(-1, 3).numpy()
+        self.server.scene.add_point_cloud("/light", around, picture.reshape(-1, 3), point_size=SKY_TEXEL)
+
+    def _choose(self) -> None:
+        """Show the frame's photograph, and turn the light as it stood about the object then."""
+        if self.capture is not None and self.names:
+            self.photograph.image = _small(self.capture, self.names[min(self.frame.value, len(self.names) - 1)], 320)
+        light = self.server.scene.get_handle_by_name("/light")
+        if light is not None and self.look.trajectory is not None:
+            R_env_obj = self.look.trajectory.R_env_obj[min(self.frame.value, len(self.look.trajectory) - 1)]
+            light.wxyz = SO3.from_matrix(R_env_obj.T).wxyz.numpy()
+            light.visible = self.sky.value
+
+
+def view(out: Path, host: str, port: int) -> None:
+    """Serve a run until Ctrl-C.
+
+    Raises:
+        ModuleNotFoundError: viser is not installed; says how to.
+        BadFile: `out` is no run, or a file of it is damaged.
+    """
+    window = Window(out, host, port)
+    print(f"{window.address}   (Ctrl-C ends it; from another machine: ssh -L {port}:localhost:{port} THIS_MACHINE)")
+    try:
+        while True:
+            time.sleep(SECONDS)
+            window.refresh()
+    finally:
+        window.server.stop()
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("tumble view needs viser: pip install 'tumble[view]'") from None
+    return viser
+
+
+def _capture(out: Path) -> Capture | None:
+    """The run's photographs, if they are still where the run found them."""
+    path = Path(files.read_json(out / run.RECIPE)["capture"]["path"])
+    return which(path).load(path) if path.exists() else None
+
+
+def _small(capture: Capture, name: str, side: int = THUMBNAIL) -> UInt8[np.ndarray, "h w 3"]:
+    picture = capture.images[capture.names.index(name)]
+    scale = min(1.0, side / max(picture.shape[:2]))
+    size = (max(1, round(scale * length)) for length in picture.shape[:2])
+    return resize_area(picture.float(), *size).round().to(torch.uint8).numpy()
