@@ -24,7 +24,7 @@ from tumble.environment import Environment
 from tumble.gaussians import Gaussians
 from tumble.images import edge_aware
 from tumble.loop import State
-from tumble.material import TEMPERATURE, Material
+from tumble.material import DIELECTRIC, TEMPERATURE, Material
 from tumble.prefilter import prefilter
 from tumble.rasterize import rasterize
 from tumble.refine import Frame, Refined, frame
@@ -34,9 +34,11 @@ from tumble.trace import Visibility, build, moved, open_sky, surface_points, vis
 from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 
-VERSION = 4
+VERSION = 5
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
+BRIGHTEST = 0.9
+"""Albedo that 95 % of a surface stays below."""
 MOVED = 0.3
 """Of `trace.moved`, beyond which visibility is traced anew."""
 
@@ -58,8 +60,8 @@ class Rates:
     albedo: float = 0.025
     roughness: float = 0.025
     normal: float = 1e-3
-    f0: float = 0.0
-    """The paper fixes 0.04. One number for the object: a Lambertian surface cannot be fitted with a highlight."""
+    tint: float = 0.03
+    """Of the highlight against the diffuse light."""
     light: float = 0.01
     means: float = 1.6e-5
     """Geometry joins after the warm-up, about ten times slower than in stage 2. The paper: "from SVG-IR"."""
@@ -112,6 +114,12 @@ class Params:
     material: Material
     environment: Environment
     poses: Float[Tensor, "t 6"]
+    log_tint: Float[Tensor, "3"]
+    """How much brighter the highlight is than light and f0 as they stand make it.
+
+    The diffuse lobe shows the product of albedo and light. How it is shared out only the highlight says, which has the
+    colour of the light alone; a descent texel by texel hardly moves along that valley.
+    """
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
         environment=Environment.from_radiance(light.radiance / share),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
+        log_tint=albedo.new_zeros(3),
     )
     params = optim.leaves(params)
     optimizer = optim.adam(params, _rates(cfg))
@@ -156,7 +165,7 @@ def _rates(cfg: Config) -> dict[str, float]:
         "material.albedo_logits": rates.albedo,
         "material.roughness_logits": rates.roughness,
         "material.normal_offset": rates.normal,
-        "material.f0_logit": rates.f0,
+        "material.f0_logit": 0.0,
         "environment": rates.light,
         "gaussians.means": rates.means,
         "gaussians.quats": rates.quats,
@@ -165,6 +174,7 @@ def _rates(cfg: Config) -> dict[str, float]:
         "gaussians.sh": 0.0,
         "gamma": 0.0,
         "poses": rates.poses,
+        "log_tint": rates.tint,
     }
 
 
@@ -255,7 +265,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     joined = float(state.step >= cfg.warmup)
     slow = 0.1 ** (state.step / cfg.steps)
     optim.anneal(
-        state.optimizer, {"material": slow, "environment": slow, "gaussians": joined * slow, "poses": joined * slow}
+        state.optimizer,
+        {"material": slow, "environment": slow, "log_tint": slow, "gaussians": joined * slow, "poses": joined * slow},
     )
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
@@ -280,7 +291,7 @@ def _shaded(
         prefilter(params.environment),
         R_env_obj,
         seen,
-        f0=params.material.f0,
+        f0=params.material.f0 * params.log_tint.exp(),
         bounce=_bounce(cfg, params),
     )
 
@@ -338,9 +349,33 @@ def _grow_light(cfg: Config, state: State) -> None:
 
 
 @torch.no_grad()
+def shared_out(params: Params) -> Params:
+    """The same with the tint of the highlight moved where it belongs: into the light, and out of the albedo.
+
+    The highlight of a dielectric is grey. Where the tint would leave an albedo above 1, it is the object that has less
+    of a highlight than glass, and the fainter that is, the less its colour counts.
+    """
+    albedo = params.material.albedo
+    bound = (albedo.flatten(0, 1).quantile(0.95, dim=0) / BRIGHTEST).log()
+    faint = (bound - params.log_tint).max().clamp(min=0)
+    mean = params.log_tint.mean()
+    log_tint = mean + (-faint).exp() * (params.log_tint - mean)
+    log_tint = log_tint + (bound - log_tint).max().clamp(min=0)
+    f0 = (params.material.f0 * (params.log_tint - log_tint).exp()).mean().clamp(max=DIELECTRIC)
+    lit = (albedo / log_tint.exp()).clamp(max=0.98)
+    material = replace(
+        params.material,
+        albedo_logits=TEMPERATURE * torch.logit(lit),
+        f0_logit=torch.logit(f0 / (2 * DIELECTRIC)),
+    )
+    environment = Environment(params.environment.log_radiance + log_tint)
+    return replace(params, material=material, environment=environment, log_tint=torch.zeros_like(log_tint))
+
+
+@torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable object."""
-    params = state.params if cfg.corners else uncornered(state.params)
+    params = shared_out(state.params if cfg.corners else uncornered(state.params))
     T_cam_obj = SE3.exp(params.poses) @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,

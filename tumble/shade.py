@@ -163,7 +163,7 @@ def shade_split(
     R_env_obj: Float[Tensor, "3 3"],
     visibility: Visibility,
     *,
-    f0: float | Float[Tensor, ""],
+    f0: float | Float[Tensor, "*c"],
     bounce: Bounce | AveragedBounce | None = None,
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance, the diffuse lobe summed over the directions, the specular one too where it is wide.
@@ -188,7 +188,7 @@ def specular(
     roughness: Float[Tensor, "p 1"],
     prefiltered: Prefiltered,
     R_env_obj: Float[Tensor, "3 3"],
-    f0: float | Float[Tensor, ""],
+    f0: float | Float[Tensor, "*c"],
 ) -> Float[Tensor, "p 3"]:
     """The specular lobe by the split sum, nothing in the way; unit normals and directions to the eye, object frame."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
