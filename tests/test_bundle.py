@@ -87,13 +87,15 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         assert float(slope) == pytest.approx(2 * float(system.g_point.flatten()[index]), rel=1e-4, abs=1e-3)
 
 
-def test_elimination_solves_the_whole_system() -> None:
-    """One group: the step equals that of the dense normal equations."""
+@pytest.mark.parametrize("short", [0, 3])
+def test_elimination_solves_the_whole_system(short: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One group: the step equals that of the dense normal equations, whichever way points are summed."""
+    monkeypatch.setattr(bundle, "SHORT", short)
     truth = scene(1, 3, 6)
     problem, at = seen(truth, noise=0.5), shaken(truth, 0.02)
     system = bundle._linearise(problem, at, 2.0)
     damping = torch.tensor([0.01]).double()
-    d_cam, d_point = bundle._solve(problem, at, system, damping, bundle._links(problem.tracks.point))
+    d_cam, d_point = bundle._solve(problem, at, system, damping, bundle._layout(problem))
     H = torch.zeros(36, 36).double()
     for c in range(3):
         H[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] = system.U[c]

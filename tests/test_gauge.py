@@ -10,7 +10,7 @@ from tumble import frontier, gauge
 from tumble.gauge import Solution
 from tumble.health import Observability
 from tumble.se3 import SE3, SO3
-from tumble.tracks import Tracks, build_tracks
+from tumble.tracks import Tracks, followed
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,8 @@ def outcome() -> gauge.Tracked:
     scene = tumbling(24)
     rng = torch.Generator().manual_seed(0)
     pairs = [(t - k, t) for k in (1, 2) for t in range(k, 24) if not {7, 12} & {t - k, t}]
-    tracks = build_tracks([scene.match(i, j, rng, noise=0.0, wrong=0.0) for i, j in pairs])
+    matches = [scene.match(i, j, rng, noise=0.0, wrong=0.0) for i, j in pairs]
+    tracks = followed(matches, torch.full((24,), 5.0))
     scene.capture.masks[7] = 0
     R = scene.T_cam_obj.rotation.matrix().clone()
     R[12] = SO3.exp(torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64)).matrix() @ R[12]

@@ -29,6 +29,8 @@ FRONT = 0.6
 """How far towards the camera a visible point is first believed to be [half chord]."""
 TRUST_FRONT = 0.003
 """Weight of that belief against the rays of all frames that show the point."""
+SHORT = 3
+"""Observations of a point up to which pairs of them are summed one by one."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,21 @@ class _System:
     g_point: Float[Tensor, "n 3"]
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """Who shares points with whom: what elimination couples."""
+
+    a: Int64[Tensor, " l"]
+    """Ordered pairs of observations of one point, for points with few."""
+    b: Int64[Tensor, " l"]
+    long: Int64[Tensor, " m"]
+    """Observations of all other points."""
+    column: Int64[Tensor, " n"]
+    """Number of those points within their group."""
+    columns: int
+    """Most of a group."""
+
+
 def adjust(
     problem: Problem, scene: Scene, *, steps: int, scale: float, tolerance: float = 1e-4
 ) -> tuple[Scene, Float[Tensor, " g"]]:
@@ -96,12 +113,12 @@ def adjust(
         scale: Residual at which Cauchy's loss starts to forgive [pixels].
         tolerance: A group is done when an iteration lowers its cost by less than this share.
     """
-    links = _links(problem.tracks.point)
+    layout = _layout(problem)
     damping = torch.full((len(scene.R),), 1e-3, dtype=torch.float64)
     system = _linearise(problem, scene, scale)
     done = torch.zeros_like(damping, dtype=torch.bool)
     for _ in range(steps):
-        d_cam, d_point = _solve(problem, scene, system, damping, links)
+        d_cam, d_point = _solve(problem, scene, system, damping, layout)
         moved = _moved(scene, d_cam, d_point)
         fresh = _linearise(problem, moved, scale)
         better = fresh.cost < system.cost
@@ -113,15 +130,24 @@ def adjust(
     return scene, system.cost
 
 
-def _links(point: Int64[Tensor, " o"]) -> tuple[Tensor, Tensor]:
-    """All ordered pairs of observations of one point."""
-    order = torch.argsort(point, stable=True)
-    count = torch.bincount(point)
-    begin = torch.cumsum(count, 0) - count
+def _layout(problem: Problem) -> _Layout:
+    point = problem.tracks.point
+    count = torch.bincount(point, minlength=len(problem.group))
+    short, many = count[point] <= SHORT, count > SHORT
+    order = torch.nonzero(short)[:, 0][torch.argsort(point[short], stable=True)]
     size = count[point[order]]
+    begin = torch.nonzero(torch.cat([size.new_ones(1), point[order].diff()]))[:, 0] if len(order) else size
+    begin = torch.repeat_interleave(begin, count[point[order][begin]])
     first = torch.repeat_interleave(torch.arange(len(order)), size)
     offset = torch.arange(len(first)) - (torch.cumsum(size, 0) - size)[first]
-    return order[first], order[begin[point[order]][first] + offset]
+    # Points with many observations are numbered within their group.
+    column = torch.zeros_like(count)
+    n = 0
+    for group in range(int(problem.group.max()) + 1 if len(problem.group) else 0):
+        mine = many & (problem.group == group)
+        column[mine] = torch.arange(int(mine.sum()))
+        n = max(n, int(mine.sum()))
+    return _Layout(order[first], order[begin[first] + offset], torch.nonzero(~short)[:, 0], column, n)
 
 
 def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
@@ -183,7 +209,7 @@ def _camera_priors(problem: Problem, scene: Scene, U: Tensor, g_cam: Tensor) -> 
 
 
 def _solve(
-    problem: Problem, scene: Scene, system: _System, damping: Float[Tensor, " g"], links: tuple[Tensor, Tensor]
+    problem: Problem, scene: Scene, system: _System, damping: Float[Tensor, " g"], layout: _Layout
 ) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"]]:
     g, f = scene.t.shape[:2]
     lam_cam, lam_point = damping.repeat_interleave(f)[:, None], damping[problem.group][:, None]
@@ -193,13 +219,18 @@ def _solve(
     )
     V_inv = torch.linalg.inv(V)
     Y = system.W @ V_inv[problem.tracks.point]
-    a, b = links
-    blocks = Y[a] @ system.W[b].mT
+    a, b, frame = layout.a, layout.b, problem.tracks.frame
     S = torch.zeros(g * f * f, 6, 6, dtype=torch.float64)
-    S.index_add_(0, problem.tracks.frame[a] * f + problem.tracks.frame[b] % f, -blocks)
+    S.index_add_(0, frame[a] * f + frame[b] % f, -(Y[a] @ system.W[b].mT))
     S = S.reshape(g, f, f, 6, 6)
     S.diagonal(dim1=1, dim2=2).add_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
     S = S.permute(0, 1, 3, 2, 4).reshape(g, 6 * f, 6 * f)
+    # One product of matrices instead of a sum over pairs: there are as many as a track's length squared.
+    half = torch.zeros(g * f, layout.columns, 6, 3, dtype=torch.float64)
+    point = problem.tracks.point[layout.long]
+    half[frame[layout.long], layout.column[point]] = system.W[layout.long] @ torch.linalg.cholesky(V_inv)[point]
+    half = half.transpose(1, 2).reshape(g, 6 * f, 3 * layout.columns)
+    S = S - half @ half.mT
     right = -system.g_cam
     right = right.index_add(0, problem.tracks.frame, (Y @ system.g_point[problem.tracks.point][..., None])[..., 0])
     d_cam = torch.linalg.solve(S, right.reshape(g, 6 * f, 1)).reshape(g * f, 6)

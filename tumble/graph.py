@@ -26,11 +26,11 @@ from tumble.loop import State
 from tumble.match import Match
 from tumble.pairwise import Silhouettes
 from tumble.relocate import Judge, cost, hypotheses, relocate
-from tumble.tracks import Tracks, anchored, build_tracks, joined
+from tumble.tracks import Tracks, followed, joined
 
-VERSION = 1
-ANCHORS = 150
-"""Starting points of tracks per frame."""
+VERSION = 2
+POINTS = 150
+"""Tracks that pass through a frame."""
 CONTRADICTS = 1.5
 """Loss of a frame's outline over the median from which the frame is given a second look: alone, with outlines only, a
 good pose gets worse."""
@@ -46,7 +46,7 @@ class Config:
 
     windows: tuple[int, ...] = (6, 12)
     """Sizes of the windows, rising [frames]."""
-    window_points: int = 80
+    window_points: int = 250
     """Most tracks of a window."""
     schedule: tuple[float, ...] = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5)
     """Residual at which the loss starts to forgive, per round of windows [pixels]."""
@@ -103,7 +103,7 @@ def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
     if not bool(shapes.visible.any()):
         raise ValueError("no mask has an object pixel: there is nothing to find poses of")
     area = math.pi * (shapes.radius * _focal(capture) / pairwise.ROUNDNESS).square()
-    tracks = build_tracks(anchored(matches, (area / ANCHORS).sqrt().clamp_min(2.0)))
+    tracks = followed(matches, (area / POINTS).sqrt().clamp_min(2.0))
     radius = FULL * float(shapes.radius[shapes.visible].median())
     return Inputs(capture, matches, shapes, frontier.outlines(capture), tracks, radius)
 
