@@ -19,7 +19,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     return 0
 
 
-@pytest.mark.parametrize("command", ["doctor", "synth", "check", "run", "relight", "export", "evaluate", "demo"])
+@pytest.mark.parametrize(
+    "command", ["doctor", "synth", "check", "run", "view", "relight", "export", "report", "evaluate", "demo"]
+)
 def test_every_command_explains_itself(
     command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -87,8 +87,10 @@ def _locked(path: Path) -> int:
             return handle  # a file system without locks
         # The process before this one removes the file before it lets go of the lock.
         if (path / LOCK).exists() and os.path.samestat(os.stat(path / LOCK), os.fstat(handle)):
-            os.truncate(handle, 0)
-            os.write(handle, str(os.getpid()).encode())
+            # For people only; a full disk is told of when there is something to keep.
+            with contextlib.suppress(OSError):
+                os.truncate(handle, 0)
+                os.write(handle, str(os.getpid()).encode())
             return handle
         os.close(handle)
 
