@@ -44,7 +44,7 @@ STANDARD = replace(
         warmup=2_000,
         doublings=3,
         weights=DecomposeWeights(light=0.02, material=0.02),
-        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03),
+        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
     ),
 )
 
@@ -68,7 +68,7 @@ DRAFT = replace(
         directions=256,
         doublings=1,
         weights=DecomposeWeights(light=0.002, material=0.01),
-        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05),
+        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
 )
