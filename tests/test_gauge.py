@@ -1,12 +1,14 @@
 """The gauge of stage 1's outcome, and what is said about frames and axes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from tests.lopsided import DISTANCE, KNOBS, tumbling
 from tumble import frontier, gauge
+from tumble.capture import BACKGROUND, OBJECT, Capture
 from tumble.gauge import Solution
 from tumble.health import Observability
 from tumble.se3 import SE3, SO3
@@ -24,7 +26,7 @@ def outcome() -> gauge.Tracked:
     scene.capture.masks[7] = 0
     R = scene.T_cam_obj.rotation.matrix().clone()
     R[12] = SO3.exp(torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64)).matrix() @ R[12]
-    solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE)
+    solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE, torch.zeros(24))
     return gauge.finished(scene.capture, tracks, frontier.outlines(scene.capture), solution)
 
 
@@ -70,25 +72,49 @@ def test_poses_at_the_ends_repeat_the_closest() -> None:
     torch.testing.assert_close(bridged.xyz[2], (T.xyz[1] + T.xyz[3]) / 2)
 
 
-def test_points_on_one_axis_leave_the_turn_about_it_unseen() -> None:
-    """All points on the object's y axis: nothing tells how far it is turned about it."""
+def on_an_axis() -> tuple[Capture, Tracks, Solution]:
+    """A ball before a still camera; all its points lie on its y axis."""
     scene = tumbling(12)
     line = torch.linspace(-0.8, 0.8, 30, dtype=torch.float64)
     points = torch.stack([0 * line, line, 0 * line], -1)
     camera = scene.capture.camera
     n = len(points)
-    R, t = scene.T_cam_obj.rotation.matrix(), scene.T_cam_obj.xyz / DISTANCE
+    R = scene.T_cam_obj.rotation.matrix()
+    t = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(12, 3)
     X = points / DISTANCE
     frame, point = torch.arange(12).repeat_interleave(n), torch.arange(n).repeat(12)
     x = torch.einsum("oij,oj->oi", R[frame], X[point]) + t[frame]
     focal, principal = camera.fx_fy_cx_cy.double().split(2)
     tracks = Tracks(frame, point, x[:, :2] / x[:, 2:] * focal + principal)
-    tracked = gauge.finished(scene.capture, tracks, frontier.outlines(scene.capture), Solution(R, t, 0.9 / DISTANCE))
-    seen = tracked.health.observability
+    disc = (camera.pixel_centers() - principal).norm(dim=-1) < 0.8 / DISTANCE * focal[0]
+    masks = torch.where(disc, OBJECT, BACKGROUND).to(torch.uint8).expand(12, -1, -1)
+    return replace(scene.capture, masks=masks), tracks, Solution(R, t, 0.8 / DISTANCE, torch.zeros(12))
+
+
+def test_texture_on_one_axis_leaves_the_turn_about_it_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing tells how far the ball is turned about the axis that holds all its texture."""
+    capture, tracks, solution = on_an_axis()
+    sharp = 10 * torch.eye(2, dtype=torch.float64).expand(len(tracks), 2, 2)
+    monkeypatch.setattr(gauge.texture, "information", lambda capture, tracks: sharp)
+    health = gauge.finished(capture, tracks, frontier.outlines(capture), solution).health
+    seen = health.observability
     assert seen.unseen
-    expected = R[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # the object frame is that of the first view
+    assert not seen.plain
+    # The object frame is that of the first view.
+    expected = solution.R[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     assert abs(float(seen.axis.double() @ expected)) > 0.98
-    assert "looks the same when it turns" in seen.sentence
+    assert seen.sentence.startswith("Rotation about axis (")
+    assert health.verdict == "bad"
+    assert health.sentence == seen.sentence
+
+
+def test_a_plain_ball_shows_no_turn() -> None:
+    """Grey pictures, round outlines: whatever the matches say, it is not to be believed."""
+    capture, tracks, solution = on_an_axis()
+    health = gauge.finished(capture, tracks, frontier.outlines(capture), solution).health
+    assert health.observability.plain
+    assert health.verdict == "bad"
+    assert health.sentence.startswith("Rotation is not observable")
 
 
 def test_a_seen_object_is_said_to_be_seen() -> None:

@@ -17,7 +17,7 @@ LAYERS = [
     {"brdf", "camera", "trajectory"},
     {"gaussians", "material", "environment", "buffers", "coarse_light"},
     {"capture", "asset", "match"},
-    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"},
+    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"} | {"texture"},
     {"prefilter", "shade", "importance", "mesh", "hull"},
     {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching"}
     | {"pairwise", "averaging", "bundle", "relocate", "gauge"},

@@ -50,7 +50,7 @@ def test_a_turn_about_the_viewing_axis_is_exact() -> None:
     turned = (uv[facing] - centre) @ turn.T + centre
     exact = type(match)(0, 1, uv[facing], turned, torch.ones(int(facing.sum())))
     shapes = pairwise.silhouettes(scene.capture)
-    same = pairwise.Silhouettes(shapes.centre[[0, 0]], shapes.radius[[0, 0]], shapes.visible[[0, 0]])
+    same = pairwise.Silhouettes(*(getattr(shapes, k)[[0, 0]] for k in ("centre", "radius", "extent", "visible")))
     found = pairwise.fit([exact], same, scene.capture.camera)
     expected = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64)
     torch.testing.assert_close(SO3.from_matrix(found.R_j_i[0]).log(), expected, atol=0.02, rtol=0)
@@ -67,3 +67,18 @@ def test_silhouettes_are_measured() -> None:
     assert shapes.centre[0].tolist() == [20, 35]
     assert float(shapes.radius[0]) == pytest.approx(pairwise.ROUNDNESS * (200 / torch.pi) ** 0.5 / 100)
     assert shapes.visible.tolist() == [True, False]
+
+
+def test_a_silhouette_that_jumps_is_odd_and_mended() -> None:
+    """Five frames in a row grow by five percent each; one is cut in half, another moved aside."""
+    radius = 0.1 * 1.05 ** torch.arange(9, dtype=torch.float64)
+    centre = torch.full((9, 2), 64.0, dtype=torch.float64)
+    shapes = pairwise.Silhouettes(centre, radius, torch.full((9,), 30.0), torch.ones(9, dtype=torch.bool))
+    assert not pairwise.odd(shapes).any()
+    radius[3] *= 0.7
+    centre[6, 0] += 15
+    found = pairwise.odd(shapes)
+    assert torch.nonzero(found)[:, 0].tolist() == [3, 6]
+    whole = pairwise.mended(shapes, found)
+    assert float(whole.radius[3]) in (float(radius[2]), float(radius[4]))
+    assert whole.centre[6].tolist() == [64, 64]

@@ -175,7 +175,7 @@ def test_the_card_names_drift_lost_frames_and_outliers(asset: Asset, capture: Ca
     lost[3] = True
     ones = torch.ones(N)
     sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
-    health = Health(4 * ones, 50 * ones, ones, ones, lost, sight)
+    health = Health(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), sight)
     frames = list(rerender.frames(rerender.scene(asset), spoilt))
     fit, outline, exposure, away, match, _ = diagnosis.card(frames, health, confidence.confidence(asset, asset.camera))
     assert fit.marks[0] == "bad" or fit.verdict != "good"

@@ -150,12 +150,11 @@ def _layout(problem: Problem) -> _Layout:
     return _Layout(order[first], order[begin[first] + offset], torch.nonzero(~short)[:, 0], column, n)
 
 
-def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
-    g, f = scene.t.shape[:2]
+def _jacobians(
+    problem: Problem, scene: Scene, x: Float[Tensor, "o 3"]
+) -> tuple[Float[Tensor, "o 2 6"], Float[Tensor, "o 2 3"]]:
+    """Derivatives of the projections by poses (turn, shift) and by points."""
     focal = problem.camera.fx_fy_cx_cy.double()[:2]
-    residual, x = residuals(problem, scene)
-    squared = residual.square().sum(-1) / scale**2
-    w = problem.weight / (1 + squared)
     R = scene.R.flatten(0, 1)[problem.tracks.frame]
     z = x[:, 2].clamp_min(NEAREST)
     zero = torch.zeros_like(z)
@@ -168,7 +167,15 @@ def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
     )
     arm = x - scene.t.flatten(0, 1)[problem.tracks.frame]
     J_turn = torch.linalg.cross(arm[:, None].expand_as(J_x), J_x)
-    J_cam, J_point = torch.cat([J_turn, J_x], -1), J_x @ R
+    return torch.cat([J_turn, J_x], -1), J_x @ R
+
+
+def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
+    g, f = scene.t.shape[:2]
+    residual, x = residuals(problem, scene)
+    squared = residual.square().sum(-1) / scale**2
+    w = problem.weight / (1 + squared)
+    J_cam, J_point = _jacobians(problem, scene, x)
     wJ_cam, wJ_point = w[:, None, None] * J_cam, w[:, None, None] * J_point
     n, c = len(scene.X), g * f
     U = torch.zeros(c, 6, 6, dtype=torch.float64).index_add_(0, problem.tracks.frame, wJ_cam.mT @ J_cam)
@@ -268,9 +275,16 @@ def _choose(
     return scene, system
 
 
-def information(problem: Problem, scene: Scene, *, scale: float = 1.0) -> Float[Tensor, "c 6 6"]:
-    """Of every pose (turn, shift) with the points held and without priors, from residuals of one pixel."""
-    return _linearise(problem, scene, scale).U
+def information(problem: Problem, scene: Scene, precision: Float[Tensor, "o 2 2"]) -> Float[Tensor, "c 6 6"]:
+    """Of every pose (turn, shift) with the points held and without priors.
+
+    Args:
+        precision: Of every observation [1/pixel^2].
+    """
+    _, x = residuals(problem, scene)
+    J, _ = _jacobians(problem, scene, x)
+    U = torch.zeros(scene.t.shape[0] * scene.t.shape[1], 6, 6, dtype=torch.float64)
+    return U.index_add_(0, problem.tracks.frame, J.mT @ precision @ J)
 
 
 # Points from poses ----------------------------------------------------------------------------------------------------

@@ -11,12 +11,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble import bundle, hull
+from tumble import bundle, hull, relocate, texture
 from tumble.capture import BACKGROUND, UNKNOWN, Capture
 from tumble.frontier import Outlines, touch
 from tumble.health import Health, Observability
 from tumble.images import linear_from_srgb
-from tumble.se3 import SE3, SO3, interpolate
+from tumble.relocate import Judge
+from tumble.se3 import SE3, SO3, angle_between, interpolate
 from tumble.tracks import Tracks
 from tumble.trajectory import Trajectory
 
@@ -26,6 +27,8 @@ LOST = 8.0
 """Gap over the capture's median from which the outline contradicts the pose."""
 LEAST_GAP = 0.15
 """Median gap that is always forgiven [pixels]."""
+STRANGE = 0.1
+"""Overlap under the median from which a frame's silhouette contradicts the hull."""
 FEW = 8
 """Inliers under which matches do not hold a frame against its outline."""
 WIDE = 0.5
@@ -33,6 +36,8 @@ WIDE = 0.5
 STRAY = 1.1
 """Distance from the centre, over that which one point in twenty exceeds, from which a point is a wrong one: frontier
 points gather at the object's ends."""
+JUDGED, JUDGES = 24, 16
+"""Frames that are asked what their outline would say of a turn, and frames they are compared with."""
 CELLS = 48
 """Of the hull's grid, per side, and of the grid of rays that look at it."""
 
@@ -57,6 +62,8 @@ class Solution:
     t: Float[Tensor, "t 3"]
     radius: float
     """Of the object, roughly."""
+    drift: Float[Tensor, " t"]
+    """Angle between what tracks and what outlines would have preferred [radians]."""
 
 
 def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solution) -> Tracked:
@@ -73,19 +80,21 @@ def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solu
     median, inliers = _per_frame(residual, tracks.frame, len(R))
     worst = LOST * gap[~gap.isnan()].median().clamp_min(LEAST_GAP) if bool((~gap.isnan()).any()) else torch.inf
     visible = (capture.masks != BACKGROUND).flatten(1).any(1)
-    lost = ~visible | ((gap > worst) & (inliers < FEW)) | (gap.isnan() & (inliers < FEW))
+    failed = ~outline.sure.any(1)
+    lost = ~visible | failed | ((gap > worst) & (inliers < FEW)) | (gap.isnan() & (inliers < FEW))
     sure = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < AGREES).float()) >= 3
     centre, scale = _ball(torch.cat([rim, X[sure]]) if len(rim) < 50 else rim)
     R_first = R[0]
     origin = t + R @ centre
     T = SE3.from_rotation(SO3.from_matrix(R @ R_first.mT), origin / scale)
+    lost, overlap = _contradicting(capture, Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light), lost)
     T = _bridged(T, lost)
     trajectory = Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light)
     points = ((X[sure] - centre) / scale) @ R_first.mT
     colours = _colours(capture, tracks, residual, sure)
-    overlap = _overlap(capture, trajectory, lost)
-    observability = _observability(problem, scene, R_first)
-    health = Health(median.float(), inliers.float(), gap.float(), overlap, lost, observability)
+    observability = _observability(capture, outline, solution, problem, scene, residual < AGREES)
+    drift, turn = solution.drift.float(), angle_between(T.rotation[:, None], T.rotation).max().float()
+    health = Health(median.float(), inliers.float(), gap.float(), overlap, drift, lost, turn, observability)
     return Tracked(trajectory, points.float(), colours, health)
 
 
@@ -166,6 +175,24 @@ def _colours(
     return torch.stack([part.median(0).values for part in parts]) if parts else colour[:0]
 
 
+def _contradicting(
+    capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"]
+) -> tuple[Bool[Tensor, " t"], Float[Tensor, " t"]]:
+    """Lost frames, with those whose silhouette the hull of the others does not know; also the overlaps.
+
+    Frames that went astray together carve the hull of all: what they leave of it is looked at again without them.
+    """
+    for _ in range(3):
+        overlap = _overlap(capture, trajectory, lost)
+        if bool(lost.all()):
+            break
+        strange = overlap < overlap[~lost].median() - STRANGE
+        if not bool((strange & ~lost).any()):
+            break
+        lost = lost | strange
+    return lost, overlap
+
+
 def _overlap(capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"]) -> Float[Tensor, " t"]:
     """Intersection over union of silhouettes and the hull that those of frames not lost carve."""
     kept = torch.nonzero(~lost)[:, 0]
@@ -197,14 +224,37 @@ def _part(capture: Capture, frames: Sequence[int]) -> Capture:
     return replace(capture, images=capture.images[index], masks=capture.masks[index], names=names, trajectory=None)
 
 
-def _observability(problem: bundle.Problem, scene: bundle.Scene, R_first: Float[Tensor, "3 3"]) -> Observability:
-    """Uncertainty of a single frame's rotation by its matches, points held, translation free: typical over frames."""
-    information = bundle.information(problem, scene)
+def _observability(
+    capture: Capture,
+    outline: Outlines,
+    solution: Solution,
+    problem: bundle.Problem,
+    scene: bundle.Scene,
+    agrees: Tensor,
+) -> Observability:
+    """Uncertainty of a single frame's rotation by texture and outlines, points held, translation free: typical over
+    frames that texture shows anything of, and others."""
+    R, t, camera, n = solution.R, solution.t, capture.camera, len(solution.R)
+    textured = texture.information(capture, problem.tracks) * agrees[:, None, None]
+    # A place is never known better than to the noise of a good match.
+    precision = torch.linalg.inv(
+        torch.linalg.inv(textured + 1e-9 * torch.eye(2, dtype=torch.float64))
+        + bundle.NOISE**2 * torch.eye(2, dtype=torch.float64)
+    )
+    information = bundle.information(problem, scene, precision)
+    frames = torch.arange(0, n, max(1, n // JUDGED))
+    for k in frames.tolist():
+        others = torch.tensor([i for i in range(0, n, max(1, n // JUDGES)) if i != k])
+        own, theirs = outline[torch.tensor([k])], outline[others]
+        judge = Judge((R[others], t[others]), own, theirs, camera, solution.radius)
+        information[k] += relocate.information(judge, R[k], t[k])
+    information = information[frames]
     H = information[:, :3, :3] - information[:, :3, 3:] @ torch.linalg.solve(
         information[:, 3:, 3:] + 1e-9 * torch.eye(3, dtype=torch.float64), information[:, 3:, :3]
     )
-    R = R_first @ scene.R[0].mT  # from each camera to the object frame of the outcome
-    typical = (R @ H @ R.mT).median(0).values
+    R_first_cam = R[0] @ R[frames].mT  # from each camera to the object frame of the outcome
+    H = R_first_cam @ H @ R_first_cam.mT
+    total = H.diagonal(dim1=1, dim2=2).sum(-1)
+    typical = total.median() * (H / total.clamp_min(1e-9)[:, None, None]).mean(0)
     strength, axes = torch.linalg.eigh(typical)
-    sigma = bundle.NOISE / strength.clamp_min(1e-6).sqrt()
-    return Observability(axes[:, 0].float(), sigma.float())
+    return Observability(axes[:, 0].float(), strength.clamp_min(1 / torch.pi**2).rsqrt().float())

@@ -25,10 +25,11 @@ from tumble.gauge import Solution, Tracked, finished
 from tumble.loop import State
 from tumble.match import Match
 from tumble.pairwise import Silhouettes
-from tumble.relocate import Judge, cost, hypotheses, relocate
+from tumble.relocate import FEW, Judge, cost, hypotheses, relocate
+from tumble.se3 import SO3, angle_between, mean_rotation
 from tumble.tracks import Tracks, followed, joined
 
-VERSION = 2
+VERSION = 3
 POINTS = 150
 """Tracks that pass through a frame."""
 CONTRADICTS = 1.5
@@ -36,6 +37,8 @@ CONTRADICTS = 1.5
 good pose gets worse."""
 FORGIVEN = 0.1
 """Such loss that is always forgiven: a quarter of a pixel."""
+PREFERENCE = 6.0
+"""Factor on the weight of outlines when one witness is preferred: without the other neither holds all poses."""
 FULL = 1.1
 """The object's radius over that of the ball about its middling silhouette."""
 
@@ -54,10 +57,12 @@ class Config:
     """Likewise, per round of the whole capture."""
     again: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
     """Likewise, after frames have been relocated."""
+    preferring: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
+    """Likewise, where tracks or outlines are preferred, whose difference tells how far to trust the poses."""
     relocations: int = 2
     """How often contradicting frames are given a second look."""
-    frontier: float = 3.0
-    """Weight of a frontier point, of a match 1."""
+    frontier: float = 12.0
+    """Weight of a frontier point, of a match 1: outlines know nothing of shading, whose pull all matches share."""
     iterations: int = 4
     """Of the adjustment, per round: then the frontier has moved."""
     reach: int = 2
@@ -103,9 +108,13 @@ def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
     if not bool(shapes.visible.any()):
         raise ValueError("no mask has an object pixel: there is nothing to find poses of")
     area = math.pi * (shapes.radius * _focal(capture) / pairwise.ROUNDNESS).square()
+    outline = frontier.outlines(capture)
+    odd = pairwise.odd(shapes)
+    outline = replace(outline, sure=outline.sure & ~odd[:, None])
+    shapes = pairwise.mended(shapes, odd)
     tracks = followed(matches, (area / POINTS).sqrt().clamp_min(2.0))
     radius = FULL * float(shapes.radius[shapes.visible].median())
-    return Inputs(capture, matches, shapes, frontier.outlines(capture), tracks, radius)
+    return Inputs(capture, matches, shapes, outline, tracks, radius)
 
 
 def _focal(capture: Capture) -> float:
@@ -247,33 +256,50 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
     R, t = state.params.R.clone(), state.params.t.clone()
     n, camera = len(R), inputs.capture.camera
 
-    def judge(k: int) -> Judge:
-        others = torch.tensor([i for i in range(n) if i != k])
+    def judge(k: int, trusted: Tensor) -> Judge:
+        others = torch.nonzero(trusted & (torch.arange(n) != k))[:, 0]
         others = others[:: max(1, len(others) // 32)]
         return Judge(
             (R[others], t[others]), inputs.outline[torch.tensor([k])], inputs.outline[others], camera, inputs.radius
         )
 
-    before = torch.stack([cost(judge(k).gaps(R[k : k + 1], t[k : k + 1]), scale)[0] for k in range(n)])
+    every = torch.ones(n, dtype=torch.bool)
+    before = torch.stack([cost(judge(k, every).gaps(R[k : k + 1], t[k : k + 1]), scale)[0] for k in range(n)])
     calm = torch.nn.functional.avg_pool1d(before.nan_to_num(posinf=9.0)[None], 5, 1, 2, count_include_pad=False)[0]
-    seed, usual = int(calm.argmin()), float(before.median())
+    seed, limit = int(calm.argmin()), max(CONTRADICTS * float(before.median()), FORGIVEN)
+    # Frames that went astray together agree with each other: only those beyond doubt may judge.
+    trusted = before <= limit
     turns, middle = hypotheses(), _on_axis(inputs.capture, inputs.shapes)
     changed = 0
     for k in [*range(seed, n), *range(seed - 1, -1, -1)]:
-        if not before[k] > max(CONTRADICTS * usual, FORGIVEN):
+        if trusted[k] or int(trusted.sum()) < FEW:
             continue
         near = [i for i in (k, k - 1, k + 1) if 0 <= i < n]
         R_try = torch.cat([R[k : k + 1], *(turns @ R[i] for i in near)])
         t_try = torch.cat([t[k : k + 1], (middle[k] * t[near, 2].mean()).expand(len(R_try) - 1, 3)])
-        (R_new, t_new), after = relocate(judge(k), R_try, t_try, scale=scale)
-        if after < 0.9 * before[k]:
+        now = cost(judge(k, trusted).gaps(R_try[:1], t_try[:1]), scale)[0]
+        (R_new, t_new), after = relocate(judge(k, trusted), R_try, t_try, scale=scale)
+        if after < 0.9 * now:
             R[k], t[k] = R_new, t_new
             changed += 1
+        trusted[k] = after <= limit
     return Poses(R, t), {"relocated": float(changed)}
 
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Tracked:
     """Poses in the object's own unit and frame, its points, and how far to trust them."""
-    solution = Solution(state.params.R, state.params.t, inputs.radius)
+    solution = Solution(state.params.R, state.params.t, inputs.radius, _drift(cfg, inputs, state))
     return finished(inputs.capture, inputs.tracks, inputs.outline, solution)
+
+
+def _drift(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
+    """Angle between the rotations that tracks and outlines, the two witnesses, would each have preferred [radians]."""
+    preferred = []
+    for weight in (cfg.frontier / PREFERENCE, cfg.frontier * PREFERENCE):
+        alone = State(0, state.params, None, torch.Generator().manual_seed(0))
+        for scale in cfg.preferring:
+            alone.params, _ = _whole(replace(cfg, frontier=weight), inputs, alone, scale)
+        preferred.append(SO3.from_matrix(alone.params.R).inverse())
+    a, b = preferred
+    return angle_between(b, mean_rotation(b @ a.inverse()) @ a)

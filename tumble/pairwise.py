@@ -10,8 +10,9 @@ Two rotations can explain two nearly affine pictures equally well (Necker's reve
 another one is kept beside the best as its *rival*.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -30,6 +31,8 @@ BEHIND = -0.5
 """Where the far end is, from the middle of the chord, over half its length: all in the front half. Two views tell the
 angle only up to the object's depth (bas-relief), and this belief is what keeps it near; with points allowed behind the
 middle, half of all fits were mirror images."""
+JUMP = 0.2
+"""Change against the frames around from which a mask has failed [logarithm of the radius; half the box's diagonal]."""
 LEAST = 8
 """Matches from which a pair is worth fitting."""
 SOFT = 2.0
@@ -50,6 +53,8 @@ class Silhouettes:
     """Middle of the bounding box [pixels]."""
     radius: Float[Tensor, " t"]
     """Of the ball about the object, over its distance, positive."""
+    extent: Float[Tensor, " t"]
+    """Half the diagonal of the bounding box [pixels]."""
     visible: Bool[Tensor, " t"]
     """Whether the mask has any pixel of it."""
 
@@ -109,19 +114,41 @@ def silhouettes(capture: Capture) -> Silhouettes:
     Where there is no object, the middle of the picture and the usual size stand.
     """
     camera = capture.camera
-    centres, radii, visible = [], [], []
+    centres, radii, extents, visible = [], [], [], []
     for mask in capture.masks != BACKGROUND:
         rows, columns = torch.nonzero(mask.any(1))[:, 0], torch.nonzero(mask.any(0))[:, 0]
         seen = len(rows) > 0
         box = [columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1] if seen else [camera.width, camera.height]
         centres.append([0.5 * float(x) for x in box])
         radii.append(float(mask.sum()) / torch.pi)
+        sides = [float(columns[-1] - columns[0]), float(rows[-1] - rows[0])] if seen else [1.0, 1.0]
+        extents.append(0.5 * math.hypot(*sides))
         visible.append(seen)
     focal = camera.fx_fy_cx_cy[:2].double().prod().sqrt()
     radius = ROUNDNESS * torch.tensor(radii, dtype=torch.float64).sqrt() / focal
     seen = torch.tensor(visible)
     usual = radius[seen].median() if bool(seen.any()) else radius.new_tensor(1.0)
-    return Silhouettes(torch.tensor(centres, dtype=torch.float64), torch.where(seen, radius, usual), seen)
+    centre, extent = (torch.tensor(values, dtype=torch.float64) for values in (centres, extents))
+    return Silhouettes(centre, torch.where(seen, radius, usual), extent, seen)
+
+
+def odd(shapes: Silhouettes) -> Bool[Tensor, " t"]:
+    """Frames whose silhouette jumps in size or place against those before and after: a mask that failed."""
+    n, reach = len(shapes.radius), 3
+    near = (torch.arange(n)[:, None] + torch.arange(-reach, reach + 1)).clamp(0, n - 1)
+    size = (shapes.radius.log() - shapes.radius.log()[near].median(1).values).abs()
+    # Pixels per radius are the same in all frames of one lens.
+    place = (shapes.centre - shapes.centre[near].median(1).values).norm(dim=-1)
+    return shapes.visible & ((size > JUMP) | (place > JUMP * shapes.extent))
+
+
+def mended(shapes: Silhouettes, odd: Bool[Tensor, " t"]) -> Silhouettes:
+    """Silhouettes with place and size of the closest frame where they are odd."""
+    kept = torch.nonzero(~odd)[:, 0]
+    if not len(kept):
+        return shapes
+    closest = kept[(torch.arange(len(odd))[:, None] - kept).abs().argmin(1)]
+    return replace(shapes, centre=shapes.centre[closest], radius=shapes.radius[closest], extent=shapes.extent[closest])
 
 
 def fit(

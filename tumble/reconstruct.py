@@ -126,12 +126,13 @@ def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) 
     tracked = run.stage(opened, 1, "track", graph, recipe.track, inputs, keys)
     health = tracked.health
     lost = int(health.lost.sum())
-    run.log(opened, {"name": "track", "event": "health", "lost": lost, "axis": health.observability.sentence})
+    about = {"lost": lost, "verdict": health.verdict, "axis": health.observability.sentence}
+    run.log(opened, {"name": "track", "event": "health", **about, "degrees": math.degrees(health.uncertainty)})
     if len(capture) - lost < LEAST_TRACKED:
         rule = f"could not be tracked: {lost} of {len(capture)} frames contradict the others"
         raise BadFile(capture_path, rule, "film an object with more texture or shape, in smaller turns")
-    if health.observability.unseen:
-        warnings.warn(health.observability.sentence, stacklevel=2)
+    if health.verdict == "bad":
+        warnings.warn(health.sentence, stacklevel=2)
     return tracked, run.key("track", graph.VERSION, recipe.track, keys)
 
 

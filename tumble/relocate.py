@@ -25,6 +25,10 @@ HOLD = 10.0
 """Weight of the origin's place against one pixel: it moves by a tenth of its distance at most."""
 STEP = 1e-4
 """Of the difference quotients."""
+RAGGED = 0.5
+"""Noise of a gap where one outline is compared with many: its own errors are the same in all [pixels]."""
+TURN, SHIFT = 0.15, 0.02
+"""Likewise, where outlines are asked what they know of a pose [radians, distance of the object]."""
 
 Poses = tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]
 """`R_cam_obj` and the object's origin, camera frame."""
@@ -105,6 +109,20 @@ def _refine(
         gaps, now = torch.where(better[:, None], gaps_new, gaps), torch.where(better, then, now)
         damping = torch.where(better, 0.3 * damping, 5 * damping)
     return (R, t), now
+
+
+def information(judge: Judge, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> Float[Tensor, "6 6"]:
+    """Of a pose (turn, shift), from gaps of RAGGED pixels of noise [1 / radian^2 and so on].
+
+    By wide differences: outlines have corners, and the slope at one of them says little.
+    """
+    unit = torch.eye(3, dtype=torch.float64)
+    turns = SO3.exp(torch.cat([TURN * unit, -TURN * unit])).matrix()
+    turned = judge.gaps(turns @ R, t.expand(6, 3)) / TURN
+    shifted = judge.gaps(R.expand(6, 3, 3), t + SHIFT * torch.cat([unit, -unit])) / SHIFT
+    J = torch.cat([turned[:3] - turned[3:], shifted[:3] - shifted[3:]]).T / 2
+    J = J[~J.isnan().any(-1)]
+    return J.mT @ J / RAGGED**2
 
 
 def _jacobian(judge: Judge, R: Tensor, t: Tensor, gaps: Tensor) -> Float[Tensor, "h n 6"]:

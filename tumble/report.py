@@ -77,7 +77,8 @@ def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Healt
     if not path.exists():
         raise BadFile(path, "is the run's capture and is gone", "say where it is: --capture")
     taken = of_run(which(path).load(path), asset, list(files.read_json(out / "poses.json")), path)
-    story = Story(path.stem, run.records(out), known["recipe"])
+    name = out.resolve().name if path.name == run.CAPTURE else path.stem
+    story = Story(name, run.records(out), known["recipe"])
     with tempfile.TemporaryDirectory() as folder:
         glb = model(asset, Path(folder))
         build(asset, taken, glb, story, health, out / REPORT)
