@@ -4,6 +4,7 @@ The world is the object's frame, +y up. Nodes: `/object` (Gaussians, or the poin
 `/path`, `/light` (a sphere of the light's colours, turned as the light stood in the chosen frame).
 """
 
+import contextlib
 import math
 import time
 from dataclasses import dataclass, field
@@ -261,9 +262,10 @@ def view(out: Path, host: str, port: int) -> None:
     window = Window(out, host, port)
     print(f"{window.address}   (Ctrl-C ends it; from another machine: ssh -L {port}:localhost:{port} THIS_MACHINE)")
     try:
-        while True:
-            time.sleep(SECONDS)
-            window.refresh()
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(SECONDS)
+                window.refresh()
     finally:
         window.server.stop()
 
