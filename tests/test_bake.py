@@ -88,6 +88,14 @@ def test_colours_and_roughness_are_those_of_the_place(asset: Asset, ball: Unwrap
     assert (at(textures.roughness, spots) - rough(spots.points)).abs().max() < 0.05
 
 
+def test_values_of_gaussians_lie_where_they_are(asset: Asset, ball: Unwrapped) -> None:
+    spots = bake.texels(ball, 96)
+    height = 0.5 + 0.5 * asset.gaussians.means[:, 1] / RADIUS
+    found = at(bake.spread(height, asset, ball, resolution=96), spots)
+    # 3000 Gaussians lie 0.05 apart.
+    assert (found - 0.5 - 0.5 * spots.points[:, 1] / RADIUS).abs().max() < 0.05
+
+
 def test_a_smooth_sphere_has_a_flat_normal_map(asset: Asset, ball: Unwrapped) -> None:
     spots, textures = bake.texels(ball, 192), baked(asset, ball)
     z = 2 * at(textures.normal, spots)[:, 2] - 1
@@ -126,5 +134,5 @@ def test_padding_repeats_the_nearest_texel() -> None:
 
 def test_what_no_view_sees_takes_the_nearest_gaussian(asset: Asset) -> None:
     points = torch.tensor([[0.2, 0.1, 0.0], [-0.1, 0.0, 0.3]])
-    values = bake._nearest(asset, points, normalize(points, dim=-1))
+    values = bake._beside(asset, points, normalize(points, dim=-1))
     assert (values[:, :3] - colour(RADIUS * normalize(points, dim=-1))).abs().max() < 0.03

@@ -25,8 +25,8 @@ LAYERS = [
     {"track", "lift", "graph", "refine", "decompose", "average", "relight"},
     {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
     | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "check"}
-    | {"scoresheet", "evaluate", "bake", "export", "doctor", "demo_assets"},
-    {"plots", "lamps", "confidence", "rerender", "diagnosis", "gallery"},
+    | {"scoresheet", "evaluate", "bake", "confidence", "export", "doctor", "demo_assets"},
+    {"plots", "lamps", "rerender", "diagnosis", "gallery"},
     {"recipes", "run", "report", "reconstruct", "demo", "viewer"},
     {"cli", "__main__"},
 ]

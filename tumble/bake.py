@@ -79,6 +79,18 @@ def bake(asset: Asset, mesh: Unwrapped, *, resolution: int, views: int, pixels: 
     return Textures(picture[..., :3], picture[..., 3], picture[..., 4:], covered)
 
 
+@torch.no_grad()
+def spread(values: Float[Tensor, " n"], asset: Asset, mesh: Unwrapped, *, resolution: int) -> UInt8[np.ndarray, "r r"]:
+    """Values in [0, 1], one per Gaussian, as a texture: every texel has that of the Gaussian next to it."""
+    spots = texels(mesh, resolution)
+    index = _nearest(asset, spots.points.to(asset.gaussians.means))
+    picture, covered = np.zeros((resolution, resolution, 1), np.uint8), np.zeros((resolution, resolution), bool)
+    at = (spots.rows.numpy(), spots.columns.numpy())
+    picture[at] = (values[index] * 255).round().to(torch.uint8).cpu().numpy()[:, None]
+    covered[at] = True
+    return padded(picture, covered)[..., 0]
+
+
 def texels(mesh: Unwrapped, resolution: int) -> Texels:
     """Points of the mesh behind the texels that faces cover; those that a face only touches lie on its plane."""
     places = mesh.uv[mesh.faces] * resolution - 0.5
@@ -149,7 +161,7 @@ def _gathered(asset: Asset, spots: Texels, views: int, pixels: int) -> Float[Ten
         weights.index_add_(0, index, weight)
     values = total / weights.clamp(min=1e-6)
     unseen = weights[:, 0] < 1e-3
-    values[unseen] = _nearest(asset, points[unseen], normals[unseen])
+    values[unseen] = _beside(asset, points[unseen], normals[unseen])
     values[:, 4:] = normalize(values[:, 4:], dim=-1)
     return values.cpu()
 
@@ -172,11 +184,15 @@ def _looked_up(
     return found[:, :CHANNELS], near * (share > 0.25) * share
 
 
-def _nearest(asset: Asset, points: Float[Tensor, "t 3"], normals: Float[Tensor, "t 3"]) -> Float[Tensor, "t 7"]:
+def _nearest(asset: Asset, points: Float[Tensor, "t 3"]) -> Int[Tensor, " t"]:
+    nearest = [torch.cdist(rows, asset.gaussians.means).argmin(1) for rows in points.split(1024)]
+    return torch.cat([*nearest, torch.zeros(0, dtype=torch.long, device=points.device)])
+
+
+def _beside(asset: Asset, points: Float[Tensor, "t 3"], normals: Float[Tensor, "t 3"]) -> Float[Tensor, "t 7"]:
     """What no view sees looks like the Gaussian next to it."""
     material = asset.material
     assert material is not None, "an asset with material"
-    nearest = [torch.cdist(rows, asset.gaussians.means).argmin(1) for rows in points.split(1024)]
-    index = torch.cat([*nearest, torch.zeros(0, dtype=torch.long, device=points.device)])
+    index = _nearest(asset, points)
     rough = material.roughness.mean(1, keepdim=True)
     return torch.cat([material.albedo.mean(1)[index], rough[index], normals], -1)

@@ -41,6 +41,11 @@ class Confidence:
     halves: Float[Tensor, " n"]
     """Number of cells in which the half-vector of camera and a lamp fell."""
 
+    @property
+    def score(self) -> Float[Tensor, " n"]:
+        """0 to 1: how much of the sky above it a lamp has stood in, the count that says most about albedo."""
+        return (self.lights / (CELLS / 2)).clamp(max=1)
+
 
 def lamps(environment: Environment) -> Float[Tensor, "k 3"]:
     """Unit directions of the brightest places, env frame, brightest first, at least `APART`."""

@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from tumble import __version__, bake, files, mesh, shade
+from tumble import __version__, bake, confidence, files, mesh, shade
 from tumble.asset import Asset
 from tumble.bake import Textures
 from tumble.directions import fibonacci_sphere
@@ -63,12 +63,13 @@ PRESETS: dict[str, Preset | None] = {
     "splat": None,
 }
 """web: up to 10 MB; splat: no mesh at all."""
+CONFIDENCE = "confidence.png"
 COARSE = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
 """Enough to measure a size."""
 
 
 def export(asset: Asset, names: list[str], out: Path, preset: Name, scale_mm: float | None = None) -> None:
-    """Write a folder: `asset.glb` (not for "splat"), `asset.ply`, `asset_material.ply`, `light.*`, `poses*`, `bop/`.
+    """Write a folder: `asset.glb` and `confidence.png` (not for "splat"), both PLYs, `light.*`, `poses*`, `bop/`.
 
     Args:
         names: Of the frames, in the order of the trajectory.
@@ -110,10 +111,13 @@ def surface(asset: Asset, preset: Preset) -> Mesh:
 
 
 def glb(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
-    """Unwrap, bake and write the GLB."""
+    """Unwrap, bake and write the GLB, and beside it how sure its material is, over the same coordinates."""
     flat = mesh.unwrapped(shape, preset.texture, PADDING)
     textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
     assert asset.material is not None, "an asset with material"
+    if asset.environment is not None:
+        score = confidence.confidence(asset, asset.camera).score
+        files.write_png(path.parent / CONFIDENCE, bake.spread(score, asset, flat, resolution=512)[..., None])
     write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 
