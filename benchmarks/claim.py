@@ -71,7 +71,8 @@ def level(rows: list[Row]) -> list[str]:
                 about = [_stem(row["made_by"]["env"]), material, _stem(row["made_by"]["model"])]
             rest = [f"{_mean(picked, 'normal.mean_fg_degrees'):.1f}", f"{_mean(picked, 'silhouette.iou'):.3f}"]
             for key in ("run_seconds", "score_seconds", "peak_memory_MiB"):
-                rest.append(f"{statistics.fmean(r[key] for r in picked):.0f}")
+                known = [r[key] for r in picked if r[key] is not None]
+                rest.append(f"{statistics.fmean(known):.0f}" if known else "-")
             lines.append("| " + " | ".join([*about, *pairs, *rest]) + " |")
     return lines
 
