@@ -191,6 +191,15 @@ def test_the_card_names_drift_lost_frames_and_outliers(asset: Asset, capture: Ca
     assert diagnosis.overall([fit, outline, exposure, away, match])[0] == "bad"
 
 
+def test_matches_that_agree_do_not_hide_a_drift() -> None:
+    ones = torch.ones(N)
+    sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
+    health = Health(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), sight)
+    row = diagnosis._match(health)
+    assert row.verdict == "bad"
+    assert "28.6 degrees" in row.sentence
+
+
 def test_light_that_turns_with_the_object_comes_from_few_sides(asset: Asset) -> None:
     """At most one cell per lamp; under light that stands still, more."""
     still = confidence.confidence(asset, asset.camera)

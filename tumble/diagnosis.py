@@ -147,9 +147,10 @@ def _match(health: Health | None) -> Row:
         "sides.",
         "none": "There were no matches; the poses rest on outlines alone.",
     }[verdict]
-    sentence = f"{sentence} {health.observability.sentence}"
-    if health.observability.unseen and verdict in ("good", "none"):
-        verdict = "warn"
+    sentence = f"{sentence} {health.sentence}"
+    # Matches may agree with each other on a wrong turn; the health of the poses knows more.
+    if health.verdict == "bad" or (health.verdict == "warn" and verdict in ("good", "none")):
+        verdict = health.verdict
     value = "-" if math.isnan(middle) else f"{middle:.2f} px"
     return Row("Match residual", value, verdict, sentence, values, tuple(_high(v, limits) for v in values))
 
