@@ -70,12 +70,7 @@ def bake(asset: Asset, mesh: Unwrapped, *, resolution: int, views: int, pixels: 
     # A normal map cannot show what faces away from the mesh.
     local = normalize(torch.cat([local[:, :2], local[:, 2:].clamp(min=0.05)], -1), dim=-1)
     painted = torch.cat([srgb_from_linear(albedo), roughness, 0.5 + 0.5 * local], -1)
-    picture = np.zeros((resolution, resolution, CHANNELS), np.uint8)
-    covered = np.zeros((resolution, resolution), bool)
-    at = (spots.rows.numpy(), spots.columns.numpy())
-    picture[at] = (painted.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    covered[at] = True
-    picture = padded(picture, covered)
+    picture, covered = _painted(spots, painted, resolution)
     return Textures(picture[..., :3], picture[..., 3], picture[..., 4:], covered)
 
 
@@ -84,11 +79,19 @@ def spread(values: Float[Tensor, " n"], asset: Asset, mesh: Unwrapped, *, resolu
     """Values in [0, 1], one per Gaussian, as a texture: every texel has that of the Gaussian next to it."""
     spots = texels(mesh, resolution)
     index = _nearest(asset, spots.points.to(asset.gaussians.means))
-    picture, covered = np.zeros((resolution, resolution, 1), np.uint8), np.zeros((resolution, resolution), bool)
+    return _painted(spots, values[index, None], resolution)[0][..., 0]
+
+
+def _painted(
+    spots: Texels, values: Float[Tensor, "t c"], resolution: int
+) -> tuple[UInt8[np.ndarray, "r r c"], Bool[np.ndarray, "r r"]]:
+    """A padded texture with values in [0, 1] at texels, and where those are."""
+    picture = np.zeros((resolution, resolution, values.shape[1]), np.uint8)
+    covered = np.zeros((resolution, resolution), bool)
     at = (spots.rows.numpy(), spots.columns.numpy())
-    picture[at] = (values[index] * 255).round().to(torch.uint8).cpu().numpy()[:, None]
+    picture[at] = (values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     covered[at] = True
-    return padded(picture, covered)[..., 0]
+    return padded(picture, covered), covered
 
 
 def texels(mesh: Unwrapped, resolution: int) -> Texels:

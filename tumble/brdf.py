@@ -54,7 +54,7 @@ def fresnel(voh: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
     Fresnel's equations for an index of 1.5, within 0.4 %. Schlick's fit, which the paper's relatives take, is a fifth
     too low around 50 degrees: a dark print, where the highlight is a third of the light, takes up the rest as albedo
-    (24 instead of 28 dB). Scaled by f0 as a whole, since a surface that does not reflect has no rim either.
+    (24.2 instead of 25.6 dB on a box). Scaled by f0 as a whole: a surface that does not reflect has no rim either.
     """
     m = (1 - voh).clamp(0, 1)
     return 1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303))))

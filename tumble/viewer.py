@@ -27,6 +27,7 @@ from tumble.gauge import Tracked
 from tumble.gaussians import Gaussians, opacity
 from tumble.images import resize_area, srgb_from_linear
 from tumble.material import Material
+from tumble.reconstruct import ASSET
 from tumble.refine import Refined
 from tumble.se3 import SO3
 from tumble.trajectory import Trajectory
@@ -37,7 +38,6 @@ CAMERAS, THUMBNAIL = 48, 96
 """Cameras drawn at most, and the longer side of their photographs [pixels]."""
 SKY, SKY_ROWS, SKY_TEXEL = 12.0, 48, 0.85
 """Radius of the sphere of light, beyond the cameras [object radius], its rows of points, and their size."""
-ASSET = "asset.safetensors"
 SOURCES = (
     ASSET,
     f"3-decompose/{run.CHECKPOINT}",
