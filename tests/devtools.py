@@ -17,7 +17,8 @@ from typing import Any
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader")
-OPTIONS += ("--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-port=0")
+OPTIONS += ("--enable-unsafe-swiftshader", "--remote-debugging-port=0")
+OPTIONS += ("--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",)
 
 
 def browser() -> str | None:

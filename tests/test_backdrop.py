@@ -93,6 +93,17 @@ def test_shake_is_the_shift_of_the_background() -> None:
     assert found[1] == pytest.approx(4 / 320, abs=0.2 * 4 / 320)
 
 
+def test_an_object_that_turns_before_nothing_is_no_shaking_camera() -> None:
+    """Over black there is no other texture than the object's, which the backdrop holds where it was never elsewhere."""
+    film = scene()
+    pictures = np.where(film.object[..., None], film.pictures, np.uint8(0))
+    covered = film.object.copy()
+    still = backdrop(pictures, covered)
+    # Masks that were lost on some frames leave the object bare there.
+    covered[[4, 11]] = False
+    assert shake(pictures, completed(still, backdrop(pictures)), covered).max() == 0
+
+
 def test_one_frame_is_enough_to_answer() -> None:
     found = backdrop(WALL[None])
     assert found.known.all()

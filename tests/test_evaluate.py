@@ -509,3 +509,13 @@ def test_vgg_numbers_join_those_of_alexnet(capture_path: Path, tmp_path: Path, s
     report = evaluate.run(tmp_path / "mine", capture_path, tmp_path / "out", vgg=weights)
     assert report["regions"]["shared"]["image.lpips_full_srgb_vgg"] == 0
     assert "vgg features" in report["protocol"]["image.lpips_full_srgb_vgg"]
+
+
+def test_folders_of_a_run_go_by_the_names_of_their_runs(capture_path: Path, tmp_path: Path) -> None:
+    """`RUN/prediction` and `RUN/capture` would name nothing."""
+    shutil.copytree(capture_path, tmp_path / "runs" / "pot" / "capture")
+    Prediction(light=the_truth(capture_path).light).write(tmp_path / "runs" / "mug" / "prediction")
+    report = evaluate.run(
+        tmp_path / "runs" / "mug" / "prediction", tmp_path / "runs" / "pot" / "capture", tmp_path / "out"
+    )
+    assert (report["prediction"], report["capture"]["name"]) == ("mug", "pot")

@@ -73,8 +73,14 @@ def test_a_plain_ball() -> None:
 @pytest.mark.slow
 def test_a_can_without_a_label() -> None:
     """Its axis rocks by 40 degrees, which outlines show; its spin nobody can see."""
-    found = tracked(photographed(turning(16, 0.7), 0.8))
-    assert found.health.verdict == "bad"
+    T_cam_obj = turning(16, 0.7)
+    health = tracked(photographed(T_cam_obj, 0.8)).health
+    assert health.verdict == "bad"
+    assert health.sentence.startswith("Rotation about axis (")
+    axis = T_cam_obj.rotation[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    seen = torch.nn.functional.normalize(axis[:2], dim=0)
+    # Silhouettes of 96 pixels.
+    assert abs(float(health.observability.axis[:2].double() @ seen)) > 0.99
 
 
 @pytest.fixture(scope="module")

@@ -72,6 +72,20 @@ def test_poses_at_the_ends_repeat_the_closest() -> None:
     torch.testing.assert_close(bridged.xyz[2], (T.xyz[1] + T.xyz[3]) / 2)
 
 
+def test_frames_beyond_a_leap_are_lost() -> None:
+    """The first two turned by half a turn, their matches with each other only: nothing else contradicts them."""
+    scene = tumbling(24)
+    rng = torch.Generator().manual_seed(0)
+    pairs = [(t - k, t) for k in (1, 2) for t in range(k, 24) if (t < 2) == (t - k < 2)]
+    tracks = followed([scene.match(i, j, rng, wrong=0.0) for i, j in pairs], torch.full((24,), 5.0))
+    R = scene.T_cam_obj.rotation.matrix().clone()
+    R[:2] = R[:2] @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE, torch.zeros(24))
+    health = gauge.finished(scene.capture, tracks, frontier.outlines(scene.capture), solution).health
+    assert torch.nonzero(health.lost)[:, 0].tolist() == [0, 1]
+    assert health.verdict == "warn"
+
+
 def on_an_axis() -> tuple[Capture, Tracks, Solution]:
     """A ball before a still camera; all its points lie on its y axis."""
     scene = tumbling(12)

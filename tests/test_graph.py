@@ -69,6 +69,27 @@ def test_a_frame_without_the_object_is_lost(scene: Tumble) -> None:
     assert scores["rotation_median_degrees"] < 2
 
 
+def test_what_does_not_settle_begins_anew_and_the_best_is_kept(scene: Tumble) -> None:
+    """The second way to begin has smaller windows, and outlines without weight."""
+    inputs = graph.gather(scene.capture, matches(scene))
+    other = (graph.Start((4,), 0.0),)
+    state = graph.init(QUICK, inputs, torch.Generator().manual_seed(0))
+    cfg = replace(QUICK, others=other, settled=0.0)
+    kept = []
+    for state.step, (phase, _, start) in enumerate(graph.plan(cfg)):
+        found = graph.step(cfg, inputs, state)
+        if phase == "keep":
+            kept.append((start, float(state.memory["loss"]), state.params.R))
+        assert found or start == 0
+    assert [start for start, _, _ in kept] == [0, 1]
+    assert kept[1][1] <= kept[0][1]
+    assert torch.equal(kept[1][2], kept[0][2]) == (kept[1][1] == kept[0][1])
+    # Once settled, no time is spent on other ways.
+    cfg = replace(cfg, settled=float("inf"))
+    state.step = graph.plan(cfg).index(("pairs", 0.0, 1))
+    assert graph.step(cfg, inputs, state) == {}
+
+
 def test_no_object_is_an_error(scene: Tumble) -> None:
     blank = replace(scene.capture, masks=torch.zeros_like(scene.capture.masks))
     with pytest.raises(ValueError, match="no mask has an object pixel"):

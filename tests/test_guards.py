@@ -17,14 +17,15 @@ LAYERS = [
     {"brdf", "camera", "trajectory"},
     {"gaussians", "material", "environment", "buffers", "coarse_light"},
     {"capture", "asset", "match"},
-    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"} | {"texture"},
+    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"}
+    | {"texture", "symmetry"},
     {"prefilter", "shade", "importance", "mesh", "hull"},
     {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching"}
     | {"pairwise", "averaging", "bundle", "relocate", "gauge"},
     {"loop"},
-    {"track", "lift", "graph", "refine", "decompose", "average", "relight"},
+    {"track", "lift", "graph", "progressive", "refine", "decompose", "average", "relight"},
     {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
-    | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "check"}
+    | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "pick", "colmap", "posed", "check"}
     | {"scoresheet", "evaluate", "bake", "confidence", "export", "doctor", "demo_assets"},
     {"plots", "lamps", "rerender", "diagnosis", "gallery"},
     {"recipes", "run", "report", "reconstruct", "demo", "viewer"},

@@ -15,7 +15,7 @@ from tumble import matching, weights
 from tumble.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.files import BadFile
 from tumble.match import Match, View
-from tumble.matching import _aliked, _lightglue, _window, match_pairs, xfeat
+from tumble.matching import _aliked, _gmflow, _lightglue, _window, match_pairs, xfeat
 from tumble.named import named, names
 
 SIZE = 128
@@ -149,11 +149,23 @@ def test_windows_know_where_they_lie(size: int) -> None:
     mask[20:90, 30:100] = OBJECT
     look = _window.window(View(0, torch.from_numpy(image.astype(np.uint8)), mask), 80.0, size)
     # Only the dot: around the object lies the fill.
-    light = look.grey.astype(np.float64) * (look.grey > 20)
+    light = look.rgb[..., 0].astype(np.float64) * (look.rgb[..., 0] > 20)
     rows, columns = np.mgrid[:size, :size] + 0.5
     centroid = np.array([[(light * columns).sum(), (light * rows).sum()]]) / light.sum()
     # The threshold cuts a disc out of 40 x 40 pixels of 2 unevenly, by a fiftieth of a pixel.
     torch.testing.assert_close(look.in_frame(centroid), torch.tensor([[61.3, 44.8]]), atol=0.06, rtol=0)
+
+
+def test_shading_and_exposure_leave_little_in_what_is_matched() -> None:
+    """The same texture in a light that rises threefold across the object: pixels differ by 60 code values and more,
+    what is matched by a few of its 45 per standard deviation."""
+    view, _ = pair()
+    columns = torch.arange(SIZE) / SIZE
+    shaded = (view.image * (0.4 + 0.8 * columns)[None, :, None]).to(torch.uint8)
+    plain, other = (_window.window(View(0, image, view.mask), 110.0, 384) for image in (view.image, shaded))
+    sure = plain.sure
+    assert np.abs(plain.rgb[sure].astype(float) - other.rgb[sure]).mean() > 25
+    assert np.abs(plain.grey[sure].astype(float) - other.grey[sure]).mean() < 8
 
 
 def test_masks_lose_their_border_but_not_at_the_frame() -> None:
@@ -356,6 +368,68 @@ def test_xfeat_reads_weights_by_the_published_names() -> None:
     per_cell = corners.unflatten(2, (8, 8)).unflatten(4, (12, 8)).sum((3, 5))
     assert bool(((per_cell > 0) & (per_cell < 1 + 1e-5)).all())
     torch.testing.assert_close(descriptors.norm(dim=1), torch.ones(1, 8, 12))
+
+
+def flow_weights(c: int = 8) -> dict[str, torch.Tensor]:
+    """Weights of GMFlow's names and proportions, drawn at random."""
+    rng = torch.Generator().manual_seed(4)
+    p: dict[str, torch.Tensor] = {}
+
+    def draw(name: str, *shape: int, bias: bool = False) -> None:
+        p[f"{name}.weight"] = torch.randn(*shape, generator=rng) / max(1, int(np.prod(shape[1:]))) ** 0.5
+        if bias:
+            p[f"{name}.bias"] = 0.1 * torch.randn(shape[0], generator=rng)
+
+    draw("backbone.conv1", c, 3, 7, 7)
+    for layer in (1, 2, 3):
+        for block in range(2):
+            draw(f"backbone.layer{layer}.{block}.conv1", c, c, 3, 3)
+            draw(f"backbone.layer{layer}.{block}.conv2", c, c, 3, 3)
+    draw("backbone.layer2.0.downsample.0", c, c, 1, 1, bias=True)
+    draw("backbone.conv2", c, c, 1, 1, bias=True)
+    draw("backbone.trident_conv", c, c, 3, 3)
+    for layer in range(_gmflow.LAYERS):
+        for part in ("self_attn", "cross_attn_ffn"):
+            for name in ("q_proj", "k_proj", "v_proj", "merge"):
+                draw(f"transformer.layers.{layer}.{part}.{name}", c, c)
+            draw(f"transformer.layers.{layer}.{part}.norm1", c, bias=True)
+        draw(f"transformer.layers.{layer}.cross_attn_ffn.mlp.0", 8 * c, 2 * c)
+        draw(f"transformer.layers.{layer}.cross_attn_ffn.mlp.2", c, 8 * c)
+        draw(f"transformer.layers.{layer}.cross_attn_ffn.norm2", c, bias=True)
+    for name in ("q_proj", "k_proj"):
+        draw(f"feature_flow_attn.{name}", c, c, bias=True)
+    draw("upsampler.0", 16, c + 2, 3, 3, bias=True)
+    draw("upsampler.2", 16 * 9, 16, 1, 1, bias=True)
+    return p
+
+
+def test_gmflow_there_is_gmflow_back_of_the_pair_turned_round() -> None:
+    first, second = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(5))
+    p = flow_weights()
+    there, back = _gmflow.flow(first, second, p)
+    assert there.shape == (2, 64, 96)
+    other = _gmflow.flow(second, first, p)
+    torch.testing.assert_close(other[0], back, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(other[1], there, atol=1e-3, rtol=1e-3)
+
+
+def test_gmflow_matches_equal_features_wherever_they_are() -> None:
+    """Every pixel with a feature of its own, all moved by (5, -3) around the frame's edge."""
+    own = 200 * torch.eye(6 * 16).reshape(96, 6, 16)
+    found = _gmflow._global(torch.stack([own, own.roll((-3, 5), (1, 2))]))
+    rows, columns = torch.meshgrid(torch.arange(6), torch.arange(16), indexing="ij")
+    expected = torch.stack([(columns + 5) % 16 - columns, (rows - 3) % 6 - rows]).float()
+    torch.testing.assert_close(found[0], expected, atol=1e-3, rtol=0)
+
+
+def test_gmflow_windows_that_were_rolled_together_do_not_mix() -> None:
+    """Of an 8 x 8 picture in 2 x 2 windows rolled by 2, the last one holds four corners of 2 x 2 pixels each."""
+    apart = _gmflow._apart(8, 8, 2, (2, 2)) < 0
+    assert apart.shape == (4, 16, 16)
+    assert not apart[0].any()
+    assert int((~apart[3]).sum()) == 4 * 4 * 4
+    x = torch.arange(2 * 8 * 8 * 3.0).reshape(2, 8, 8, 3)
+    assert torch.equal(_gmflow._whole(_gmflow._windows(x, 2), 2, 8, 8), x)
 
 
 # Networks of the user's own, by stand-ins of their interfaces ---------------------------------------------------------

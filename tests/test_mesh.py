@@ -109,6 +109,23 @@ def test_gaussians_on_a_torus_become_its_surface() -> None:
     assert volume(made) == pytest.approx(2 * math.pi**2 * MAJOR * MINOR**2, rel=0.03)
 
 
+def test_a_side_that_no_frame_showed_leaves_no_hole() -> None:
+    """A turntable never shows the underside, so there are no Gaussians: views from below look at the inside's back."""
+    whole = sphere(3000, radius=0.8)
+    seen = whole.means[:, 1] > -0.5
+    made = fused(Gaussians(**{name: values[seen] for name, values in vars(whole).items()}))
+    assert_closed(made)
+    assert euler(made) == 2
+    # A plane over the hole at least, for level views see past it; the rest of the ball at most.
+    height = 0.3
+    cap = math.pi * height**2 * (3 * 0.8 - height) / 3
+    ball = 4 / 3 * math.pi * 0.8**3
+    assert 0.97 * (ball - cap) < volume(made) < 1.02 * ball
+    # The side with Gaussians is where it was.
+    radii = np.linalg.norm(made.vertices[made.vertices[:, 1] > -0.4], axis=1)
+    np.testing.assert_allclose(radii, 0.8, atol=CELL)
+
+
 def test_a_thin_plate_keeps_both_sides() -> None:
     """A disc of radius 0.7, three cells thick, thinner than the band in which distances are averaged."""
     half = 1.5 * CELL

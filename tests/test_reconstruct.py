@@ -151,6 +151,20 @@ def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
         assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.5)
 
 
+def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Path, tmp_path: Path) -> None:
+    """A film of eight frames of which the second to last and the third were kept, and one that the capture lacks."""
+    kept = {"0000.png": 6, "0001.png": 2, "0002.png": 8}
+    files.write_json(tmp_path / reconstruct.POSES, kept)
+    known = folder.load(capture)
+    assert reconstruct.source_names(tmp_path, known) == tuple(kept)
+    said = [{"name": name, "source_frame": number} for name, number in kept.items()]
+    files.write_json(tmp_path / "capture" / "ingest.json", {"frames": said})
+    assert reconstruct.source_names(tmp_path, known) == (known.names[6], known.names[2], "0002.png")
+    # Pictures with a model have names, not numbers.
+    files.write_json(tmp_path / "capture" / "ingest.json", {"frames": [{"name": "0000.png", "source": "a.jpg"}]})
+    assert reconstruct.source_names(tmp_path, known) == tuple(kept)
+
+
 def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path) -> None:
     taken = folder.load(capture)
     # Of a plain ellipsoid that is lit from its own side, too few frames for a verdict.

@@ -123,3 +123,16 @@ def test_a_coarse_mask_is_brought_to_the_edges_of_the_picture() -> None:
     assert overlap(fine != BACKGROUND, disc) > 0.9
     assert (fine[~disc] != OBJECT).all()
     assert (fine == OBJECT).sum() > 1.1 * (coarse == OBJECT).sum()
+
+
+def test_a_small_hole_is_doubted_and_a_large_one_is_one() -> None:
+    """Of a disc of radius 40: holes of 2 % and 8 % of its area, and a bay that is open to the outside."""
+    y, x = np.mgrid[:100, :100] - 49.5
+    inside = np.hypot(x, y) < 40
+    small, large = np.hypot(x + 20, y) < 5.5, np.hypot(x - 12, y) < 11
+    bay = (np.abs(x) < 2) & (y > 30)
+    labels = three_valued(inside & ~small & ~large & ~bay, np.zeros_like(inside), 1)
+    assert (labels[small] != BACKGROUND).all()
+    assert labels[49, 61] == BACKGROUND
+    assert labels[86, 49] == BACKGROUND
+    assert labels[0, 0] == labels[99, 50] == BACKGROUND

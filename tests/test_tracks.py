@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tumble import tracks
 from tumble.match import Match
 from tumble.tracks import Tracks, followed, joined
 
@@ -111,3 +112,13 @@ def test_where_matches_disagree_tracks_end() -> None:
     tracks = followed([match(0, 1, here, there)], spacing(2))
     assert tracks.n == 1
     assert observations(tracks, 0)[1] == pytest.approx([32.0, 30.0], abs=0.31)
+
+
+def test_correspondences_become_points_that_two_frames_show() -> None:
+    uv = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    pair = tracks.of_match(Match(3, 7, uv, uv + 10, torch.ones(2)))
+    both = tracks.joined(tracks.NONE, pair, pair)
+    assert both.n == 4
+    assert both.frame.tolist() == [3, 3, 7, 7] * 2
+    assert both.point.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
+    assert torch.equal(both.uv[2:4], (uv + 10).double())

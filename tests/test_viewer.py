@@ -47,13 +47,17 @@ def test_a_run_that_is_still_going_on_shows_its_last_checkpoint(
     stop: int,
     found: str,
 ) -> None:
-    step = stage.step
+    step, last = stage.step, []
 
     def interrupted(cfg, inputs, state):
         result = step(cfg, inputs, state)
         if state.step == stop:
             import signal
 
+            if stage is decompose:
+                with torch.no_grad():
+                    state.params.log_tint.add_(torch.tensor([0.4, 0.1, -0.2]))
+            last[:] = cfg, inputs, state
             signal.raise_signal(signal.SIGINT)
         return result
 
@@ -66,6 +70,11 @@ def test_a_run_that_is_still_going_on_shows_its_last_checkpoint(
     assert all(values.shape == (len(seen.gaussians), 3) for values in seen.colours.values())
     assert ("roughness" in seen.colours) == (stage is decompose)
     assert (seen.environment is not None) == (stage is decompose)
+    if stage is decompose:
+        # What the stage would put out if it ended now: the tint of the highlight is shared out.
+        ended = decompose.finish(*last)
+        assert ended.material is not None
+        torch.testing.assert_close(linear_from_srgb(seen.colours["albedo"]), ended.material.albedo.mean(1))
 
 
 def test_the_log_becomes_a_line(tmp_path: Path) -> None:

@@ -128,11 +128,14 @@ def shake(
 ) -> Float32[np.ndarray, " t"]:
     """How far the background lies from where it was, as a share of the longer side of the picture.
 
-    The median length of the optical flow over textured background. 0 where there is too little texture to tell.
+    The median length of the optical flow over textured background. 0 where there is too little texture to tell. Where
+    the object is at some time, and nothing is known to stand still, the reference shows the object itself.
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     gray = cv2.cvtColor(reference.picture, cv2.COLOR_RGB2GRAY)
     textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > TEXTURED
+    path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
+    textured &= reference.known | ~path
     moved = np.zeros(len(pictures), np.float32)
     for i, picture in enumerate(pictures):
         keep = textured & ~covered[i]

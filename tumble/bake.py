@@ -27,6 +27,8 @@ TOLERANCE = 0.03
 """How far a texel may lie from the rendered surface and still be the one that is seen [object radius]."""
 SUBTEXEL = 4
 """Bits of the fraction with which triangles are drawn."""
+CHUNK = 1 << 20
+"""Texels looked up at once: bounds memory, changes nothing else."""
 CHANNELS = 7
 """Albedo, roughness and normal."""
 
@@ -105,10 +107,12 @@ def texels(mesh: Unwrapped, resolution: int) -> Texels:
     face = owner[rows, columns]
     a, b, c = np.moveaxis(places[face], 1, 0)
     share_b, share_c = _barycentric(np.stack([columns, rows], -1) - a, b - a, c - a)
-    shares = np.stack([1 - share_b - share_c, share_b, share_c], -1)
+    shares = np.stack([1 - share_b - share_c, share_b, share_c], -1).astype(np.float32)
 
     def interpolated(values: Float[np.ndarray, "v k"]) -> Float[Tensor, "t k"]:
-        return torch.from_numpy((shares[..., None] * values[mesh.faces[face]]).sum(1)).float()
+        # Corner by corner: there are millions of texels.
+        parts = (shares[:, k, None] * values.astype(np.float32)[mesh.faces[face, k]] for k in range(3))
+        return torch.from_numpy(sum(parts, np.float32(0)))
 
     return Texels(
         rows=torch.from_numpy(rows),
@@ -154,14 +158,17 @@ def _gathered(asset: Asset, spots: Texels, views: int, pixels: int) -> Float[Ten
     points, normals = spots.points.to(like), spots.normals.to(like)
     total, weights = points.new_zeros(len(points), CHANNELS), points.new_zeros(len(points), 1)
     for i in range(views):
-        to_camera = normalize(poses[i].inverse().xyz - points, dim=-1)
-        cosine = (normals * to_camera).sum(-1)
-        index = torch.where(cosine > GRAZING)[0]
-        values, seen = _looked_up(buffers_of(asset, poses[i], camera), poses[i] @ points[index], camera)
-        # The fourth power: a view head-on is the sharpest.
-        weight = seen * cosine[index, None] ** 4
-        total.index_add_(0, index, weight * values)
-        weights.index_add_(0, index, weight)
+        view = buffers_of(asset, poses[i], camera)
+        for some in torch.arange(len(points), device=points.device).split(CHUNK):
+            to_camera = normalize(poses[i].inverse().xyz - points[some], dim=-1)
+            cosine = (normals[some] * to_camera).sum(-1)
+            facing = torch.where(cosine > GRAZING)[0]
+            index = some[facing]
+            values, seen = _looked_up(view, poses[i] @ points[index], camera)
+            # The fourth power: a view head-on is the sharpest.
+            weight = seen * cosine[facing, None] ** 4
+            total.index_add_(0, index, weight * values)
+            weights.index_add_(0, index, weight)
     values = total / weights.clamp(min=1e-6)
     unseen = weights[:, 0] < 1e-3
     values[unseen] = _beside(asset, points[unseen], normals[unseen])

@@ -1,4 +1,4 @@
-"""Is this film fit for reconstruction? One finding per property, each with a sentence on what to shoot again.
+"""Is this film, or set of pictures, fit for reconstruction? One finding per property, with what to shoot again.
 
 A finding *stops* when no reconstruction can come of the film, *warns* when it costs quality, and else is good. The film
 is a GO when nothing stops.
@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from tumble import ingest, selection
+from tumble import ingest, posed, selection, video
 from tumble.backdrop import shake
 from tumble.capture import BACKGROUND
 from tumble.survey import Options, Survey, survey
@@ -40,6 +40,12 @@ WIDE_STEP = math.radians(15)
 """Turn between kept frames above which matching suffers [radians]."""
 COMPARED = 12
 """Frames on which the camera's shake is measured."""
+MISSED = (1.0, 3.0)
+"""Mean reprojection error of a COLMAP model [pixels]."""
+APART = (0.4, 0.8)
+"""How far the middles of the masks miss one point, in parts of the median mask's radius."""
+ROUND = (math.radians(90), math.radians(30))
+"""Largest angle between two views of the object [radians]."""
 
 Verdict = Literal["good", "warn", "stop"]
 
@@ -63,13 +69,15 @@ def check(path: Path, out: Path, options: Options | None = None) -> list[Finding
         BadFile: It cannot be read, or nothing that moves is found in it.
     """
     options = options or Options()
+    if posed.recognises(path):
+        return _check_posed(posed.gather(path, options), out, options)
     found = survey(path, options)
     chosen = selection.chosen(found.turned, found.blurs, found.usable, options.frames)
     kept = [int(i) for i in np.nonzero(found.usable)[0]] if found.footage.pictures else chosen
     ingest.preview(found, out / ingest.PREVIEW, kept)
     judged = [_film(found), _hint(found), _camera(found), _masks(found), _border(found)]
     if not kept:
-        return [*judged, Finding("frames", "stop", "none is usable", "give a --box around the object, or --masks")]
+        return [*judged, Finding("frames", "stop", "none is usable", "draw a box with --pick, or give --masks")]
     return [*judged, _size(found), *_turning(found, kept), _sharpness(found, kept, options), *_light(found)]
 
 
@@ -103,7 +111,7 @@ def _hint(found: Survey) -> Finding:
         left, top, width, height = (round(v / found.scale) for v in found.seed.box)
         state += f"; object guessed at {left} {top} {width} {height} on frame {found.numbers[found.seed.index]}"
     guesses = found.guessed or found.lens.source == "guess"
-    advice = "look at the mask preview and give --box if it is wrong; give --focal or --fov if you know them"
+    advice = "look at the mask preview, and draw a box with --pick if it is wrong; give --focal or --fov if known"
     return _finding("hints", "warn" if guesses else "good", state, advice)
 
 
@@ -121,7 +129,7 @@ def _masks(found: Survey) -> Finding:
     state = f"unsure on {100 * share:.0f} % of the frames"
     if share > 0:
         state += f", most at frame {worst}"
-    advice = "look at the preview (red edges); give --box on a clear frame (--at), --masks, or a plainer background"
+    advice = "look at the preview (red edges); --pick a box on a clear frame (--at), --masks, or a plainer background"
     return _finding("masks", _graded(share, UNCERTAIN), state, advice)
 
 
@@ -178,3 +186,46 @@ def _light(found: Survey) -> list[Finding]:
     state = f"{100 * burnt:.1f} % of the object is saturated"
     advice = "expose for the object's brightest side: what is saturated has no colour"
     return [drifted, _finding("highlights", "warn" if burnt > BURNT else "good", state, advice)]
+
+
+# Pictures with poses --------------------------------------------------------------------------------------------------
+
+
+def _check_posed(found: posed.Posed, out: Path, options: Options) -> list[Finding]:
+    """What a COLMAP model, its pictures and their masks are good for."""
+    R_new_cam = posed.turns(found, options.light)
+    glass, fine = posed.camera(found, R_new_cam, options.size)
+    shown = posed.frames(found, R_new_cam, glass, fine, options)
+    video.write_clip(out / ingest.PREVIEW, (ingest.tinted(p, m, ingest.KEPT) for p, m in shown), quality=24)
+    n = len(found.seen)
+    words = {"object": "the camera went round it", "camera": "it turned, its background masked"}
+    state = f"stands still with the {options.light}: {words[options.light]}; --light says otherwise"
+    findings = [_model(found), Finding("light", "good", state)]
+    share = len(found.empty) / (n + len(found.empty))
+    state, advice = f"{100 * share:.0f} % of the pictures do not show the object", "mend the masks that are empty"
+    findings.append(_finding("masks", _graded(share, UNCERTAIN), state, advice))
+    state = f"the middles of the masks meet within {100 * found.apart:.0f} % of a mask's radius"
+    advice = "masks and poses contradict each other, or the object did not stand still in the model"
+    findings.append(_finding("agreement", _graded(found.apart, APART), state, advice))
+    share = sum(outline.cut for outline in found.seen) / n
+    state = f"the object touches the border of the picture on {100 * share:.0f} % of the pictures"
+    advice = "keep the whole object in the picture, with room around"
+    findings.append(_finding("framing", _graded(share, CLIPPED), state, advice))
+    diameter = float(np.median([outline.diameter for outline in found.seen]))
+    state = f"the object is {diameter:.0f} pixels across"
+    findings.append(_finding("size", _graded(diameter, SMALL), state, "go nearer, or take larger pictures"))
+    places = posed.trajectory(found, R_new_cam, options.light).camera_positions.double().numpy()
+    places = places / np.linalg.norm(places, axis=1, keepdims=True)
+    widest = math.acos(float((places @ places.T).clip(-1, 1).min()))
+    state = f"seen from {n} places, up to {math.degrees(widest):.0f} degrees apart"
+    findings.append(_finding("views", _graded(widest, ROUND), state, "take pictures from all sides, from above, too"))
+    return findings
+
+
+def _model(found: posed.Posed) -> Finding:
+    state = f"{len(found.model.views)} pictures with a pose, {len(found.model.points)} points"
+    if not len(found.model.errors):
+        return Finding("model", "good", state)
+    error = float(found.model.errors.mean())
+    advice = "sharper pictures, more texture around the object, or fewer wrong matches"
+    return _finding("model", _graded(error, MISSED), f"{state}, off by {error:.2f} pixels on average", advice)

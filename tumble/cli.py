@@ -94,19 +94,29 @@ def _synth():
 def _check():
     from tumble.survey import Options
 
-    def check(film: Positional[Path], /, options: Annotated[Options, arg(name="")], out: OptionalFolder = None) -> None:
+    def check(
+        film: Positional[Path],
+        /,
+        options: Annotated[Options, arg(name="")],
+        out: OptionalFolder = None,
+        pick: bool = False,
+    ) -> None:
         """Say whether a film is fit for reconstruction, and what to shoot again; exit code 1 when it is not.
 
         Args:
-            film: A film of an object turned in front of a still camera, or a folder of pictures.
+            film: A film of an object turned in front of a still camera, a folder of pictures, or one with masks and a
+                COLMAP model.
             options: How the film becomes a capture; the same as for `run`.
             out: Where the preview of the masks goes; runs/check/NAME when left out.
+            pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
         """
         from rich.console import Console
 
         from tumble import check as checking
+        from tumble.pick import picked
 
         where = out or Path("runs/check") / film.stem
+        options = picked(film, options, where / "capture") if pick else options
         findings = checking.check(film, where, options)
         console = Console(highlight=False)
         marks = {"good": "[green]+[/]", "warn": "[yellow]![/]", "stop": "[red]x[/]"}
@@ -132,25 +142,31 @@ def _run():
         out: Folder,
         quality: Literal["draft", "standard", "paper"] = "draft",
         poses: Literal["given", "estimate"] = "given",
+        pick: bool = False,
         seed: int = 0,
     ) -> None:
         """Reconstruct an object: its motion, geometry, albedo, roughness and the light.
 
         Args:
-            capture: A film of an object turned in front of a still camera; or a capture: a folder of docs/format.md, or
-                another layout that it lists. Truth is never read.
-            options: How a film becomes a capture; no matter where it is one already.
+            capture: A film of an object turned in front of a still camera; a folder of pictures with masks, with or
+                without a COLMAP model; or a capture: a folder of docs/format.md, or another layout that it lists. Truth
+                is never read.
+            options: How a film, or pictures, become a capture; no matter where it is one already.
             out: The run directory; the same command goes on where an interrupted one stopped.
             quality: draft: two CPU cores, minutes; standard: one GPU, minutes; paper: the published numbers, hours.
             poses: given: the capture's own, where it has any; estimate: find them from the frames all the same.
+            pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
             seed: Of every random draw.
         """
         from dataclasses import replace
 
+        from tumble.pick import picked
         from tumble.recipes import QUALITIES
         from tumble.reconstruct import health, ingested, reconstruct
         from tumble.report import write
+        from tumble.run import CAPTURE
 
+        options = picked(capture, options, out / CAPTURE) if pick else options
         folder = ingested(capture, out, options)
         asset = reconstruct(folder, out, replace(QUALITIES[quality], seed=seed), poses=poses)
         print(write(out, asset, capture=folder, health=health(out)))

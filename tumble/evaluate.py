@@ -24,6 +24,8 @@ SMALLEST = 11
 """Least height and width of a capture that can be scored [pixels]."""
 TOLERANCE_METRES, TOLERANCE_SHARE = 0.1, 0.1
 """Position error at which a frame is worth nothing: 10 cm, or without metres 10 % of the mean camera distance."""
+PARTS = ("capture", "prediction")
+"""Folders of a run that go by its name."""
 IDENTITY = 1e-3
 """Change of scale, angle [radians] and shift [mean camera distances] under which poses were already aligned."""
 
@@ -117,7 +119,7 @@ def run(
     networks = [lpips.read()] + ([lpips.read(vgg)] if vgg else [])
     scores = compare(predicted, known.capture, known.truth, networks)
     scores["notes"] = [*notes, *scores["notes"]]
-    report = {"tumble": __version__, "prediction": prediction.resolve().name, "capture": _about(known), **scores}
+    report = {"tumble": __version__, "prediction": _called(prediction), "capture": _about(known), **scores}
     picture = scoresheet.draw(report, predicted, known.truth)
     files.write_png(out / "sheet.png", picture)
     files.write_json(out / "report.json", report)
@@ -167,11 +169,17 @@ def protocol(key: str) -> str | None:
     return "; ".join(sentence for sentence in sentences if sentence)
 
 
+def _called(path: Path) -> str:
+    """A folder's name, or that of the run which it is a part of."""
+    path = path.resolve()
+    return path.parent.name if path.name in PARTS and path.parent.name else path.name
+
+
 def _about(known: Subject) -> dict[str, Any]:
     """What was scored: facts of the capture, none of them about the machine."""
     capture, truth = known.capture, known.truth
     return {
-        "name": known.path.resolve().name,
+        "name": _called(known.path),
         "setting": truth.setting,
         "light": capture.light,
         "units": truth.units,

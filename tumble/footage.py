@@ -92,7 +92,7 @@ def open_footage(path: Path, masks: Path | None = None) -> Footage:
     with_images = (path / "images").is_dir()
     pictures = _pictures_in(path / "images" if with_images else path)
     masks = path / "masks" if masks is None and with_images and (path / "masks").is_dir() else masks
-    mask_files = () if masks is None else tuple(_mask_of(picture, masks) for picture in pictures)
+    mask_files = () if masks is None else tuple(mask_of(picture, masks) for picture in pictures)
     with Image.open(pictures[0]) as first:
         stated = first.getexif().get_ifd(EXIF_IFD).get(EXIF_EQUIVALENT_FOCAL)
     return Footage(path, pictures, mask_files, _positive(stated), None)
@@ -124,7 +124,7 @@ def frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[Frame]:
             if number >= len(footage.masks):
                 rule = f"holds {len(footage.masks)} masks, the film has more frames"
                 raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the film, in order")
-            mask = _read_mask(footage.masks[number], picture, invert_masks)
+            mask = read_mask(footage.masks[number], picture, invert_masks)
         yield Frame(number, time, picture, mask)
     if footage.masks and not footage.pictures and number + 1 < len(footage.masks):
         rule = f"holds {len(footage.masks)} masks, the film has {number + 1} frames"
@@ -205,7 +205,12 @@ def _by_numbers(path: Path) -> list[tuple[int, int, str]]:
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
-def _mask_of(picture: Path, masks: Path) -> Path:
+def mask_of(picture: Path, masks: Path) -> Path:
+    """The mask of a picture, by its stem or its whole name.
+
+    Raises:
+        BadFile: There is none.
+    """
     names = [picture.stem + ending for ending in PICTURES] + [picture.name + ".png"]
     for name in names:
         if (masks / name).is_file():
@@ -237,7 +242,12 @@ def _upright(path: Path, values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(turned[:, ::-1] if mirror else turned)
 
 
-def _read_mask(path: Path, picture: np.ndarray, invert: bool) -> np.ndarray:
+def read_mask(path: Path, picture: UInt8[np.ndarray, "h w c"], invert: bool) -> UInt8[np.ndarray, "h w"]:
+    """A mask of a picture's size as OBJECT, UNKNOWN and BACKGROUND.
+
+    Raises:
+        BadFile: It cannot be read or is of another size.
+    """
     mask = np.ascontiguousarray(files.read_picture(path)[..., -1])
     if mask.shape != picture.shape[:2]:
         found = f"is {mask.shape[1]} x {mask.shape[0]} pixels"

@@ -11,13 +11,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble import bundle, hull, relocate, texture
+from tumble import bundle, hull, relocate, symmetry, texture
 from tumble.capture import BACKGROUND, UNKNOWN, Capture
 from tumble.frontier import Outlines, touch
-from tumble.health import Health, Observability
+from tumble.health import UNSEEN, Health, Observability
 from tumble.images import linear_from_srgb
 from tumble.relocate import Judge
 from tumble.se3 import SE3, SO3, angle_between, interpolate
+from tumble.symmetry import Mirrors
 from tumble.tracks import Tracks
 from tumble.trajectory import Trajectory
 
@@ -29,13 +30,17 @@ LEAST_GAP = 0.15
 """Median gap that is always forgiven [pixels]."""
 STRANGE = 0.1
 """Overlap under the median from which a frame's silhouette contradicts the hull."""
-FEW = 8
-"""Inliers under which matches do not hold a frame against its outline."""
+FEW, CONTRARY = 8, 6.0
+"""Inliers under which matches do not hold a frame against its outline, and median distance between its matches and
+their points from which they speak against it [pixels]."""
 WIDE = 0.5
 """Least angle between the rays that make a frontier point [radians]."""
 STRAY = 1.1
 """Distance from the centre, over that which one point in twenty exceeds, from which a point is a wrong one: frontier
 points gather at the object's ends."""
+BARE = 0.15
+"""Share of observations with texture that no edge explains under which a body of revolution has no texture: bare cans
+4 to 12 %, where their rims are cut off, a soup can 38 %."""
 JUDGED, JUDGES = 24, 16
 """Frames that are asked what their outline would say of a turn, and frames they are compared with."""
 CELLS = 48
@@ -81,7 +86,8 @@ def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solu
     worst = LOST * gap[~gap.isnan()].median().clamp_min(LEAST_GAP) if bool((~gap.isnan()).any()) else torch.inf
     visible = (capture.masks != BACKGROUND).flatten(1).any(1)
     failed = ~outline.sure.any(1)
-    lost = ~visible | failed | ((gap > worst) & (inliers < FEW)) | (gap.isnan() & (inliers < FEW))
+    lost = ~visible | failed | (((gap > worst) | gap.isnan() | (median > CONTRARY)) & (inliers < FEW))
+    lost = ~relocate.unbroken(R, ~lost)
     sure = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < AGREES).float()) >= 3
     centre, scale = _ball(torch.cat([rim, X[sure]]) if len(rim) < 50 else rim)
     R_first = R[0]
@@ -257,4 +263,16 @@ def _observability(
     total = H.diagonal(dim1=1, dim2=2).sum(-1)
     typical = total.median() * (H / total.clamp_min(1e-9)[:, None, None]).mean(0)
     strength, axes = torch.linalg.eigh(typical)
-    return Observability(axes[:, 0].float(), strength.clamp_min(1 / torch.pi**2).rsqrt().float())
+    seen = Observability(axes[:, 0].float(), strength.clamp_min(1 / torch.pi**2).rsqrt().float())
+    bare = bool((torch.linalg.eigvalsh(textured)[:, 0] > 0).double().mean() < BARE)
+    return _symmetric(seen, symmetry.mirrors(capture.masks)) if bare else seen
+
+
+def _symmetric(seen: Observability, mirrors: Mirrors) -> Observability:
+    """What is seen of a bare object, whatever the poses that were found for it say."""
+    if not mirrors.revolves:
+        return seen
+    if mirrors.ball:
+        return replace(seen, sigma=torch.full_like(seen.sigma, torch.pi))
+    axis = torch.nn.functional.pad(mirrors.axis, (0, 1), value=torch.nan)
+    return Observability(axis, torch.cat([seen.sigma.new_full((1,), torch.pi), seen.sigma[1:].clamp_max(UNSEEN)]))

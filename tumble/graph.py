@@ -5,6 +5,8 @@ frontier points and averaged again, twice with growing windows; at last the whol
 of all pairs of frames found anew in every round. Frames that contradict the others are tried in many other rotations.
 Necker's reversal is met where it arises: every window also starts from its mirror image, and the better one stays.
 
+A capture whose outlines and tracks still contradict each other begins anew in other ways; the best is kept.
+
 Unit of length until `finish`: the object's mean distance from the camera.
 """
 
@@ -16,7 +18,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble import bundle, frontier, pairwise
+from tumble import bundle, frontier, matching, pairwise
 from tumble.averaging import average
 from tumble.bundle import Problem, Scene
 from tumble.capture import Capture
@@ -24,12 +26,15 @@ from tumble.frontier import Outlines
 from tumble.gauge import Solution, Tracked, finished
 from tumble.loop import State
 from tumble.match import Match
+from tumble.pairs import loops_by_rotation
 from tumble.pairwise import Silhouettes
-from tumble.relocate import FEW, Judge, cost, hypotheses, relocate
+from tumble.relocate import FEW, LEAP, Judge, cost, hypotheses, relocate, unbroken
 from tumble.se3 import SO3, angle_between, mean_rotation
-from tumble.tracks import Tracks, followed, joined
+from tumble.symmetry import mirrors
+from tumble.tracks import NONE, Tracks, followed, joined, of_match
+from tumble.trajectory import Trajectory
 
-VERSION = 3
+VERSION = 5
 POINTS = 150
 """Tracks that pass through a frame."""
 CONTRADICTS = 1.5
@@ -39,8 +44,23 @@ FORGIVEN = 0.1
 """Such loss that is always forgiven: a quarter of a pixel."""
 PREFERENCE = 6.0
 """Factor on the weight of outlines when one witness is preferred: without the other neither holds all poses."""
+MOST_LOOPS, AGAIN, SURE = 60, 12, 0.6
+"""Pairs of frames that see the same side again, their least distance in time [frames], and the confidence of matches
+that are taken from them."""
+STILL = 0.01
+"""Weight of the belief that the object does not turn from one frame to the next, of a match 1."""
 FULL = 1.1
 """The object's radius over that of the ball about its middling silhouette."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """One way to begin."""
+
+    windows: tuple[int, ...]
+    """Sizes of the windows, rising [frames]."""
+    frontier: float
+    """Weight of a frontier point, of a match 1."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +69,11 @@ class Config:
 
     windows: tuple[int, ...] = (6, 12)
     """Sizes of the windows, rising [frames]."""
+    others: tuple[Start, ...] = (Start((8, 16), 12.0), Start((6, 12), 5.0))
+    """Other ways to begin, for captures that do not settle."""
+    settled: float = 0.06
+    """Loss under which a capture has settled [pixels^2]: those with median errors of 2 degrees and less came to 0.02 to
+    0.07, others to 0.13 and more."""
     window_points: int = 250
     """Most tracks of a window."""
     schedule: tuple[float, ...] = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5)
@@ -59,6 +84,8 @@ class Config:
     """Likewise, after frames have been relocated."""
     preferring: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
     """Likewise, where tracks or outlines are preferred, whose difference tells how far to trust the poses."""
+    loops: float = 0.6
+    """Angle between viewing directions up to which a body of revolution is matched with itself [radians]."""
     relocations: int = 2
     """How often contradicting frames are given a second look."""
     frontier: float = 12.0
@@ -121,12 +148,15 @@ def _focal(capture: Capture) -> float:
     return float(capture.camera.fx_fy_cx_cy[:2].double().prod().sqrt())
 
 
-def plan(cfg: Config) -> list[tuple[str, float]]:
-    """What each step does: the name of the phase and its number."""
-    phases = [("pairs", 0.0), *(("windows", float(size)) for size in cfg.windows)]
-    phases += [("whole", scale) for scale in cfg.rounds]
+def plan(cfg: Config) -> list[tuple[str, float, int]]:
+    """What each step does: the name of the phase, its number, and the way to begin that it belongs to."""
+    phases: list[tuple[str, float, int]] = []
+    for start, windows in enumerate((cfg.windows, *(other.windows for other in cfg.others))):
+        phases += [("pairs", 0.0, start), *(("windows", float(size), start) for size in windows)]
+        phases += [*(("whole", scale, start) for scale in cfg.rounds), ("keep", cfg.rounds[-1], start)]
+    phases += [("loops", cfg.loops, 0)]
     for _ in range(cfg.relocations):
-        phases += [("relocate", 0.7), *(("whole", scale) for scale in cfg.again)]
+        phases += [("relocate", 0.7, 0), *(("whole", scale, 0) for scale in cfg.again)]
     return phases
 
 
@@ -137,7 +167,9 @@ def length(cfg: Config, inputs: Inputs) -> int:
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     """Every frame as the camera would see an object that does not turn, in the middle of its silhouette."""
     R = torch.eye(3, dtype=torch.float64).repeat(len(inputs.capture), 1, 1)
-    return State(0, Poses(R, _on_axis(inputs.capture, inputs.shapes)), None, rng)
+    t = _on_axis(inputs.capture, inputs.shapes)
+    kept = {"R": R, "t": t, "loss": torch.tensor(torch.inf, dtype=torch.float64)}
+    return State(0, Poses(R, t), None, rng, kept | {f"loop_{name}": x for name, x in vars(NONE).items()})
 
 
 def _on_axis(capture: Capture, shapes: Silhouettes) -> Float[Tensor, "t 3"]:
@@ -148,8 +180,13 @@ def _on_axis(capture: Capture, shapes: Silhouettes) -> Float[Tensor, "t 3"]:
 
 @torch.no_grad()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
-    phase, number = plan(cfg)[state.step]
-    phases = {"pairs": _pairs, "windows": _windows, "whole": _whole, "relocate": _relocate}
+    phase, number, start = plan(cfg)[state.step]
+    if start > 0:
+        if float(state.memory["loss"]) < cfg.settled:
+            return {}
+        cfg = replace(cfg, frontier=cfg.others[start - 1].frontier) if phase != "keep" else cfg
+    phases = {"pairs": _pairs, "windows": _windows, "whole": _whole, "keep": _keep, "loops": _loops}
+    phases |= {"relocate": _relocate}
     state.params, scalars = phases[phase](cfg, inputs, state, number)
     return scalars
 
@@ -166,8 +203,14 @@ def _pairs(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
         return state.params, {"pairs": 0.0}
     fits = pairwise.fit(near, inputs.shapes, inputs.capture.camera, most=150)
     weight = (fits.inliers + 1) / (fits.j - fits.i).abs()
-    found = average(fits.i, fits.j, fits.R_j_i, weight, n_frames=len(inputs.capture))
-    return replace(state.params, R=found.R_cam_obj), {"pairs": float(len(fits))}
+    # A film is smooth: where matches do not say how it goes on, it is first believed to stand still.
+    n = len(inputs.capture)
+    before = torch.arange(n - 1)
+    still = torch.eye(3, dtype=weight.dtype).expand(n - 1, 3, 3)
+    i, j = torch.cat([fits.i, before]), torch.cat([fits.j, before + 1])
+    weight = torch.cat([weight, torch.full((n - 1,), STILL, dtype=weight.dtype)])
+    found = average(i, j, torch.cat([fits.R_j_i, still]), weight, n_frames=n)
+    return Poses(found.R_cam_obj, _on_axis(inputs.capture, inputs.shapes)), {"pairs": float(len(fits))}
 
 
 def _windows(cfg: Config, inputs: Inputs, state: State, number: float) -> Outcome:
@@ -214,9 +257,34 @@ def _whole(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
     poses = state.params
     frames = torch.arange(len(inputs.capture))[None]
     scene = Scene(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype))
-    group = torch.zeros(inputs.tracks.n, dtype=torch.long)
-    scene, price = _round(cfg, inputs, scene, inputs.tracks, group, frames, scale, state.rng)
+    tracks = inputs.tracks
+    if len(state.memory.get("loop_point", ())):
+        tracks = joined(tracks, Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv"))))
+    group = torch.zeros(tracks.n, dtype=torch.long)
+    scene, price = _round(cfg, inputs, scene, tracks, group, frames, scale, state.rng)
     return Poses(scene.R[0], scene.t[0]), {"loss": price.mean()}
+
+
+def _keep(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
+    """The better of these poses and those of other ways to begin."""
+    alone = State(0, state.params, None, torch.Generator().manual_seed(0))
+    loss, memory = torch.as_tensor(_whole(cfg, inputs, alone, scale)[1]["loss"]), state.memory
+    if float(loss) < float(memory["loss"]):
+        memory |= {"R": state.params.R, "t": state.params.t, "loss": loss}
+    return Poses(memory["R"], memory["t"]), {"loss": memory["loss"]}
+
+
+def _loops(cfg: Config, inputs: Inputs, state: State, widest: float) -> Outcome:
+    """Points that are seen again when a body of revolution comes round: its outlines do not tell how it turned."""
+    capture = inputs.capture
+    if not mirrors(capture.masks).revolves:
+        return state.params, {}
+    pairs = loops_by_rotation(SO3.from_matrix(state.params.R), count=MOST_LOOPS, gap=AGAIN, widest=widest, spread=1)
+    found = [m.select(m.confidence > SURE) for m in matching.match_pairs(matching.views_of(capture), pairs, "sift")]
+    parts = [of_match(m) for m in found if len(m) >= pairwise.LEAST]
+    for name, x in vars(joined(NONE, *parts)).items():
+        state.memory[f"loop_{name}"] = x
+    return state.params, {"loops": float(len(parts))}
 
 
 def _round(
@@ -265,10 +333,14 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
 
     every = torch.ones(n, dtype=torch.bool)
     before = torch.stack([cost(judge(k, every).gaps(R[k : k + 1], t[k : k + 1]), scale)[0] for k in range(n)])
+    stretch = unbroken(R, every)
     calm = torch.nn.functional.avg_pool1d(before.nan_to_num(posinf=9.0)[None], 5, 1, 2, count_include_pad=False)[0]
-    seed, limit = int(calm.argmin()), max(CONTRADICTS * float(before.median()), FORGIVEN)
+    seed, limit = (
+        int(torch.where(stretch, calm, torch.inf).argmin()),
+        max(CONTRADICTS * float(before.median()), FORGIVEN),
+    )
     # Frames that went astray together agree with each other: only those beyond doubt may judge.
-    trusted = before <= limit
+    trusted = (before <= limit) & stretch
     turns, middle = hypotheses(), _on_axis(inputs.capture, inputs.shapes)
     changed = 0
     for k in [*range(seed, n), *range(seed - 1, -1, -1)]:
@@ -278,12 +350,25 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
         R_try = torch.cat([R[k : k + 1], *(turns @ R[i] for i in near)])
         t_try = torch.cat([t[k : k + 1], (middle[k] * t[near, 2].mean()).expand(len(R_try) - 1, 3)])
         now = cost(judge(k, trusted).gaps(R_try[:1], t_try[:1]), scale)[0]
+        inner = k - 1 if k > seed else k + 1
+        if trusted[inner]:
+            smooth = angle_between(SO3.from_matrix(R_try), SO3.from_matrix(R[inner])) < LEAP
+            now = now if smooth[0] else torch.full_like(now, torch.inf)
+            R_try, t_try = R_try[smooth], t_try[smooth]
         (R_new, t_new), after = relocate(judge(k, trusted), R_try, t_try, scale=scale)
         if after < 0.9 * now:
             R[k], t[k] = R_new, t_new
             changed += 1
         trusted[k] = after <= limit
     return Poses(R, t), {"relocated": float(changed)}
+
+
+def judged(inputs: Inputs, trajectory: Trajectory) -> Tracked:
+    """Poses of another route as if this one had found them."""
+    T_cam_obj = trajectory.T_cam_obj
+    t = T_cam_obj.xyz.double()
+    poses = Poses(T_cam_obj.rotation.matrix().double(), t / t[:, 2].mean())
+    return finish(Config(), inputs, State(0, poses, None, torch.Generator().manual_seed(0)))
 
 
 @torch.no_grad()
@@ -297,7 +382,7 @@ def _drift(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
     """Angle between the rotations that tracks and outlines, the two witnesses, would each have preferred [radians]."""
     preferred = []
     for weight in (cfg.frontier / PREFERENCE, cfg.frontier * PREFERENCE):
-        alone = State(0, state.params, None, torch.Generator().manual_seed(0))
+        alone = State(0, state.params, None, torch.Generator().manual_seed(0), state.memory)
         for scale in cfg.preferring:
             alone.params, _ = _whole(replace(cfg, frontier=weight), inputs, alone, scale)
         preferred.append(SO3.from_matrix(alone.params.R).inverse())

@@ -29,7 +29,8 @@ class Observability:
     """The axis of the object about which frames can turn with the least notice."""
 
     axis: Float[Tensor, "3"]
-    """Unit length, object frame."""
+    """Unit length, object frame. Of a bare body of revolution only its direction in the first picture is known: the
+    last number is NaN."""
     sigma: Float[Tensor, "3"]
     """Typical uncertainty of a frame's rotation about this axis, and about the two across it [radians]."""
 
@@ -46,7 +47,8 @@ class Observability:
     @property
     def sentence(self) -> str:
         """What to tell a person."""
-        x, y, z = (f"{float(a):.2f}" for a in self.axis)
+        known = [f"{float(a):.2f}" for a in self.axis if not a.isnan()]
+        where = f"({', '.join(known)})" + ("" if len(known) == 3 else " of the first picture")
         if self.plain:
             return (
                 "Rotation is not observable: neither texture nor outline shows how the object turns. Stick something "
@@ -54,8 +56,8 @@ class Observability:
             )
         if self.unseen:
             return (
-                f"Rotation about axis ({x}, {y}, {z}) is not observable: the object looks the same when it turns about "
-                f"it. Stick something on it that breaks the symmetry."
+                f"Rotation about axis {where} is not observable: the object looks the same when it turns about it. "
+                f"Stick something on it that breaks the symmetry."
             )
         return f"Rotations are seen about every axis, to about {_degrees(self.sigma[0])} degrees about the worst."
 

@@ -11,7 +11,7 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ LEAST_TURN = math.radians(20)
 """Less turning cannot be reconstructed, and half of it may be the noise of flow [radians]."""
 MARGIN = 0.08
 """Room around the object's path, as a share of its longer side."""
+UNSURE, KEPT, LEFT = (220, 30, 30), (40, 200, 60), (60, 60, 60)
+"""Edges of the frames of the preview."""
 PREVIEW = "mask_preview.mp4"
 PROVENANCE = "ingest.json"
 
@@ -45,15 +47,25 @@ def capture_from_video(path: Path, out: Path, options: Options | None = None) ->
         BadFile: The footage cannot become a capture, or `out` is there already; nothing is written then.
     """
     options = options or Options()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadFile(out, "is there already", "choose a new folder")
+    refuse_full(out)
     found = survey(path, options)
     kept = keep(found, options)
     window = crop_window(found, kept)
+    return write_folder(out, lambda partial: _write(found, kept, window, partial, options))
+
+
+def refuse_full(out: Path) -> None:
+    """Refuse a place where something is already."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise BadFile(out, "is there already", "choose a new folder")
+
+
+def write_folder(out: Path, write: Callable[[Path], None]) -> Path:
+    """Let `write` fill a partial folder, then put it in place in one step; returns it."""
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=files.partial_prefix(), dir=out.parent))
     try:
-        _write(found, kept, window, partial, options)
+        write(partial)
         partial.chmod(0o755)
         partial.replace(out)
     finally:
@@ -106,21 +118,21 @@ def crop_window(found: Survey, kept: list[int]) -> tuple[int, int, int, int]:
 
 
 def preview(found: Survey, path: Path, kept: list[int]) -> None:
-    """A film of the masks: background dark, unknown orange, the object as it is; a red edge marks unsure frames.
+    """A film of the masks; a green edge marks the frames that `keep` chose, a red one those whose mask is unsure."""
+    edges = [UNSURE if unsure else KEPT if i in kept else LEFT for i, unsure in enumerate(found.masks.unsure)]
+    shown = map(tinted, found.pictures, found.masks.labels, edges)
+    video.write_clip(path, shown, quality=24)
 
-    A green edge marks the frames that `keep` chose.
-    """
-    h, w = (side // 2 * 2 for side in found.pictures.shape[1:3])
 
-    def shown() -> Iterator[np.ndarray]:
-        for i, (picture, labels) in enumerate(zip(found.pictures, found.masks.labels, strict=True)):
-            tinted = picture.copy()
-            tinted[labels == BACKGROUND] //= 3
-            tinted[labels == UNKNOWN] = tinted[labels == UNKNOWN] // 2 + np.array([120, 60, 0], np.uint8)
-            edge = (220, 30, 30) if found.masks.unsure[i] else (40, 200, 60) if i in kept else (60, 60, 60)
-            yield cv2.rectangle(tinted[:h, :w].copy(), (0, 0), (w - 1, h - 1), edge, 3)
-
-    video.write_clip(path, shown(), quality=24)
+def tinted(
+    picture: UInt8[np.ndarray, "h w 3"], labels: UInt8[np.ndarray, "h w"], edge: tuple[int, int, int]
+) -> UInt8[np.ndarray, "i j 3"]:
+    """Background dark, unknown orange, the object as it is, with an edge; of even sides, as films want them."""
+    h, w = (side // 2 * 2 for side in labels.shape)
+    shown = picture.copy()
+    shown[labels == BACKGROUND] //= 3
+    shown[labels == UNKNOWN] = shown[labels == UNKNOWN] // 2 + np.array([120, 60, 0], np.uint8)
+    return cv2.rectangle(shown[:h, :w].copy(), (0, 0), (w - 1, h - 1), edge, 3)
 
 
 # The second pass ------------------------------------------------------------------------------------------------------
@@ -139,7 +151,7 @@ def _write(found: Survey, kept: list[int], window: tuple[int, int, int, int], ou
             continue
         i, name = wanted[frame.number], f"{len(entries):04d}.png"
         full = undistorted(frame, found.lens)
-        picture = _developed(full.picture[top : top + height, left : left + width], found.gains[i], size)
+        picture = developed(full.picture[top : top + height, left : left + width], found.gains[i], size)
         mask = _full_mask(found, i, full, window, picture)
         if not (mask == OBJECT).any():
             continue
@@ -174,7 +186,7 @@ def _said(found: Survey, i: int, name: str) -> dict[str, Any]:
     }
 
 
-def _developed(picture: np.ndarray, gain: np.ndarray, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+def developed(picture: np.ndarray, gain: np.ndarray, size: tuple[int, int]) -> UInt8[np.ndarray, "i j 3"]:
     """The window without drift, averaged over the area of the new pixels in linear light."""
     picture = np.ascontiguousarray(picture)
     if np.abs(gain - 1).max() >= ALIKE:

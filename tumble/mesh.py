@@ -4,12 +4,12 @@ Object frame, object radius = 1, faces counterclockwise from outside. A *cell* i
 the *values*: signed distances to the surface, positive outside, in units of a cell and clamped to `BAND`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8, Int32
 from torch import Tensor
 from torch.nn.functional import max_pool3d, normalize
 
@@ -89,19 +89,20 @@ def distances(
     means = gaussians.means
     camera = Camera(camera.fx_fy_cx_cy.to(means), pixels, pixels)
     poses = SE3(poses.wxyz.to(means), poses.xyz.to(means))
-    cell = 2 * REACH / cells
-    planes, near = [], torch.zeros((cells + 1,) * 3, dtype=torch.bool, device=means.device)
+    cell, backs = 2 * REACH / cells, _turned_over(gaussians)
+    sights, near = [], torch.zeros((cells + 1,) * 3, dtype=torch.bool, device=means.device)
     for i in range(views):
         view = rasterize(gaussians, gamma, poses[i], camera, {})
         known, x_obj = _surface(view, poses[i], camera, 2 * cell)
-        planes.append(_planes(view, known, x_obj))
+        back = rasterize(backs, gamma, poses[i], camera, {}).alpha
+        sights.append(_sight(view, known, back, x_obj))
         at = ((x_obj[known] + REACH) / cell).round().long().clamp(0, cells)
         near[at[:, 0], at[:, 1], at[:, 2]] = True
     corners = torch.where(_grown(near, BAND))
     coarse = torch.cartesian_prod(*[torch.arange(2, cells + 1, 4, device=means.device)] * 3)
 
     def fused(index: Int[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        return torch.cat([_fused(rows * cell - REACH, planes, poses, camera, cell) for rows in index.split(CHUNK)])
+        return torch.cat([_fused(rows * cell - REACH, sights, poses, camera, cell) for rows in index.split(CHUNK)])
 
     blocks = fused(coarse).sign().reshape((cells // 4,) * 3) * BAND
     values = torch.full((cells + 1,) * 3, float(BAND), device=means.device)
@@ -121,25 +122,50 @@ def _surface(
     return known, T_cam_obj.inverse() @ x_cam
 
 
-def _planes(view: Buffers, known: Bool[Tensor, "h w"], x_obj: Float[Tensor, "h w 3"]) -> Float[Tensor, "p 6"]:
-    """Per pixel the normal, the offset and the depth of its plane, and what is known: 1 surface, 0 nothing, -1 sky."""
-    normal = normalize(view.normal, dim=-1)
-    offset = (normal * x_obj).sum(-1)
-    state = known.to(offset) - (view.alpha < 0.5).to(offset)
-    return torch.cat([normal, torch.stack([offset, view.depth, state], -1)], -1).flatten(0, 1)
+def _turned_over(gaussians: Gaussians) -> Gaussians:
+    """The same with the other side outwards: what a view sees of them it sees from within the object."""
+    half_turn = SO3(gaussians.quats.new_tensor([0.0, 1.0, 0.0, 0.0]))
+    return replace(gaussians, quats=(SO3(normalize(gaussians.quats, dim=-1)) @ half_turn).wxyz)
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What one view tells; most of its pixels tell little, and there are many views of many pixels."""
+
+    state: Int8[Tensor, " p"]
+    """1: a surface; 0: nothing; -1: sky."""
+    place: Int32[Tensor, " p"]
+    """Of a pixel's plane, where it has one."""
+    planes: Float[Tensor, "k 5"]
+    """Normal, offset and depth."""
+
+
+def _sight(
+    view: Buffers, known: Bool[Tensor, "h w"], back: Float[Tensor, "h w"], x_obj: Float[Tensor, "h w 3"]
+) -> _Sight:
+    """A view of the far side's back looks in where no frame ever showed the object: that is no sky."""
+    normal = normalize(view.normal[known], dim=-1)
+    offset = (normal * x_obj[known]).sum(-1)
+    state = known.to(torch.int8) - ((view.alpha < 0.5) & (back < 0.5)).to(torch.int8)
+    place = (known.flatten().cumsum(0, dtype=torch.int32) - 1).clamp(min=0)
+    planes = torch.cat([normal, torch.stack([offset, view.depth[known]], -1)], -1)
+    # A view of nothing but sky.
+    planes = planes if len(planes) else planes.new_zeros(1, 5)
+    return _Sight(state.flatten(), place, planes)
 
 
 def _fused(
-    x_obj: Float[Tensor, "n 3"], planes: list[Float[Tensor, "p 6"]], poses: SE3, camera: Camera, cell: float
+    x_obj: Float[Tensor, "n 3"], sights: list[_Sight], poses: SE3, camera: Camera, cell: float
 ) -> Float[Tensor, " n"]:
     """Signed distances [cells] of points, from all views' planes."""
     total, weights, outer, outer_weights, through = x_obj.new_zeros(5, len(x_obj))
-    for i, plane in enumerate(planes):
+    for i, sight in enumerate(sights):
         x_cam = poses[i] @ x_obj
         column, row = camera.project(x_cam).floor().long().unbind(-1)
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         pixel = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-        normal, (offset, depth, state) = plane[pixel].split([3, 3], -1)[0], plane[pixel][:, 3:].unbind(-1)
+        state, (normal, rest) = sight.state[pixel], sight.planes[sight.place[pixel].long()].split([3, 2], -1)
+        offset, depth = rest.unbind(-1)
         distance = ((normal * x_obj).sum(-1) - offset) / cell
         behind = (x_cam[:, 2] - depth) / cell
         through += ~inside | (state < 0) | ((state > 0) & (behind < -3 * BAND) & (distance > BAND))
@@ -151,7 +177,7 @@ def _fused(
         weight = near * fade * cosine.clamp(min=0).square()
         total, weights = total + weight * distance, weights + weight
         outer, outer_weights = outer + weight * distance.clamp(min=0), outer_weights + weight * (distance > 0)
-    air = through > THROUGH * len(planes)
+    air = through > THROUGH * len(sights)
     total, weights = torch.where(air, outer, total), torch.where(air, outer_weights, weights)
     unseen = torch.where(through >= 2, float(BAND), -float(BAND))
     return torch.where(weights > 0.1, total / weights.clamp(min=0.1), unseen)

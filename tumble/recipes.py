@@ -11,8 +11,11 @@ from tumble import average, graph
 from tumble.decompose import Config as Decompose
 from tumble.decompose import Rates as DecomposeRates
 from tumble.decompose import Weights as DecomposeWeights
+from tumble.fields import Sizes
 from tumble.refine import Config as Refine
 from tumble.relight import Config as Relight
+from tumble.track import Config as Track
+from tumble.track import Rates as TrackRates
 
 
 @dataclass(frozen=True)
@@ -21,8 +24,8 @@ class Recipe:
 
     matcher: str = "mixed"
     """Of pixels between frames, for captures without poses: a file of `matching`."""
-    track: graph.Config = field(default_factory=graph.Config)
-    """Stage 1, for captures without poses."""
+    track: graph.Config | Track = field(default_factory=graph.Config)
+    """Stage 1, for captures without poses: by the graph route, or by the paper's (`progressive`)."""
     refine: Refine = field(default_factory=Refine)
     """Its pose rate counts where poses are estimated; known ones stay as they are."""
     decompose: Decompose | average.Config = field(default_factory=Decompose)
@@ -81,6 +84,24 @@ SMOKE = replace(
     relight=replace(DRAFT.relight, brdf_samples=16, light_samples=16),
 )
 
+QUICK_TRACK = Track(
+    poses="vectors",
+    motion="steady",
+    sizes=Sizes(width=64, depth=4, skip=2, features=32, octaves=4, colour_width=64, colour_depth=2, colour_octaves=2),
+    samples=16,
+    warmup=60,
+    pose_steps=30,
+    joint_steps=40,
+    rays=128,
+    old_rays=64,
+    match_rays=48,
+    match_share=1.0,
+    inside=1.0,
+    block=2,
+    rates=TrackRates(poses=3e-3, poses_decay=0.3, fields=2e-3, sharpness=2e-3, ramp=1),
+)
+"""The progressive route for two CPU cores: its network, rays and steps are a hundredth of the paper's work."""
+
 QUALITIES = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 
 
@@ -126,6 +147,12 @@ def full_light(recipe: Recipe) -> Recipe:
 def averaging(recipe: Recipe) -> Recipe:
     """Baseline: albedo is the mean colour over the frames, the light is white; no inverse rendering."""
     return replace(recipe, decompose=average.Config())
+
+
+def progressive_poses(recipe: Recipe) -> Recipe:
+    """The paper's route of stage 1: a neural field that grows frame by frame. PAPER's numbers take days on a CPU; other
+    recipes take a network, rays and steps for minutes."""
+    return replace(recipe, track=Track() if recipe == PAPER else QUICK_TRACK)
 
 
 def _decomposing(recipe: Recipe, **changes: Any) -> Recipe:

@@ -21,7 +21,9 @@ from tumble import (
     graph,
     ingest,
     matching,
+    posed,
     predict,
+    progressive,
     refine,
     relight,
     run,
@@ -51,17 +53,18 @@ FILM_FRAMES, FILM_SIDE, FILM_ELEVATION = 90, 384, math.radians(20)
 
 
 def ingested(path: Path, out: Path, options: Options) -> Path:
-    """The capture folder to reconstruct: `path` itself, or what became of a film, in the run directory.
+    """The capture folder to reconstruct: `path` itself, or what became of footage, in the run directory.
 
     Raises:
-        BadFile: The film cannot become a capture, or `out` holds that of another film or of other options.
+        BadFile: The footage cannot become a capture, or `out` holds that of other footage or of other options.
     """
-    if not footage.is_footage(path):
+    with_model = posed.recognises(path)
+    if not with_model and not footage.is_footage(path):
         return path
     made = out / run.CAPTURE
     with run.alone(out):
         if not made.exists():
-            return ingest.capture_from_video(path, made, options)
+            return (posed.capture_from_model if with_model else ingest.capture_from_video)(path, made, options)
     note = made / ingest.PROVENANCE
     found, wanted = files.read_json(note) if note.exists() else {}, ingest.origin(path, options)
     different = [line for name in wanted for line in run.differences(found.get(name), wanted[name], name)]
@@ -114,16 +117,17 @@ def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe
 def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) -> tuple[Tracked, str]:
     """Stage 1: match, then find all poses; also the key of the result."""
     recipe = opened.recipe
+    route = graph if isinstance(recipe.track, graph.Config) else progressive
     near = neighbours(len(capture))
     matches = matching.match_pairs(
         matching.views_of(capture), near, recipe.matcher, cache=opened.path / "1-track" / "matches"
     )
     try:
-        inputs = graph.gather(capture, matches)
+        inputs = route.gather(capture, matches)
     except ValueError as error:
         raise BadFile(capture_path, str(error), "give masks that show the object") from None
     keys = [content, recipe.matcher]
-    tracked = run.stage(opened, 1, "track", graph, recipe.track, inputs, keys)
+    tracked = run.stage(opened, 1, "track", route, recipe.track, inputs, keys)
     health = tracked.health
     lost = int(health.lost.sum())
     about = {"lost": lost, "verdict": health.verdict, "axis": health.observability.sentence}
@@ -133,7 +137,7 @@ def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) 
         raise BadFile(capture_path, rule, "film an object with more texture or shape, in smaller turns")
     if health.verdict == "bad":
         warnings.warn(health.sentence, stacklevel=2)
-    return tracked, run.key("track", graph.VERSION, recipe.track, keys)
+    return tracked, run.key("track", route.VERSION, recipe.track, keys)
 
 
 def _keep(asset: Asset, capture: Capture, out: Path) -> None:
@@ -173,15 +177,27 @@ def evaluate_run(out: Path, capture_path: Path, where: Path) -> dict[str, Any]:
 
 
 def _predict(out: Path, known: evaluate.Subject) -> str:
-    """Write the prediction; returns how its views were aligned, in words. A run with a stage 1 has poses of its own."""
-    asset = finished(out)
-    names = tuple(files.read_json(out / POSES))
-    given = known.capture.trajectory is not None and not any(out.glob("1-*"))
+    """Write the prediction; returns how its views were aligned, in words.
+
+    A run that found its poses, or had them from COLMAP, has an object frame of its own.
+    """
+    asset, names = finished(out), source_names(out, known.capture)
+    own_frame = any(out.glob("1-*")) or (out / run.CAPTURE / ingest.PROVENANCE).is_file()
+    given = known.capture.trajectory is not None and not own_frame
     alignment, words = predict.aligned(asset.trajectory, names, known.capture, known.truth, given=given)
     cfg = _relighting(out)
     prediction = predict.predict(cfg, asset, known.capture, known.truth, alignment, names=names)
     prediction.write(out / PREDICTION)
     return words
+
+
+def source_names(out: Path, capture: Capture) -> tuple[str, ...]:
+    """Names in a capture of the frames of a run, in order: those of a film are found by their numbers."""
+    names, note = tuple(files.read_json(out / POSES)), out / run.CAPTURE / ingest.PROVENANCE
+    if not note.is_file():
+        return names
+    numbers = {said["name"]: said.get("source_frame", len(capture)) for said in files.read_json(note)["frames"]}
+    return tuple(capture.names[i] if (i := numbers.get(name, len(capture))) < len(capture) else name for name in names)
 
 
 def relight_run(out: Path, env: Path, pictures: Path | None = None, *, fast: bool, exposure: float = 0.0) -> Path:

@@ -2,18 +2,21 @@
 
 The judge is the frontier (see `frontier`): outlines of all frames together leave a frame little freedom, whatever its
 texture. What is tried are the poses of the neighbours in time, turned about many axes.
+
+Outlines do not tell a bottle's bottom from itself half a turn later. A film does: between two frames an object turns
+by degrees. Where poses *leap*, one side of the leap is wrong, however well it fits.
 """
 
 from dataclasses import dataclass
 from itertools import product
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.camera import Camera
 from tumble.frontier import Outlines, touch
-from tumble.se3 import SO3
+from tumble.se3 import SO3, angle_between
 
 TURNS = (-0.35, -0.17, 0.17, 0.35)
 """Angles tried about each of 13 axes [radians]."""
@@ -25,6 +28,8 @@ HOLD = 10.0
 """Weight of the origin's place against one pixel: it moves by a tenth of its distance at most."""
 STEP = 1e-4
 """Of the difference quotients."""
+LEAP, PACE = 0.7, 0.2
+"""Turn from one frame to the next that no matcher survives, and what it may be in the long run [radians]."""
 RAGGED = 0.5
 """Noise of a gap where one outline is compared with many: its own errors are the same in all [pixels]."""
 TURN, SHIFT = 0.15, 0.02
@@ -72,6 +77,25 @@ def hypotheses() -> Float[Tensor, "k 3 3"]:
     unit = torch.nn.functional.normalize(torch.tensor(axes, dtype=torch.float64), dim=-1)
     turns = torch.cat([torch.zeros(1, 3, dtype=torch.float64), *(angle * unit for angle in TURNS)])
     return SO3.exp(turns).matrix()
+
+
+def unbroken(R: Float[Tensor, "t 3 3"], known: Bool[Tensor, " t"]) -> Bool[Tensor, " t"]:
+    """The most known frames that follow each other without a leap; of more in between, each may turn by PACE."""
+    frames = torch.nonzero(known)[:, 0]
+    turn = angle_between(SO3.from_matrix(R[frames][:, None]), SO3.from_matrix(R[frames]))
+    follows = turn < (PACE * (frames[:, None] - frames).abs()).clamp_min(LEAP)
+    length, before = [], []
+    for k in range(len(frames)):
+        reached = [(length[i], i) for i in torch.nonzero(follows[k, :k])[:, 0].tolist()]
+        most, previous = max(reached, default=(0, -1))
+        length.append(most + 1)
+        before.append(previous)
+    found = torch.zeros_like(known)
+    k = length.index(max(length)) if length else -1
+    while k >= 0:
+        found[frames[k]] = True
+        k = before[k]
+    return found
 
 
 def relocate(judge: Judge, R: Float[Tensor, "h 3 3"], t: Float[Tensor, "h 3"], *, scale: float) -> tuple[Pose, Tensor]:

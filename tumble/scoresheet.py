@@ -58,7 +58,7 @@ def draw(report: dict[str, Any], predicted: Prediction, truth: Truth) -> UInt8[n
         rows.append((f"{truth.names[i]}\n{truth.regions[i]}", tiles))
     return sheet.draw(
         Sheet(
-            title=f"Prediction {report['prediction']}, capture {report['capture']['name']}",
+            title=_title(report),
             subtitle=_subtitle(report),
             table=_table(report),
             groups=groups,
@@ -68,6 +68,11 @@ def draw(report: dict[str, Any], predicted: Prediction, truth: Truth) -> UInt8[n
             notes=report["notes"],
         )
     )
+
+
+def _title(report: dict[str, Any]) -> str:
+    names = dict.fromkeys([report["prediction"], report["capture"]["name"]])
+    return f"Scores of {' on '.join(names)}"
 
 
 def _known(truth: Truth, light: str | None) -> dict[str, bool]:

@@ -43,6 +43,8 @@ LEAST_MOVING = 0.1
 """Share of the box that must differ from the backdrop for it to be of use there before the object is known."""
 OTHER_PART = 0.15
 """A second piece of the object, behind a finger, has at least this share of the largest one's area."""
+SMALL_HOLE = 0.03
+"""Share of the object's area up to which a hole in it is doubted; the handle of a mug is larger."""
 GRABCUT_SEED = 7
 """GrabCut starts its colour models at random."""
 
@@ -152,12 +154,18 @@ def three_valued(
 ) -> UInt8[np.ndarray, "h w"]:
     """Object with a band of unknown pixels along its silhouette, half inside, and other things that move unknown.
 
+    A small hole is unknown, too: a dark print before a dark wall looks like one, and would be carved out of the object.
+
     Args:
         other: What moves and is not the object.
         band: Half the width of the band [pixels].
     """
     labels = np.where(_dilated(inside, band) | other, np.uint8(UNKNOWN), np.uint8(BACKGROUND))
     labels[_eroded(inside, band)] = OBJECT
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats((labels == BACKGROUND).astype(np.uint8), connectivity=4)
+    left, top, width, height, area = stats.T
+    within = (left > 0) & (top > 0) & (left + width < labels.shape[1]) & (top + height < labels.shape[0])
+    labels[(within & (area < SMALL_HOLE * inside.sum()))[pieces]] = UNKNOWN
     return labels
 
 

@@ -64,6 +64,9 @@ class Options:
     """A fisheye lens: OpenCV's k1 k2 k3 k4, zeros for the ideal one."""
     distortion: tuple[float, ...] | None = None
     """A normal lens that bends lines: OpenCV's k1 k2 p1 p2 [k3]."""
+    light: Literal["object", "camera"] = "object"
+    """Pictures with poses by COLMAP: what the light stood still with. object: the camera went round the object; camera:
+    the object turned, and the background was masked. (A film's light always stands still with the camera.)"""
     frames: int = 96
     """Frames to keep at most."""
     size: int = 256
@@ -209,7 +212,7 @@ def _scanned(footage: Footage, options: Options) -> _Scan:
     for frame in frames(footage, invert_masks=options.invert_masks):
         height, width = frame.picture.shape[:2]
         if glass is None:
-            glass, scale = _glass(footage, options, height, width), min(SURVEY_SIDE / max(height, width), 1.0)
+            glass, scale = lens_of(footage, options, height, width), min(SURVEY_SIDE / max(height, width), 1.0)
         if frame.number >= MOST_FRAMES:
             raise BadFile(footage.path, f"has more than {MOST_FRAMES} frames", "cut the part in which the object turns")
         if frame.number % stride:
@@ -235,7 +238,8 @@ def _scanned(footage: Footage, options: Options) -> _Scan:
     )
 
 
-def _glass(footage: Footage, options: Options, height: int, width: int) -> Lens:
+def lens_of(footage: Footage, options: Options, height: int, width: int) -> Lens:
+    """The lens of footage whose frames have this size."""
     if min(height, width) < LEAST_SIDE:
         raise BadFile(footage.path, f"is {width} x {height} pixels", f"the shorter side needs {LEAST_SIDE} at least")
     return lens(
@@ -276,7 +280,7 @@ def _seed(path: Path, scan: _Scan, pictures: np.ndarray, still: Backdrop, option
     if options.box is None and options.click is None:
         seed = segment.find_seed(pictures, still)
         if seed is None:
-            fix = "draw a box: --box LEFT TOP WIDTH HEIGHT, on frame 0 or on --at FRAME; or give --masks"
+            fix = "draw a box in the browser: --pick; or --box LEFT TOP WIDTH HEIGHT on --at FRAME; or --masks"
             raise BadFile(path, "shows nothing that moves before a still background", fix)
         return seed
     index = int(np.abs(scan.numbers - options.at).argmin())

@@ -59,6 +59,16 @@ class Tracks:
         return Tracks(frame[enough], fresh, uv[enough])
 
 
+NONE = Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2).double())
+
+
+def of_match(match: Match) -> Tracks:
+    """Every correspondence a point that two frames show."""
+    point = torch.arange(len(match))
+    frame = torch.cat([torch.full_like(point, match.i), torch.full_like(point, match.j)])
+    return Tracks(frame, point.repeat(2), torch.cat([match.uv_i, match.uv_j]).double())
+
+
 def joined(*parts: Tracks) -> Tracks:
     """Tracks of different points, those of the first part numbered first."""
     point, begin = [], 0

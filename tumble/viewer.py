@@ -7,7 +7,7 @@ The world is the object's frame, +y up. Nodes: `/object` (Gaussians, or the poin
 import contextlib
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from tumble import export, files, gallery, loop, run, tree
+from tumble import decompose, export, files, gallery, loop, run, tree
 from tumble.asset import Asset
 from tumble.capture import Capture
 from tumble.datasets import which
@@ -61,6 +61,8 @@ class Look:
     colours: dict[str, Float[Tensor, "n 3"]] = field(default_factory=dict)
     """sRGB by the name of a map."""
     trajectory: Trajectory | None = None
+    names: tuple[str, ...] = ()
+    """Of the trajectory's frames."""
     environment: Environment | None = None
 
 
@@ -71,29 +73,38 @@ def look(out: Path, capture: Capture | None) -> Look:
         BadFile: A file of the run is damaged.
     """
     source = next((name for name in SOURCES if (out / name).is_file()), "")
-    trajectory = _trajectory(out, capture)
+    tracked = tree.load(Tracked, out / "1-track" / run.OUT) if (out / "1-track" / run.OUT).is_file() else None
+    trajectory, names = _frames(tracked, capture)
     if source == ASSET:
         asset = tree.load(Asset, out / ASSET)
         assert asset.material is not None, "an asset with material"
         lit = torch.stack([torch.from_numpy(export.splats(asset, 1.0)[f"f_dc_{i}"]) for i in range(3)], -1)
         colours = {"as photographed": 0.5 + export.SH_DC * lit} | _maps(asset.gaussians, asset.material)
-        shown = asset.gaussians, asset.gamma, None, colours, asset.trajectory, asset.environment
+        shown = asset.gaussians, asset.gamma, None, colours, asset.trajectory, names, asset.environment
         return Look("finished", *shown)
     if source.startswith("3") or source.endswith(f"2-refine/{run.CHECKPOINT}"):
-        return _checkpoint(out / source, trajectory)
+        return replace(_checkpoint(out / source), trajectory=trajectory, names=names)
     if source.startswith("2"):
         refined = tree.load(Refined, out / source)
         colours = {"albedo": srgb_from_linear(refined.albedo)} | _normals(refined.gaussians)
-        return Look("stage 2 finished", refined.gaussians, refined.gamma, None, colours, trajectory)
-    if source:
-        tracked = tree.load(Tracked, out / source)
+        return Look("stage 2 finished", refined.gaussians, refined.gamma, None, colours, trajectory, names)
+    if tracked is not None:
         colours = {"as photographed": srgb_from_linear(tracked.colours)}
-        return Look("stage 1 finished", points=tracked.points, colours=colours, trajectory=trajectory)
-    return Look("nothing yet", trajectory=trajectory)
+        return Look("stage 1 finished", None, None, tracked.points, colours, trajectory, names)
+    return Look("nothing yet", trajectory=trajectory, names=names)
 
 
-def _checkpoint(path: Path, trajectory: Trajectory | None) -> Look:
-    """A stage in training."""
+def _frames(tracked: Tracked | None, capture: Capture | None) -> tuple[Trajectory | None, tuple[str, ...]]:
+    """Poses and names of the frames that are used; those whose pose is lost are left out."""
+    names = () if capture is None else capture.names
+    if tracked is None:
+        return (None if capture is None else capture.trajectory), names
+    kept = torch.where(~tracked.health.lost)[0].tolist()
+    return tracked.trajectory.select(kept), tuple(names[i] for i in kept) if names else ()
+
+
+def _checkpoint(path: Path) -> Look:
+    """A stage in training; of stage 3 what it would put out if it ended now."""
     step, params = loop.peek(path)
     parts: dict[str, dict[str, Tensor]] = {}
     for name, value in params.items():
@@ -102,10 +113,12 @@ def _checkpoint(path: Path, trajectory: Trajectory | None) -> Look:
     gaussians, gamma = Gaussians(**parts["gaussians"]), params["gamma"]
     if "material" not in parts:
         colours = {"albedo": srgb_from_linear(torch.sigmoid(params["points.albedo_logits"]))} | _normals(gaussians)
-        return Look(f"stage 2, step {step}", gaussians, gamma, None, colours, trajectory)
-    colours = _maps(gaussians, Material(**parts["material"]))
-    environment = Environment(**parts["environment"])
-    return Look(f"stage 3, step {step}", gaussians, gamma, None, colours, trajectory, environment)
+        return Look(f"stage 2, step {step}", gaussians, gamma, None, colours)
+    material, environment = Material(**parts["material"]), Environment(**parts["environment"])
+    trained = decompose.Params(gaussians, gamma, material, environment, params["poses"], params["log_tint"])
+    ended = decompose.shared_out(trained)
+    colours = _maps(gaussians, ended.material)
+    return Look(f"stage 3, step {step}", gaussians, gamma, None, colours, environment=ended.environment)
 
 
 def _maps(gaussians: Gaussians, material: Material) -> dict[str, Float[Tensor, "n 3"]]:
@@ -115,22 +128,6 @@ def _maps(gaussians: Gaussians, material: Material) -> dict[str, Float[Tensor, "
 
 def _normals(gaussians: Gaussians) -> dict[str, Float[Tensor, "n 3"]]:
     return {"normals": 0.5 + 0.5 * gaussians.normals}
-
-
-def _trajectory(out: Path, capture: Capture | None) -> Trajectory | None:
-    """Of the frames that are used; those whose pose is lost are left out."""
-    if not (out / "1-track" / run.OUT).is_file():
-        return None if capture is None else capture.trajectory
-    tracked = tree.load(Tracked, out / "1-track" / run.OUT)
-    return tracked.trajectory.select(torch.where(~tracked.health.lost)[0])
-
-
-def _names(out: Path, capture: Capture) -> tuple[str, ...]:
-    """Of the frames of the trajectory."""
-    if not (out / "1-track" / run.OUT).is_file():
-        return capture.names
-    lost = tree.load(Tracked, out / "1-track" / run.OUT).health.lost.tolist()
-    return tuple(name for name, gone in zip(capture.names, lost, strict=True) if not gone)
 
 
 def progress(out: Path) -> str:
@@ -158,7 +155,6 @@ class Window:
             raise BadFile(out, "is no run", "give the folder of a `tumble run`, which may still be going on")
         self.out, self.stamp, self.look = out, (), Look("nothing yet")
         self.capture: Capture | None = None
-        self.names: tuple[str, ...] = ()
         self.server = viser.ViserServer(host=host, port=port, label=f"tumble {out.name}", verbose=False)
         self.server.scene.set_up_direction("+y")
         self.server.scene.configure_fog(1.0, 2.0, enabled=False)
@@ -215,19 +211,19 @@ class Window:
         trajectory, capture = self.look.trajectory, self.capture
         if trajectory is None or capture is None:
             return
-        self.names = _names(self.out, capture)
-        self.frame.max = len(self.names) - 1
+        names = self.look.names
+        self.frame.max = len(names) - 1
         T_obj_cam, camera = trajectory.T_cam_obj.inverse(), capture.camera
         fov = 2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1]))
-        for i in np.linspace(0, len(self.names) - 1, min(CAMERAS, len(self.names))).round().astype(int):
+        for i in np.linspace(0, len(names) - 1, min(CAMERAS, len(names))).round().astype(int):
             self.server.scene.add_camera_frustum(
-                f"/cameras/{self.names[i]}",
+                f"/cameras/{names[i]}",
                 fov,
                 camera.width / camera.height,
                 scale=0.2,
                 thickness=0.008,
                 color=(60, 110, 200),
-                image=_small(capture, self.names[i]),
+                image=_small(capture, names[i]),
                 wxyz=T_obj_cam.wxyz[i].numpy(),
                 position=T_obj_cam.xyz[i].numpy(),
             )
@@ -243,8 +239,9 @@ class Window:
 
     def _choose(self) -> None:
         """Show the frame's photograph, and turn the light as it stood about the object then."""
-        if self.capture is not None and self.names:
-            self.photograph.image = _small(self.capture, self.names[min(self.frame.value, len(self.names) - 1)], 320)
+        names = self.look.names
+        if self.capture is not None and names:
+            self.photograph.image = _small(self.capture, names[min(self.frame.value, len(names) - 1)], 320)
         light = self.server.scene.get_handle_by_name("/light")
         if light is not None and self.look.trajectory is not None:
             R_env_obj = self.look.trajectory.R_env_obj[min(self.frame.value, len(self.look.trajectory) - 1)]

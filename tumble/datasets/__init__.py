@@ -25,7 +25,7 @@ def which(path: Path) -> ModuleType:
     if len(found) == 1:
         return readers[found[0]]
     known = "; ".join(f"{name}: {reader.LAYOUT}" for name, reader in readers.items())
-    rule = "has no layout that is known" if path.is_dir() else "is not a folder"
+    rule = "has no layout that is known" if path.is_dir() else "is not a folder" if path.exists() else "is missing"
     raise BadFile(path, f"has the layouts of {' and '.join(found)}" if found else rule, f"known are {known}")
 
 

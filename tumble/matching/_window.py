@@ -22,6 +22,11 @@ mixes object and background, which does not move (method_poses, pitfall 15)."""
 MARGIN = 0.1
 """What a window shows around the object, in units of the object's longer side."""
 
+AROUND = 16.0
+"""Standard deviation of the surroundings of a pixel [pixels of the window]."""
+FAINT = 3.0
+"""Contrast that is not made stronger: noise [code values]."""
+
 
 @dataclass(frozen=True)
 class Window:
@@ -40,7 +45,16 @@ class Window:
 
     @property
     def grey(self) -> UInt8[np.ndarray, "h w"]:
-        return cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY)
+        """What a surface shows against its surroundings, as strong as everywhere else, whatever light falls on it.
+
+        Shading stays with the light when the object turns, and the exposure may drift: both hold flow back. Median
+        error of stage 1 on four hand-held captures, with plain grey: 0.82, 1.05, 0.50 and 0.65 degrees; so 0.89, 0.80,
+        0.46 and 0.48.
+        """
+        grey = cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        away = grey - cv2.GaussianBlur(grey, (0, 0), AROUND)
+        spread = np.sqrt(cv2.GaussianBlur(away * away, (0, 0), AROUND))
+        return (128 + 45 * away / (spread + FAINT)).clip(0, 255).astype(np.uint8)
 
     def in_frame(self, at: Float[np.ndarray, "m 2"]) -> Float[Tensor, "m 2"]:
         """Positions in the frame of positions in the window [pixels, centres at +0.5]."""

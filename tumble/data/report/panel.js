@@ -96,6 +96,21 @@
     }
   };
 
+  // What a surface sends back is diffuse part plus highlight here, as when it was measured: glTF takes from the diffuse
+  // part what the highlight sends back, which makes dielectrics a twentieth darker.
+  const additive = (shader) => {
+    shader.fragmentShader = shader.fragmentShader.replace("#include <lights_physical_pars_fragment>", `$&
+      void additive( const in vec3 radiance, const in vec3 irradiance, const in vec3 coat, const in vec3 place,
+          const in vec3 normal, const in vec3 eye, const in vec3 coatNormal, const in PhysicalMaterial material,
+          inout ReflectedLight light ) {
+        vec3 before = light.indirectDiffuse;
+        RE_IndirectSpecular_Physical( radiance, irradiance, coat, place, normal, eye, coatNormal, material, light );
+        light.indirectDiffuse = before + material.diffuseContribution * irradiance * RECIPROCAL_PI;
+      }
+      #undef RE_IndirectSpecular
+      #define RE_IndirectSpecular additive`);
+  };
+
   // Hands --------------------------------------------------------------------------------------------------------------
 
   let [distance, nearest] = [4, 1];
@@ -174,6 +189,7 @@
     const box = new THREE.Box3().setFromObject(file.scene);
     const ball = box.getBoundingSphere(new THREE.Sphere());
     file.scene.position.sub(ball.center);
+    file.scene.traverse((node) => { if (node.material) node.material.onBeforeCompile = additive; });
     turned.add(file.scene);
     // Nearest: where the ball just fits between the edges, a little inside.
     nearest = 0.55 * ball.radius / Math.sin(Math.min(camera.fov, 90) * Math.PI / 360);
