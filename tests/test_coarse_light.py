@@ -1,10 +1,11 @@
 """The rotation-aware colour: right for a Lambertian surface, and turning everything together changes nothing."""
 
 import math
+from dataclasses import replace
 
 import torch
 
-from tumble import coarse_light, harmonics
+from tumble import brdf, coarse_light, harmonics
 from tumble.coarse_light import CoarseLight
 from tumble.directions import fibonacci_sphere, texel_directions, texel_solid_angles
 from tumble.se3 import SO3
@@ -23,13 +24,17 @@ def test_the_colour_is_albedo_times_light_plus_fresnel_times_mirrored_light() ->
     view = torch.tensor([[0.0, 0.0, 1.0], [math.sin(1.2), 0.0, math.cos(1.2)]])
     albedo = torch.tensor([[0.8, 0.2, 0.1]] * 2)
     found = coarse_light.radiance(light, albedo, n, view, torch.eye(3))
-    fresnel = torch.tensor([0.04, 0.04 + 0.96 * (1 - math.cos(1.2)) ** 5])
-    torch.testing.assert_close(found, 0.5 * albedo + 0.5 * fresnel[:, None])
+    nov = torch.tensor([[1.0], [math.cos(1.2)]])
+    share = 0.04 * brdf.split_sum(brdf.split_sum_table(), nov, torch.full_like(nov, 0.5))
+    torch.testing.assert_close(found, 0.5 * albedo + 0.5 * share, atol=0.5 * 0.04 * 0.03, rtol=0)
+    doubled = replace(light, log_highlight=torch.tensor(math.log(2)))
+    found = coarse_light.radiance(doubled, albedo, n, view, torch.eye(3))
+    torch.testing.assert_close(found, 0.5 * albedo + share, atol=0.04 * 0.03, rtol=0)
 
 
 def test_turning_object_camera_and_light_together_changes_nothing() -> None:
     torch.manual_seed(0)
-    light = CoarseLight(torch.randn(16, 3))
+    light = CoarseLight(torch.randn(16, 3), torch.randn(()))
     n, view = (torch.nn.functional.normalize(torch.randn(20, 3), dim=-1) for _ in range(2))
     R_env_obj, turn = SO3.exp(torch.randn(3)).matrix(), SO3.exp(torch.randn(3)).matrix()
     albedo = torch.rand(20, 3)
@@ -42,7 +47,7 @@ def test_irradiance_and_highlight_come_from_one_light() -> None:
     """A broad lamp at +x over an even floor of light, its irradiance / pi by quadrature."""
     fine = texel_directions(64, 128, dtype=torch.float64)
     radiance = (3.0 + 2 * fine[..., :1].clamp_min(0) ** 2).expand(-1, -1, 3)
-    light = CoarseLight(harmonics.project(radiance))
+    light = CoarseLight(harmonics.project(radiance), torch.tensor(0.0))
     n = fibonacci_sphere(40).double()
     cosine = torch.einsum("hwd,nd->nhw", fine, n).clamp_min(0)
     area = texel_solid_angles(64, 128).double()
@@ -65,9 +70,11 @@ def test_the_colour_and_its_gradients_are_those_of_the_formula() -> None:
     n_v = (n * view).sum(-1, keepdim=True)
     assert 0 < (n_v > 0).sum() < 8
     coefficients, albedo, R = torch.randn(16, 3, **like), torch.rand(8, 3, **like), torch.randn(3, 3, **like)
-    light = CoarseLight(coefficients)
-    fresnel = 0.04 + 0.96 * (1 - n_v.clamp(0, 1)) ** 5
-    expected = albedo * light.diffuse(n @ R.T) + fresnel * light.glossy((2 * n_v * n - view) @ R.T)
+    log_highlight = torch.randn((), **like)
+    light = CoarseLight(coefficients, log_highlight)
+    share = 0.04 * sum(c * (1 - n_v.clamp(0, 1)) ** k for k, c in enumerate(coarse_light.LOBE))
+    mirrored = light.glossy((2 * n_v * n - view) @ R.T)
+    expected = albedo * light.diffuse(n @ R.T) + log_highlight.exp() * share * mirrored
     torch.testing.assert_close(coarse_light.radiance(light, albedo, n, view, R), expected)
-    inputs = [x.requires_grad_() for x in (coefficients, albedo, n, view, R)]
-    assert torch.autograd.gradcheck(lambda c, *rest: coarse_light.radiance(CoarseLight(c), *rest), inputs)
+    inputs = [x.requires_grad_() for x in (coefficients, log_highlight, albedo, n, view, R)]
+    assert torch.autograd.gradcheck(lambda c, h, *rest: coarse_light.radiance(CoarseLight(c, h), *rest), inputs)

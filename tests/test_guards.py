@@ -15,7 +15,7 @@ LAYERS = [
     {"tree", "named", "files", "weights", "schedule"},
     {"se3", "directions", "harmonics", "images", "video", "backends"},
     {"brdf", "camera", "trajectory"},
-    {"gaussians", "material", "environment", "buffers", "coarse_light"},
+    {"gaussians", "material", "environment", "buffers", "coarse_light", "highlight"},
     {"capture", "asset", "match"},
     {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"}
     | {"texture", "symmetry"},

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from tumble import prefilter as filtering
-from tumble.directions import fibonacci_sphere, texel_directions
+from tumble.directions import fibonacci_sphere, random_rotation, texel_directions
 from tumble.environment import Environment
 
 
@@ -78,3 +78,16 @@ def test_gradients_reach_texels_direction_and_roughness() -> None:
         return filtering.prefilter(Environment(log)).lookup(d, r)
 
     assert torch.autograd.gradcheck(glossy, inputs, fast_mode=True)
+
+
+def test_cells_of_the_sphere_miss_no_lamp() -> None:
+    """A lamp of one texel between directions: points of the map miss it, the cells that they stand for hold it."""
+    radiance = torch.full((32, 64, 3), 0.1)
+    radiance[11, 40] = 300.0
+    light = filtering.prefilter(Environment.from_radiance(radiance))
+    mean = light.environment.integral() / (4 * math.pi)
+    turned = [fibonacci_sphere(256) @ random_rotation(torch.Generator().manual_seed(k)).T for k in range(20)]
+    cells = torch.stack([light.cells(d).mean(0) for d in turned])
+    points = torch.stack([light.environment.lookup(d).mean(0) for d in turned])
+    assert (cells / mean - 1).abs().mean() < 0.1, "lobes overlap unevenly; wider ones would blur more"
+    assert (points / mean - 1).abs().mean() > 3 * (cells / mean - 1).abs().mean()

@@ -12,9 +12,9 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, max_pool2d
 
-from tumble import coarse_light, losses, optim
+from tumble import coarse_light, highlight, losses, optim
 from tumble.asset import Asset
 from tumble.buffers import Buffers
 from tumble.camera import Camera
@@ -22,25 +22,27 @@ from tumble.capture import Capture
 from tumble.directions import fibonacci_sphere, random_rotation
 from tumble.environment import Environment
 from tumble.gaussians import Gaussians
-from tumble.images import edge_aware
+from tumble.images import linear_from_srgb
 from tumble.loop import State
 from tumble.material import DIELECTRIC, TEMPERATURE, Material
 from tumble.prefilter import prefilter
 from tumble.rasterize import rasterize
-from tumble.refine import Frame, Refined, frame
+from tumble.refine import Refined, frame
 from tumble.se3 import SE3
 from tumble.shade import AveragedBounce, Bounce, Surface, shade_split, surface
 from tumble.trace import Visibility, build, moved, open_sky, surface_points, visibility
 from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 
-VERSION = 6
+VERSION = 7
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
-BRIGHTEST = 0.9
-"""Albedo that 95 % of a surface stays below."""
 FAINT = 0.2
 """Share of a dielectric's highlight below which it hardly counts as one."""
+ALBEDO = (0.003, 0.98)
+"""At the start. Printed red has a green of 0.004: a start well above it costs 0.6 dB, for the logit has far to go."""
+FITTED = 32
+"""Frames from which the strength of the highlight is found at the start."""
 MOVED = 0.3
 """Of `trace.moved`, beyond which visibility is traced anew."""
 
@@ -96,8 +98,8 @@ class Config:
     """Of the light map at the start (appendix A)."""
     doublings: int = 6
     """Of the light map, spread evenly over the run (appendix A: up to 1024 rows)."""
-    roughness: float = 0.4
-    """At the start."""
+    roughness: float = 0.5
+    """At the start: the middle, for the data hardly say. A light too blurred under a lobe too narrow fits as well."""
     brightness: float = 0.8
     """Brightest albedo at the start (95 %); the light takes up the rest. Their product is all that stage 2 knows."""
     visibility: bool = True
@@ -145,8 +147,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     refined = inputs.refined
     # One factor for all channels: a saturated object has a channel that is dark for good reason.
     share = cfg.brightness / refined.albedo.amax(-1).quantile(0.95)
-    # Printed red has a green of 0.004: a start well above it would cost 0.6 dB, for the logit has far to go.
-    albedo = (refined.albedo * share).clamp(0.003, 0.98)
+    albedo = (refined.albedo * share).clamp(*ALBEDO)
     light = coarse_light.environment(refined.light, cfg.rows)
     material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
     params = Params(
@@ -155,14 +156,39 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
         environment=Environment.from_radiance(light.radiance / share),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
-        log_tint=albedo.new_zeros(3),
+        log_tint=(refined.light.log_highlight + share.log()).repeat(3),
     )
     params = optim.leaves(params)
-    optimizer = optim.adam(params, _rates(cfg))
     turns = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
-    state = State(0, params, optimizer, rng, {"directions": torch.stack(turns)})
+    state = State(0, params, optim.adam(params, _rates(cfg)), rng, {"directions": torch.stack(turns)})
     _look_around(cfg, inputs, state)
+    if cfg.rates.tint and params.log_tint.exp().mean() > FAINT:
+        fit_highlight(cfg, inputs, state)
     return state
+
+
+@torch.no_grad()
+def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Bring the highlight to the strength that fits best under the light as it is, and the albedos with it."""
+    params, capture, parts = state.params, inputs.capture, []
+    for number in range(0, len(capture), -(-len(capture) // FITTED)):
+        T_cam_obj = pose(params, inputs, number)
+        view = buffers_of(params, T_cam_obj, capture.camera)
+        truth = frame(capture, number, view.alpha)
+        # The outermost pixels mix in the background, where the highlight is strongest.
+        inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]
+        points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, inner, state.rng))
+        R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
+        diffuse = _shaded(cfg, state, params, view, points, R_env_obj, white, 0.0)
+        specular = _shaded(cfg, state, params, view, points, R_env_obj, 0 * white, DIELECTRIC)
+        parts.append((_shown(view, points), diffuse, specular, linear_from_srgb(points.sample(truth.image))))
+    found = highlight.fit(highlight.Samples(*map(torch.cat, zip(*parts, strict=True))), len(params.gaussians.means))
+    if found is None:
+        return
+    shift = (params.log_tint.exp() - found.strength) * found.slope
+    albedo = (params.material.albedo + shift[:, None]).clamp(*ALBEDO)
+    params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo))
+    params.log_tint.copy_(found.strength.log())
 
 
 def _rates(cfg: Config) -> dict[str, float]:
@@ -258,15 +284,14 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     T_cam_obj = pose(params, inputs, number)
     view = buffers_of(params if cfg.corners else uncornered(params), T_cam_obj, capture.camera)
     truth = frame(capture, number, view.alpha)
-    points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, truth, state.rng))
-    R_env_obj = env_from_obj(T_cam_obj, capture.light)
-    shaded = _shaded(cfg, state, params, view, points, R_env_obj)
-    alpha = points.sample(view.alpha[..., None])
-    rendered, photograph = (shaded * alpha)[None], points.sample(truth.image)[None]
+    points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, truth.mask, state.rng))
+    R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_tint.exp()
+    shaded = _shaded(cfg, state, params, view, points, R_env_obj, points.sample(view.features["albedo"]), f0)
+    rendered, photograph = (shaded * points.sample(view.alpha[..., None]))[None], points.sample(truth.image)[None]
     terms = {
         "render": (losses.developed(rendered, photograph) - photograph).abs().mean(),
-        "light": cfg.weights.light * _roughness_of(params.environment.radiance),
-        "material": cfg.weights.material * _smoothness(view, truth),
+        "light": cfg.weights.light * losses.unevenness(params.environment.radiance),
+        "material": cfg.weights.material * losses.material(view, truth.mask, truth.image),
         "highlight": cfg.weights.highlight * (1 - (-params.log_tint.exp().mean() / FAINT).exp()),
     }
     joined = float(state.step >= cfg.warmup)
@@ -279,28 +304,39 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     return {name: value.detach() for name, value in terms.items()}
 
 
-def _draw(cfg: Config, view: Buffers, truth: Frame, rng: torch.Generator) -> Tensor:
+def _draw(cfg: Config, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
     """Some pixels that show the object for sure."""
-    solid = torch.where(((view.alpha > 0.5) & (truth.mask > 0.5)).flatten())[0]
+    solid = torch.where(((view.alpha > 0.5) & (mask > 0.5)).flatten())[0]
     if not len(solid):
         return solid
     return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
 
 
 def _shaded(
-    cfg: Config, state: State, params: Params, view: Buffers, points: Surface, R_env_obj: Tensor
+    cfg: Config,
+    state: State,
+    params: Params,
+    view: Buffers,
+    points: Surface,
+    R_env_obj: Tensor,
+    albedo: Float[Tensor, "p 3"],
+    f0: float | Tensor,
 ) -> Float[Tensor, "p 3"]:
-    seen = _seen(cfg, state, view.dominant.flatten()[points.pixels].clamp_min(0).long())
     return shade_split(
         points,
-        points.sample(view.features["albedo"]),
+        albedo,
         points.sample(view.features["roughness"]),
         prefilter(params.environment),
         R_env_obj,
-        seen,
-        f0=params.material.f0 * params.log_tint.exp(),
+        _seen(cfg, state, _shown(view, points)),
+        f0=f0,
         bounce=_bounce(cfg, params),
     )
+
+
+def _shown(view: Buffers, points: Surface) -> Tensor:
+    """The Gaussian that counts most at each point."""
+    return view.dominant.flatten()[points.pixels].clamp_min(0).long()
 
 
 def _bounce(cfg: Config, params: Params) -> Bounce | AveragedBounce | None:
@@ -319,19 +355,6 @@ def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:
         return open_sky(directions, len(index))
     blocker = memory["blocker"][which] if cfg.bounce != "none" else None
     return Visibility(directions, memory["bits"][which], blocker).gather(index)
-
-
-def _roughness_of(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Mean squared difference between neighbouring texels, around the seam too (L_light)."""
-    down, across = radiance[1:] - radiance[:-1], radiance.roll(-1, 1) - radiance
-    return (down**2).mean() + (across**2).mean()
-
-
-def _smoothness(view: Buffers, truth: Frame) -> Float[Tensor, ""]:
-    """Edge-aware smoothness of albedo and roughness on the object (L_material)."""
-    inside = (truth.mask * (view.alpha > 0.5))[..., None]
-    maps = torch.cat([view.features["albedo"], view.features["roughness"]], -1)
-    return edge_aware(maps * inside, truth.image)
 
 
 def _grow_light(cfg: Config, state: State) -> None:
@@ -355,26 +378,9 @@ def _grow_light(cfg: Config, state: State) -> None:
     state.params = replace(state.params, environment=environment)
 
 
-@torch.no_grad()
 def shared_out(params: Params) -> Params:
-    """The same with the tint of the highlight moved where it belongs: into the light, and out of the albedo.
-
-    The highlight of a dielectric is grey. Where the tint would leave an albedo above 1, it is the object that has less
-    of a highlight than glass, and the fainter that is, the less its colour counts.
-    """
-    albedo = params.material.albedo
-    bound = (albedo.flatten(0, 1).quantile(0.95, dim=0) / BRIGHTEST).log()
-    faint = (bound - params.log_tint).max().clamp(min=0)
-    mean = params.log_tint.mean()
-    log_tint = mean + (-faint).exp() * (params.log_tint - mean)
-    log_tint = log_tint + (bound - log_tint).max().clamp(min=0)
-    f0 = (params.material.f0 * (params.log_tint - log_tint).exp()).mean().clamp(max=DIELECTRIC)
-    lit = (albedo / log_tint.exp()).clamp(max=0.98)
-    material = replace(
-        params.material,
-        albedo_logits=TEMPERATURE * torch.logit(lit),
-        f0_logit=torch.logit(f0 / (2 * DIELECTRIC)),
-    )
+    """The same with the tint of the highlight moved where it belongs: `highlight.shared_out`."""
+    material, log_tint = highlight.shared_out(params.material, params.log_tint)
     environment = Environment(params.environment.log_radiance + log_tint)
     return replace(params, material=material, environment=environment, log_tint=torch.zeros_like(log_tint))
 

@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
+from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.gaussians import Gaussians
-from tumble.images import planes, srgb_from_linear, ssim_map
+from tumble.images import edge_aware, planes, srgb_from_linear, ssim_map
 from tumble.se3 import SE3
 
 SSIM_MARGIN = 10
@@ -150,3 +151,15 @@ def projection(
         share = torch.where(counts, error.sign(), 0.0) / seen.sum().clamp_min(1)
         surface = torch.where(counts, surface, 0.0)
     return (share * (surface - z)).sum()
+
+
+def unevenness(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean squared difference between neighbouring texels of a light map, around the seam too (L_light, eq. 14)."""
+    down, across = radiance[1:] - radiance[:-1], radiance.roll(-1, 1) - radiance
+    return (down**2).mean() + (across**2).mean()
+
+
+def material(view: Buffers, mask: Float[Tensor, "h w"], photograph: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Edge-aware smoothness of albedo and roughness on the object (L_material, eq. 14)."""
+    inside = (mask * (view.alpha > 0.5))[..., None]
+    return edge_aware(torch.cat([view.features["albedo"], view.features["roughness"]], -1) * inside, photograph)

@@ -50,6 +50,15 @@ class Prefiltered:
         found = grid_sample(volume, grid, padding_mode="border", align_corners=False)
         return found[0, :, 0, 0].mT
 
+    def cells(self, d_env: Float[Tensor, "D 3"]) -> Float[Tensor, "D 3"]:
+        """Radiance of the cells that directions of equal area stand for, rather than of a point of each.
+
+        A lobe of roughness D^(-1/4) is about as wide as a D-th of the sphere: its half vectors fall to a quarter of
+        their peak a distance a = D^(-1/2) away. What 256 points miss of a sun makes the sum over them err five times
+        as much (`benchmarks.estimators`).
+        """
+        return self.lookup(d_env, torch.full_like(d_env[:, :1], len(d_env) ** -0.25))
+
 
 def prefilter(environment: Environment) -> Prefiltered:
     """The stack of a light; linear in its radiance and differentiable."""

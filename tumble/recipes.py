@@ -40,14 +40,19 @@ PAPER = Recipe()
 STANDARD = replace(
     PAPER,
     refine=replace(
-        PAPER.refine, steps=20_000, weights=replace(PAPER.refine.weights, normal=2.0), points=20_000, limit=60_000
+        PAPER.refine,
+        steps=20_000,
+        weights=replace(PAPER.refine.weights, normal=2.0, highlight=0.002),
+        rates=replace(PAPER.refine.rates, highlight=0.005),
+        points=20_000,
+        limit=60_000,
     ),
     decompose=Decompose(
         steps=10_000,
         warmup=2_000,
         doublings=3,
         weights=DecomposeWeights(light=0.02, material=0.02),
-        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
+        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.01),
     ),
 )
 
@@ -63,7 +68,8 @@ DRAFT = replace(
         limit=16_000,
         hull=96,
         every=300,
-        weights=replace(PAPER.refine.weights, normal=0.5),
+        weights=replace(PAPER.refine.weights, normal=0.5, highlight=0.002),
+        rates=replace(PAPER.refine.rates, highlight=0.02),
         ramp=0.5,
     ),
     decompose=Decompose(
@@ -72,7 +78,7 @@ DRAFT = replace(
         directions=256,
         doublings=1,
         weights=DecomposeWeights(light=0.002, material=0.01),
-        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
+        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.02),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
 )

@@ -24,7 +24,7 @@ from tumble.rasterize import rasterize
 from tumble.se3 import SE3
 from tumble.trajectory import Trajectory, env_from_obj
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,10 @@ class Weights:
     rank: float = 0.1
     gamma: float = 5.0
     proj: float = 1.0
+    highlight: float = 0.0
+    """Of an object whose highlight is not that of glass. It saturates: noise in normals and light alone pulls the
+    highlight down by a third, and a third too faint puts the rest into the albedo; a Lambertian object pays it.
+    """
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class Rates:
     gamma: float = 0.05
     albedo: float = 2e-2
     light: float = 2e-2
+    highlight: float = 0.0
+    """Of the strength of the highlight; 0 leaves it that of glass."""
     sh: float = 1e-2
     poses: float = 0.0
     """0 leaves the poses as given."""
@@ -199,7 +205,8 @@ def _rates(cfg: Config) -> dict[str, float]:
         "points.gaussians.sdf": rates.sdf,
         "points.gaussians.sh": 0.0 if light else rates.sh,
         "points.albedo_logits": rates.albedo if light else 0.0,
-        "light": rates.light if light else 0.0,
+        "light.coefficients": rates.light if light else 0.0,
+        "light.log_highlight": rates.highlight if light else 0.0,
         "gamma": rates.gamma,
         "poses": rates.poses,
     }
@@ -288,6 +295,7 @@ def _terms(
         "rank": weights.rank * losses.effective_rank(gaussians.log_scales),
         "gamma": weights.gamma * losses.sharpness(gaussians.sdf, params.gamma, floor=cfg.gamma_floor) * 1e-2,
         "proj": weights.proj * losses.projection(gaussians, seen, depth, full, T_cam_obj, reach=0.1),
+        "highlight": weights.highlight * -torch.expm1(-params.light.log_highlight.square()),
     }
 
 

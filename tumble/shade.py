@@ -172,7 +172,7 @@ def shade_split(
     by the share of the lobe that is visible. The split sum alone sends back 1.6 times too much at grazing angles, where
     the horizon cuts the lobe (test_a_wide_lobe_is_that_of_the_path_tracer). Arguments as for `shade`.
     """
-    light = prefiltered.environment.lookup(visibility.directions @ R_env_obj.mT)
+    light = prefiltered.cells(visibility.directions @ R_env_obj.mT)
     narrow = specular(surface.normals, surface.views, roughness, prefiltered, R_env_obj, f0)
     narrow = lobe_visibility(surface, roughness, visibility) * narrow
     black = torch.zeros_like(albedo)

@@ -1,0 +1,134 @@
+"""What limits the albedo: the truth swapped in for one unknown at a time, on captures with truth and known poses.
+
+`python -m benchmarks.swap CAPTURE...` reconstructs each with DRAFT and prints a row per unknown that is given:
+
+    nothing      the method as it is
+    roughness    the true mean roughness, kept
+    light        the true light map at 32 rows, kept
+    both         both
+    geometry     Gaussians on the true surface with its normals, kept (their size and opacity are still fitted)
+
+Foreground PSNR of the sRGB albedo over the shared evaluation views after the scale per channel, and that scale (1 where
+albedo and light share their product as the truth does); mean error of normals [deg].
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from benchmarks.kernels import machine
+from tumble import decompose, files, hull, loop, metrics, refine
+from tumble.asset import Asset
+from tumble.capture import Capture
+from tumble.datasets import folder
+from tumble.decompose import buffers_of
+from tumble.environment import Environment
+from tumble.images import srgb_from_linear
+from tumble.loop import State
+from tumble.material import TEMPERATURE
+from tumble.recipes import DRAFT
+
+GIVEN = ("nothing", "roughness", "light", "both", "geometry")
+ROWS = 32
+"""Of the light map, as DRAFT ends."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--given", choices=GIVEN, nargs="+", default=GIVEN)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    arguments = parser.parse_args()
+    rows = []
+    for path in arguments.captures:
+        capture, truth = folder.load(path), folder.load_truth(path)
+        refined = loop.drive(refine, DRAFT.refine, refine.Inputs(capture, _known(capture)), seed=0)
+        for given in arguments.given:
+            surface = on_the_surface(path, capture) if given == "geometry" else refined
+            found = score(material(capture, truth, surface, given), truth, capture)
+            rows.append({"capture": path.name, "given": given, **found})
+            print(rows[-1], flush=True)
+            command = "python -m benchmarks.swap CAPTURE..."
+            files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
+
+
+def _known(capture: Capture) -> Any:
+    assert capture.trajectory is not None, "captures with known poses"
+    return capture.trajectory
+
+
+def material(capture: Capture, truth: Any, refined: refine.Refined, given: str) -> Asset:
+    """Stage 3 with what is given held at its true value."""
+    cfg, rates = DRAFT.decompose, DRAFT.decompose.rates
+    assert isinstance(cfg, decompose.Config), "DRAFT is the method, not a baseline"
+    if given in ("roughness", "both"):
+        rough = float(truth.roughness[truth.foreground].mean())
+        cfg, rates = replace(cfg, roughness=rough), replace(rates, roughness=0.0)
+    if given in ("light", "both"):
+        cfg, rates = replace(cfg, rows=ROWS, doublings=0), replace(rates, light=0.0)
+    light: Environment = truth.light.resampled(ROWS, 2 * ROWS)
+
+    def init(cfg: decompose.Config, inputs: decompose.Inputs, rng: torch.Generator) -> State:
+        state = decompose.init(cfg, inputs, rng)
+        if given in ("light", "both"):
+            with torch.no_grad():
+                environment, albedo_logits = state.params.environment, state.params.material.albedo_logits
+                # Albedo and light share one product per channel.
+                albedo = state.params.material.albedo * environment.integral() / light.integral()
+                albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*decompose.ALBEDO)))
+                environment.log_radiance.copy_(light.log_radiance)
+            decompose.fit_highlight(cfg, inputs, state)
+        return state
+
+    stage: Any = SimpleNamespace(**vars(decompose) | {"init": init})
+    return loop.drive(stage, replace(cfg, rates=rates), decompose.Inputs(capture, refined), seed=0)
+
+
+def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
+    """Stage 2 with Gaussians that stay on the true mesh."""
+    import trimesh
+
+    mesh: Any = trimesh.load(path / "truth" / "mesh.glb", force="mesh")
+
+    def surface(inside: Tensor, n: int, rng: torch.Generator) -> hull.OrientedPoints:
+        positions, faces = trimesh.sample.sample_surface(mesh, n, seed=0)
+        share = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], positions)
+        normals = (mesh.vertex_normals[mesh.faces[faces]] * share[..., None]).sum(1)
+        points = torch.tensor(positions, dtype=torch.float32)
+        return hull.OrientedPoints(points, normalize(torch.tensor(normals).float(), dim=-1), hull.spacing(points))
+
+    cfg = DRAFT.refine
+    rates = replace(cfg.rates, means=0.0, quats=0.0, sdf=0.0)
+    cfg = replace(cfg, points=cfg.limit, limit=cfg.limit, every=cfg.steps, rates=rates)
+    with patch.object(hull, "surface", surface):
+        return loop.drive(refine, cfg, refine.Inputs(capture, _known(capture)), seed=0)
+
+
+@torch.no_grad()
+def score(asset: Asset, truth: Any, capture: Capture) -> dict[str, Any]:
+    """Of the shared evaluation views."""
+    numbers = truth.views("shared")
+    views = [buffers_of(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
+    shown = torch.stack([view.features["albedo"] * (view.alpha >= 0.5)[..., None] for view in views])
+    normals = torch.stack([normalize(view.normal, dim=-1) for view in views])
+    foreground, albedo = truth.foreground[numbers], truth.albedo[numbers]
+    scale = metrics.albedo_scale(shown, albedo, foreground)
+    pictures = zip(srgb_from_linear((shown * scale).clamp(0, 1)), srgb_from_linear(albedo), foreground, strict=True)
+    psnr = [float(metrics.psnr(a, b, mask)) for a, b, mask in pictures]
+    angles = metrics.normal_angles(normals, truth.normals[numbers])[foreground]
+    return {
+        "albedo_fg": round(sum(psnr) / len(psnr), 2),
+        "scale": [round(float(x), 2) for x in scale],
+        "normal_degrees": round(float(angles.mean()), 2),
+    }
+
+
+if __name__ == "__main__":
+    main()
