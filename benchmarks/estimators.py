@@ -19,7 +19,7 @@ from torch import Tensor
 from tumble.directions import fibonacci_sphere, random_rotation
 from tumble.environment import Environment
 from tumble.prefilter import prefilter
-from tumble.shade import Surface, diffuse, shade, shade_split
+from tumble.shade import Surface, shade, shade_split
 from tumble.trace import open_sky
 
 ROUGHNESS = (0.1, 0.2, 0.3, 0.5, 0.8)
@@ -67,16 +67,15 @@ def errors(environment: Environment, roughness: float) -> dict[str, float]:
         return total
 
     truth, specular = dense(1.0), dense(0.0)
-    generator, found = torch.Generator().manual_seed(0), {"sum": [], "split": [], "diffuse": []}
+    generator, found = torch.Generator().manual_seed(0), {"sum": [], "split": [], "shine": []}
     for _ in range(TURNS):
         sky = open_sky(fibonacci_sphere(DIRECTIONS) @ random_rotation(generator).mT, len(albedo))
         found["sum"].append(shade(seen, albedo, rough, environment, R, sky, f0=F0))
         found["split"].append(shade_split(seen, albedo, rough, prefiltered, R, sky, f0=F0))
-        found["diffuse"].append(diffuse(seen, albedo, environment, R, sky))
+        found["shine"].append(shade_split(seen, 0 * albedo, rough, prefiltered, R, sky, f0=F0))
     errors = {name: sum(rms(x - truth) for x in found[name]) / TURNS / rms(truth) for name in ("sum", "split")}
-    shine = found["split"][0] - found["diffuse"][0]
     errors["split mean"] = rms(torch.stack(found["split"]).mean(0) - truth) / rms(truth)
-    errors["specular"] = rms(shine - specular) / rms(specular)
+    errors["specular"] = rms(found["shine"][0] - specular) / rms(specular)
     return {name: round(value, 4) for name, value in errors.items()}
 
 

@@ -6,8 +6,8 @@ Everything happens in the object frame, under one set of directions for the whol
 
 Two estimators for training. `shade` sums both lobes over the shared directions: unbiased, but a few hundred cannot
 resolve a narrow lobe. `shade_split` sums the diffuse lobe and takes the specular one from a prefiltered light. On a
-sphere under real light, 256 directions, the first errs by 0.6 to 1.4 at roughness 0.1, by 0.14 to 0.46 at 0.2 and by
-0.01 to 0.12 from 0.5 up; the second by 0.01 to 0.12 everywhere, of which 0.01 to 0.05 is bias (`benchmarks`).
+sphere under real light, 256 directions, the first errs by 1.6 to 3.9 at roughness 0.1, by 0.4 to 1.5 at 0.2 and by
+0.01 to 0.24 from 0.5 up; the second, which sees the light of whole cells, by 0.01 to 0.11 everywhere (`benchmarks`).
 Take the second wherever roughness may fall below 0.4. `importance.relight_surface` is for final pictures.
 """
 
