@@ -24,7 +24,7 @@ def coordinates(angle: float) -> tuple[torch.Tensor, torch.Tensor]:
 def bottle(angle: float) -> torch.Tensor:
     """A thick body with a thin neck along the line."""
     u, v = coordinates(angle)
-    return drawn(((u.abs() < 20) & (v.abs() < 12)) | ((u > 0) & (u < 34) & (v.abs() < 5)))
+    return drawn(((u.abs() < 28) & (v.abs() < 17)) | ((u > 0) & (u < 47) & (v.abs() < 7)))
 
 
 def test_a_bottle_is_its_own_mirror_image_about_its_axis() -> None:
@@ -32,14 +32,14 @@ def test_a_bottle_is_its_own_mirror_image_about_its_axis() -> None:
     found = mirrors(bottle(angle))
     assert found.revolves
     assert not found.ball, "across the axis it is not"
-    # Lines are half a degree apart; pixels are of one fortieth of the length.
+    # Lines are half a degree apart; pixels are of one seventieth of the length.
     assert abs(math.degrees(float(found.line[0])) - 40) <= 1
 
 
 def test_the_axis_is_the_line_across_which_most_are_as_wide() -> None:
-    """A bottle 24 pixels wide; the first picture shows it foreshortened, as a box that has two axes."""
+    """A bottle 34 pixels wide; the first picture shows it foreshortened, as a box that has two axes."""
     u, v = coordinates(1.2)
-    first = drawn((u.abs() < 15) & (v.abs() < 12))
+    first = drawn((u.abs() < 21) & (v.abs() < 17))
     found = mirrors(torch.cat([first, *(bottle(angle) for angle in (0.3, 0.9, 1.4))]))
     assert abs(float(found.axis @ torch.tensor([math.cos(1.2), math.sin(1.2)]))) > 0.999
 
