@@ -98,7 +98,8 @@ def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
     mesh: Any = trimesh.load(path / "truth" / "mesh.glb", force="mesh")
 
     def surface(inside: Tensor, n: int, rng: torch.Generator) -> hull.OrientedPoints:
-        positions, faces = trimesh.sample.sample_surface(mesh, n, seed=0)
+        drawn: Any = trimesh.sample.sample_surface(mesh, n, seed=0)
+        positions, faces = drawn[:2]
         share = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], positions)
         normals = (mesh.vertex_normals[mesh.faces[faces]] * share[..., None]).sum(1)
         points = torch.tensor(positions, dtype=torch.float32)

@@ -41,8 +41,7 @@ FAINT = 0.2
 """Share of a dielectric's highlight below which it hardly counts as one."""
 ALBEDO = (0.003, 0.98)
 """At the start. Printed red has a green of 0.004: a start well above it costs 0.6 dB, for the logit has far to go."""
-FITTED = 32
-"""Frames from which the strength of the highlight is found at the start."""
+FITTED = 32  # frames from which the strength of the highlight is found at the start
 MOVED = 0.3
 """Of `trace.moved`, beyond which visibility is traced anew."""
 
@@ -98,8 +97,10 @@ class Config:
     """Of the light map at the start (appendix A)."""
     doublings: int = 6
     """Of the light map, spread evenly over the run (appendix A: up to 1024 rows)."""
-    roughness: float = 0.5
-    """At the start: the middle, for the data hardly say. A light too blurred under a lobe too narrow fits as well."""
+    roughness: float = 0.4
+    """At the start. The data hardly say: a light too blurred under a lobe too narrow fits as well."""
+    fitted: bool = False
+    """Whether the highlight's strength is found in closed form at the start: better only where roughness is known."""
     brightness: float = 0.8
     """Brightest albedo at the start (95 %); the light takes up the rest. Their product is all that stage 2 knows."""
     visibility: bool = True
@@ -162,7 +163,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     turns = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
     state = State(0, params, optim.adam(params, _rates(cfg)), rng, {"directions": torch.stack(turns)})
     _look_around(cfg, inputs, state)
-    if cfg.rates.tint and params.log_tint.exp().mean() > FAINT:
+    if cfg.fitted and params.log_tint.exp().mean() > FAINT:
         fit_highlight(cfg, inputs, state)
     return state
 
@@ -175,19 +176,18 @@ def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
         T_cam_obj = pose(params, inputs, number)
         view = buffers_of(params, T_cam_obj, capture.camera)
         truth = frame(capture, number, view.alpha)
-        # The outermost pixels mix in the background, where the highlight is strongest.
-        inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]
+        inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # the outermost pixels mix in the background
         points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, inner, state.rng))
         R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
-        diffuse = _shaded(cfg, state, params, view, points, R_env_obj, white, 0.0)
-        specular = _shaded(cfg, state, params, view, points, R_env_obj, 0 * white, DIELECTRIC)
+        share = (0.0, white), (DIELECTRIC, 0 * white)
+        diffuse, specular = (_shaded(cfg, state, params, view, points, R_env_obj, x, f0) for f0, x in share)
         parts.append((_shown(view, points), diffuse, specular, linear_from_srgb(points.sample(truth.image))))
     found = highlight.fit(highlight.Samples(*map(torch.cat, zip(*parts, strict=True))), len(params.gaussians.means))
     if found is None:
         return
     shift = (params.log_tint.exp() - found.strength) * found.slope
-    albedo = (params.material.albedo + shift[:, None]).clamp(*ALBEDO)
-    params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo))
+    logits = torch.logit((params.material.albedo + shift[:, None]).clamp(*ALBEDO))
+    params.material.albedo_logits.copy_(TEMPERATURE * logits)
     params.log_tint.copy_(found.strength.log())
 
 

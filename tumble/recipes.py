@@ -52,7 +52,7 @@ STANDARD = replace(
         warmup=2_000,
         doublings=3,
         weights=DecomposeWeights(light=0.02, material=0.02),
-        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.01),
+        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
     ),
 )
 
@@ -78,7 +78,7 @@ DRAFT = replace(
         directions=256,
         doublings=1,
         weights=DecomposeWeights(light=0.002, material=0.01),
-        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.02),
+        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
 )
@@ -155,6 +155,13 @@ def averaging(recipe: Recipe) -> Recipe:
     return replace(recipe, decompose=average.Config())
 
 
+def fitted_highlight(recipe: Recipe) -> Recipe:
+    """Variant: all starts at roughness 0.5, and the highlight's strength is found in closed form."""
+    assert isinstance(recipe.decompose, Decompose), "a variant of the method, not of a baseline"
+    rates = replace(recipe.decompose.rates, tint=0.02)
+    return _decomposing(recipe, fitted=True, roughness=0.5, rates=rates)
+
+
 def progressive_poses(recipe: Recipe) -> Recipe:
     """The paper's route of stage 1: a neural field that grows frame by frame. PAPER's numbers take days on a CPU; other
     recipes take a network, rays and steps for minutes."""
@@ -175,4 +182,5 @@ ABLATIONS = {
     "no-sdf": no_sdf,
     "full-light": full_light,
     "averaging": averaging,
+    "fitted-highlight": fitted_highlight,
 }
