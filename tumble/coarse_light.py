@@ -7,9 +7,8 @@ the env frame, shared by all Gaussians. G is the share that the split sum gives 
 how much of such a highlight there is, under a light whose level is a guess: without it a Lambertian box bends its
 normals by 8 degrees to hide the highlight that it lacks, with it by 3.
 
-On hand-held captures a static colour per Gaussian can only fit the mean over
-poses; and albedo and light found here are where stage 3 starts. Two free lights, one for each lobe, would leave their
-tints to chance.
+On hand-held captures a static colour per Gaussian can only fit the mean over poses; and albedo and light found here are
+where stage 3 starts. Two free lights, one for each lobe, would leave their tints to chance.
 """
 
 import math

@@ -16,9 +16,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from tumble.files import BadFile
+from tumble.se3 import SO3
 
 MAX_BYTES = 1 << 30
 """Largest file of a model that is read; a thousand pictures make a tenth of it."""
@@ -147,22 +149,11 @@ def _views(path: Path, optics: dict[int, Optics]) -> Iterator[View]:
         length = math.sqrt(float((values[:4] ** 2).sum()))
         if not np.isfinite(values).all() or abs(length - 1) > UNIT:
             raise BadFile(path, f"{name} has no rotation: its quaternion has length {length:.4g}")
-        yield View(name, optics[camera], _matrix(values[:4] / length), values[4:])
+        yield View(name, optics[camera], SO3(torch.from_numpy(values[:4] / length)).matrix().numpy(), values[4:])
 
 
 def _points(path: Path) -> Iterator[tuple[float, ...]]:
     return _binary_points(path) if _binary(path) else _text_points(path)
-
-
-def _matrix(wxyz: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "3 3"]:
-    w, x, y, z = wxyz
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _optics(path: Path, model: str, width: int, height: int, values: Float64[np.ndarray, " n"]) -> Optics:

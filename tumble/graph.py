@@ -335,10 +335,8 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
     before = torch.stack([cost(judge(k, every).gaps(R[k : k + 1], t[k : k + 1]), scale)[0] for k in range(n)])
     stretch = unbroken(R, every)
     calm = torch.nn.functional.avg_pool1d(before.nan_to_num(posinf=9.0)[None], 5, 1, 2, count_include_pad=False)[0]
-    seed, limit = (
-        int(torch.where(stretch, calm, torch.inf).argmin()),
-        max(CONTRADICTS * float(before.median()), FORGIVEN),
-    )
+    seed = int(torch.where(stretch, calm, torch.inf).argmin())
+    limit = max(CONTRADICTS * float(before.median()), FORGIVEN)
     # Frames that went astray together agree with each other: only those beyond doubt may judge.
     trusted = (before <= limit) & stretch
     turns, middle = hypotheses(), _on_axis(inputs.capture, inputs.shapes)

@@ -102,6 +102,15 @@ def window(view: View, reach: float, size: int) -> Window:
     return Window(_filled(picture, inside), inside, sure, (float(corner[0]), float(corner[1])), scale)
 
 
+def windows(view_i: View, view_j: View, size: int) -> tuple[Window, Window] | None:
+    """Windows of two views at one scale, which holds the larger of their objects; None when one shows none for sure."""
+    reach = [extent(view) for view in (view_i, view_j)]
+    if min(reach) == 0:
+        return None
+    wide = max(reach) * (1 + 2 * MARGIN)
+    return window(view_i, wide, size), window(view_j, wide, size)
+
+
 def _on(mask: Bool[np.ndarray, "h w"], uv: Float[Tensor, "m 2"]) -> Bool[np.ndarray, " m"]:
     """The mask's values at positions; false off the frame."""
     height, width = mask.shape

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tumble.match import Match, View, no_match
-from tumble.matching._window import MARGIN, Window, extent, window
+from tumble.matching._window import Window, windows
 
 VERSION = 1
 SIZE = 384
@@ -29,10 +29,10 @@ def load(device: torch.device | str):
     """A matcher without memory."""
 
     def match(view_i: View, view_j: View) -> Match:
-        reach = [extent(view) for view in (view_i, view_j)]
-        if min(reach) == 0:
+        looks = windows(view_i, view_j, SIZE)
+        if looks is None:
             return no_match(view_i.number, view_j.number)
-        look_i, look_j = (window(view, max(reach) * (1 + 2 * MARGIN), SIZE) for view in (view_i, view_j))
+        look_i, look_j = looks
         at_i, at_j, confidence = _matched(look_i, look_j)
         return Match(view_i.number, view_j.number, look_i.in_frame(at_i), look_j.in_frame(at_j), confidence)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from tumble import weights
 from tumble.match import Match, View, no_match
 from tumble.matching import _gmflow
-from tumble.matching._window import MARGIN, Window, extent, window
+from tumble.matching._window import Window, windows
 
 VERSION = 1
 SIZE = 256
@@ -35,10 +35,10 @@ def load(device: torch.device | str):
 
     @torch.no_grad()
     def match(view_i: View, view_j: View) -> Match:
-        reach = [extent(view) for view in (view_i, view_j)]
-        if min(reach) == 0:
+        looks = windows(view_i, view_j, SIZE)
+        if looks is None:
             return no_match(view_i.number, view_j.number)
-        look_i, look_j = (window(view, max(reach) * (1 + 2 * MARGIN), SIZE) for view in (view_i, view_j))
+        look_i, look_j = looks
         there, back = _gmflow.flow(_picture(look_i, device), _picture(look_j, device), p).cpu()
         row, column = np.mgrid[STEP // 2 : SIZE : STEP, STEP // 2 : SIZE : STEP].reshape(2, -1)
         row, column = row[look_i.sure[row, column]], column[look_i.sure[row, column]]

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tumble.match import Match, View, no_match
-from tumble.matching._window import MARGIN, Window, extent, window
+from tumble.matching._window import Window, windows
 
 VERSION = 1
 WEIGHTS = "naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric"
@@ -48,10 +48,10 @@ def load(device: torch.device | str):
     network = model.AsymmetricMASt3R.from_pretrained(where).to(device).eval()
 
     def match(view_i: View, view_j: View) -> Match:
-        reach = [extent(view) for view in (view_i, view_j)]
-        if min(reach) == 0:
+        looks = windows(view_i, view_j, SIZE)
+        if looks is None:
             return no_match(view_i.number, view_j.number)
-        look_i, look_j = (window(view, max(reach) * (1 + 2 * MARGIN), SIZE) for view in (view_i, view_j))
+        look_i, look_j = looks
         pair = (_input(look_i, 0), _input(look_j, 1))
         found = inference.inference([pair], network, device, batch_size=1, verbose=False)
         unit_i, unit_j = found["pred1"]["desc"][0].float(), found["pred2"]["desc"][0].float()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from tumble.match import Match, View, no_match
-from tumble.matching._window import MARGIN, extent, window
+from tumble.matching._window import windows
 
 VERSION = 1
 SETTING, SIZE = "base", 640
@@ -39,10 +39,10 @@ def load(device: torch.device | str):
     network.apply_setting(SETTING)
 
     def match(view_i: View, view_j: View) -> Match:
-        reach = [extent(view) for view in (view_i, view_j)]
-        if min(reach) == 0:
+        looks = windows(view_i, view_j, SIZE)
+        if looks is None:
             return no_match(view_i.number, view_j.number)
-        look_i, look_j = (window(view, max(reach) * (1 + 2 * MARGIN), SIZE) for view in (view_i, view_j))
+        look_i, look_j = looks
         found = network.match(look_i.rgb, look_j.rgb)
         # Where every pixel goes, in [-1, 1] between the outer edges of the picture.
         warp, overlap = (found[name][0].float().cpu().numpy() for name in ("warp_AB", "overlap_AB"))
