@@ -15,7 +15,7 @@ from torch import Tensor
 from tumble import lpips, metrics
 from tumble.environment import Environment
 from tumble.files import BadFile
-from tumble.se3 import SE3, SO3
+from tumble.se3 import SE3, SO3, angle_between
 from tumble.trajectory import Trajectory
 
 GREY = 0.5
@@ -475,6 +475,19 @@ def test_registration_puts_the_object_where_cameras_see_it() -> None:
 
     assert off(metrics.register(predicted, truth)) < 0.02
     assert off(metrics.align(predicted, truth)) > 0.05
+
+
+def test_registration_does_not_follow_a_few_bad_frames() -> None:
+    """Three of forty frames are 10 degrees and a tenth of the object off; the others are exact in another frame."""
+    truth = a_path(40)
+    exact = disguised(truth)
+    damage = torch.zeros(40, 6, dtype=torch.float64)
+    damage[:3] = torch.tensor([0.1, 0.05, 0.2, 0.15, 0.13, 0.05])
+    found = metrics.register(Trajectory(SE3.exp(damage) @ exact.T_cam_obj, "camera"), truth)
+    known = metrics.align(exact, truth)
+    assert float(angle_between(found.R_true_pred, known.R_true_pred)) < math.radians(0.02)  # a mean: 0.9
+    assert float(found.scale / known.scale) == pytest.approx(1, abs=1e-3)
+    assert (found.shift - known.shift).abs().max() < 2e-3
 
 
 def test_registration_needs_an_object_that_turns() -> None:

@@ -235,9 +235,10 @@ def angle_between(a: SO3, b: SO3) -> Float[Tensor, "*b"]:
     return (a.inverse() @ b).angle()
 
 
-def mean_rotation(rotations: SO3) -> SO3:
-    """The rotation with the least sum of squared matrix differences to a batch `[n]` (chordal mean)."""
-    U, _, Vh = torch.linalg.svd(rotations.matrix().mean(0))
+def mean_rotation(rotations: SO3, weights: Float[Tensor, " n"] | None = None) -> SO3:
+    """The rotation with the least sum, weighted if need be, of squared matrix differences to a batch `[n]`."""
+    matrices = rotations.matrix()
+    U, _, Vh = torch.linalg.svd((matrices if weights is None else weights[:, None, None] * matrices).mean(0))
     return SO3.from_matrix(_proper(U, Vh))
 
 
