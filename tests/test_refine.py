@@ -2,15 +2,20 @@
 
 import math
 
+import numpy as np
 import torch
 
 from tumble import losses, refine
 from tumble.buffers import Buffers
 from tumble.camera import Camera
+from tumble.capture import BACKGROUND, OBJECT, Capture
 from tumble.coarse_light import CoarseLight
-from tumble.gaussians import Gaussians
+from tumble.gaussians import Gaussians, constant_sh
+from tumble.images import srgb_from_linear
+from tumble.loop import State
 from tumble.refine import Config, Frame, Params, Points
-from tumble.se3 import SE3, SO3
+from tumble.se3 import SE3, SO3, angle_between
+from tumble.trajectory import Trajectory
 
 
 def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkeypatch) -> None:
@@ -51,3 +56,29 @@ def test_a_picture_with_nothing_in_it_has_losses_too() -> None:
     view = Buffers(black, black, black, coloured, coloured, {}, none, none.int(), black.int())
     truth, camera = Frame(coloured, black, torch.ones(20, 20, 1)), Camera.from_fov(1.0, 20, 20)
     assert refine._window(view, truth, camera) == (view, truth, camera, 1.0)
+
+
+def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
+    """Two of four photographs were taken half a degree and two degrees from where the run believes."""
+    rng = torch.Generator().manual_seed(1)
+    means = torch.nn.functional.normalize(torch.randn(600, 3, generator=rng), dim=-1)
+    flat = torch.tensor([-2.4, -2.4, -4.6]).expand(600, 3)
+    gaussians = Gaussians(means, refine._facing(means), flat, torch.full((600,), -0.1), constant_sh(means * 0))
+    points = Points(gaussians, 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]])))
+    gamma, light, camera = torch.tensor(30.0), CoarseLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
+    axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])
+    true = SE3.from_rotation(SO3.exp(axes), torch.tensor([0.02, 0.05, 4.0]).expand(4, 3).contiguous())
+    turns = torch.tensor([[0.0, 0, 0], [0.0087, 0, 0], [0.0, 0, 0], [0.02, -0.02, 0.02]])
+    base = Trajectory(SE3.from_rotation(SO3.exp(turns) @ true.rotation, true.xyz), "camera")
+    views = [refine.render(points, gamma, light, true[k], base, camera) for k in range(4)]
+    images = torch.stack([(srgb_from_linear(v.rgb).clamp(0, 1) * 255).round().to(torch.uint8) for v in views])
+    masks = torch.stack([torch.where(v.alpha > 0.5, OBJECT, BACKGROUND) for v in views]).to(torch.uint8)
+    capture = Capture(images, masks, camera, tuple("abcd"), "camera")
+    params = Params(points, gamma, light, torch.zeros(4, 6))
+    inputs = refine.Inputs(capture, base)
+    for _ in range(2):
+        refine._realign(inputs, State(0, params, None, rng, {}))
+    found = torch.stack([refine.pose(params, inputs, k).rotation.wxyz for k in range(4)])
+    errors = np.degrees(angle_between(SO3(found), true.rotation).numpy())
+    # A tenth of a pixel: the pictures are quantized, the masks hard.
+    assert errors.max() < 0.25, errors

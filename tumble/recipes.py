@@ -27,7 +27,7 @@ class Recipe:
     track: graph.Config | Track = field(default_factory=graph.Config)
     """Stage 1, for captures without poses: by the graph route, or by the paper's (`progressive`)."""
     refine: Refine = field(default_factory=Refine)
-    """Its pose rate counts where poses are estimated; known ones stay as they are."""
+    """Its pose rate and realignments count where poses are estimated; known ones stay as they are."""
     decompose: Decompose | average.Config = field(default_factory=Decompose)
     """Of the method, or of the baseline that takes its place."""
     relight: Relight = field(default_factory=Relight)
@@ -46,6 +46,7 @@ STANDARD = replace(
         rates=replace(PAPER.refine.rates, highlight=0.005),
         points=20_000,
         limit=60_000,
+        realignments=4,
     ),
     decompose=Decompose(
         steps=10_000,
@@ -71,6 +72,7 @@ DRAFT = replace(
         weights=replace(PAPER.refine.weights, normal=0.5, highlight=0.002),
         rates=replace(PAPER.refine.rates, highlight=0.02),
         ramp=0.5,
+        realignments=4,
     ),
     decompose=Decompose(
         steps=1_000,
@@ -85,7 +87,7 @@ DRAFT = replace(
 
 SMOKE = replace(
     DRAFT,
-    refine=replace(DRAFT.refine, steps=30, points=300, limit=400, hull=24, every=10, views=3),
+    refine=replace(DRAFT.refine, steps=30, points=300, limit=400, hull=24, every=10, views=3, realignments=1),
     decompose=replace(DRAFT.decompose, steps=10, warmup=5, directions=64, sets=2, pixels=64),
     relight=replace(DRAFT.relight, brdf_samples=16, light_samples=16),
 )

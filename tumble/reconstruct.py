@@ -105,7 +105,7 @@ def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe
         kept = torch.where(~tracked.health.lost)[0].tolist()
         capture, trajectory, keys = capture.select(kept), tracked.trajectory.select(kept), [key]
     else:
-        cfg = replace(cfg, rates=replace(cfg.rates, poses=0.0))
+        cfg = replace(cfg, rates=replace(cfg.rates, poses=0.0), realignments=0)
     refined = run.stage(opened, 2, "refine", refine, cfg, refine.Inputs(capture, trajectory), keys)
     keys = [run.key("refine", refine.VERSION, cfg, keys)]
     last = average if isinstance(recipe.decompose, average.Config) else decompose

@@ -21,10 +21,13 @@ from tumble.gaussians import Gaussians, constant_sh, opacity, sdf_from_opacity
 from tumble.images import crop, crop_box, planes
 from tumble.loop import State
 from tumble.rasterize import rasterize
+from tumble.realign import realign
 from tumble.se3 import SE3
 from tumble.trajectory import Trajectory, env_from_obj
 
-VERSION = 3
+VERSION = 4
+OUTLINE = 0.3
+"""Weight of coverage against colours where poses are realigned."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Rates:
     """Of the strength of the highlight; 0 leaves it that of glass."""
     sh: float = 1e-2
     poses: float = 0.0
-    """0 leaves the poses as given."""
+    """Of the tangents of all poses."""
     decay: float = 0.05
 
 
@@ -107,6 +110,8 @@ class Config:
     """Gaussians below it are dropped."""
     least_weight: float = 0.05
     """Gaussians whose weight in no scored view reaches this are dropped [pixels]."""
+    realignments: int = 0
+    """How often, at even intervals, each pose is brought in line with its own frame (`realign`)."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +231,8 @@ def pose(params: Params, inputs: Inputs, number: int) -> SE3:
     """`T_cam_obj` of one frame."""
     base = inputs.trajectory.T_cam_obj[number]
     # Poses that are left as given have tangents of 0, which take a hundred small tensors to say nothing.
-    return SE3.exp(params.poses[number]) @ base if params.poses.requires_grad else base
+    free = params.poses.requires_grad or bool(params.poses[number].any())
+    return SE3.exp(params.poses[number]) @ base if free else base
 
 
 def render(
@@ -254,6 +260,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     progress = state.step / cfg.steps
     if state.step and state.step % cfg.every == 0 and progress < cfg.until:
         _densify(cfg, inputs, state)
+    if state.step in _realignments(cfg):
+        _realign(inputs, state)
     params, camera = state.params, inputs.capture.camera
     number = _draw(state, len(inputs.capture))
     T_cam_obj = pose(params, inputs, number)
@@ -340,6 +348,28 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
     densify.place_children(points.gaussians, plan)
     state.params = replace(params, points=points)
+
+
+def _realignments(cfg: Config) -> list[int]:
+    """Steps before which poses are realigned."""
+    return [cfg.steps * k // (cfg.realignments + 1) for k in range(1, cfg.realignments + 1)]
+
+
+@torch.no_grad()
+def _realign(inputs: Inputs, state: State) -> None:
+    params, capture = state.params, inputs.capture
+
+    for number in range(len(capture)):
+
+        def residual(T_cam_obj: SE3, number: int = number) -> Tensor:
+            view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, capture.camera)
+            truth = frame(capture, number, view.alpha)
+            colour = losses.developed(view.rgb, truth.image) - truth.image
+            outline = OUTLINE * (view.alpha - truth.mask)[..., None]
+            return (torch.cat([colour, outline], -1) * truth.valid).flatten()
+
+        T_cam_obj = realign(residual, pose(params, inputs, number))
+        params.poses[number] = (T_cam_obj @ inputs.trajectory.T_cam_obj[number].inverse()).log()
 
 
 @torch.no_grad()
