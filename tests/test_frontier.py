@@ -1,13 +1,17 @@
 """Outlines of a lopsided ellipsoid touch common planes when its poses are true, and only then."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 from tests.lopsided import DISTANCE, Tumble, tumbling
 from tumble import frontier, relocate
-from tumble.capture import BACKGROUND, UNKNOWN, Capture
+from tumble.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.frontier import Outlines
 from tumble.se3 import SO3
+from tumble.segment import three_valued
 
 RADIUS = 0.9
 
@@ -92,6 +96,29 @@ def test_outlines_that_a_hand_or_the_border_cuts_are_not_sure(scene: Tumble) -> 
     assert not found.sure[0][found.corners[0, :, 0] > columns.float().mean() - 1].any()
     assert not found.sure[1][found.corners[1, :, 0] > 126].any()
     assert found.sure[1][found.corners[1, :, 0] < 101].all()
+
+
+def test_a_band_along_the_silhouette_hides_nothing(scene: Tumble) -> None:
+    """Masks of films have one, half inside: divided again, they are the true ones but for the sharpest corners."""
+    true = scene.capture.masks[:6]
+    banded = torch.stack([torch.from_numpy(three_valued(m.numpy() == OBJECT, m.numpy() < 0, 1)) for m in true])
+    assert not frontier.outlines(replace(scene.capture.select(list(range(6))), masks=banded)).sure.any()
+    found = frontier.divided(banded)
+    assert (found != UNKNOWN).all()
+    assert float((found != true).float().sum() / (true == OBJECT).sum()) < 0.002
+
+
+def test_what_a_hand_hides_stays_unknown(scene: Tumble) -> None:
+    """Twelve pixels wide, from the border of the picture to the middle of the object, which ends in a band."""
+    mask = scene.capture.masks[0].numpy()
+    rows, columns = (int(x.mean()) for x in np.nonzero(mask))
+    hand = np.zeros(mask.shape, bool)
+    hand[rows:, columns - 6 : columns + 6] = True
+    labels = three_valued((mask == OBJECT) & ~hand, hand, 1)
+    kept = frontier.divided(torch.from_numpy(labels)[None])[0].numpy()
+    # But for two pixels beside the band, where the three meet.
+    assert (kept[hand] == UNKNOWN).mean() > 0.97
+    assert (kept[~hand] == mask[~hand]).mean() > 0.99
 
 
 def test_an_empty_mask_has_no_outline(scene: Tumble) -> None:

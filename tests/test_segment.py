@@ -50,6 +50,21 @@ def test_a_hand_in_front_is_unknown_and_not_object() -> None:
     assert (masks.labels[film.hand] == BACKGROUND).mean() < 0.1
 
 
+def test_a_print_of_the_colour_of_skin_belongs_to_the_object() -> None:
+    """A disc that turns into view on the middle of the object: unlike a hand it does not reach in from outside."""
+    film = scene()
+    pictures, painted = film.pictures.copy(), np.zeros(film.object.shape, bool)
+    for i, inside in enumerate(film.object):
+        row, column = (int(x.mean()) for x in np.nonzero(inside))
+        disc = np.hypot(np.arange(inside.shape[0])[:, None] - row, np.arange(inside.shape[1]) - column) < min(
+            3 * (i - 4), 12
+        )
+        painted[i] = disc & inside
+        pictures[i][painted[i]] = (110, 35, 30)
+    masks, _ = found(Scene(pictures, film.object, film.hand, film.background), Seed(0, film.box()))
+    assert (masks.labels[painted] == OBJECT).mean() > 0.95
+
+
 def test_a_seed_in_the_middle_is_carried_both_ways() -> None:
     film = scene()
     masks, _ = found(film, Seed(10, film.box(10)))

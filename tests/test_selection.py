@@ -24,7 +24,7 @@ def ball(yaw: float, roll: float = 0.0, *, side: int = 200, radius: float = 70.0
     z = np.sqrt(np.maximum(1 - x * x - y * y, 0))
     u = (np.arctan2(x, z) - yaw) / (2 * np.pi) * 512 + 256
     v = (np.arcsin(np.clip(y, -1, 1)) / np.pi + 0.5) * 255
-    seen = cv2.remap(texture.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    seen: np.ndarray = cv2.remap(texture.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
     picture = np.where(inside, seen.clip(0, 255), 90).astype(np.uint8)
     return np.repeat(picture[..., None], 3, 2), inside
 
@@ -94,6 +94,15 @@ def test_unusable_frames_are_never_kept_and_few_frames_spread_wider() -> None:
     assert 8 <= len(kept) <= 10
     assert usable[kept].all()
     assert selection.chosen(total, np.ones(361), np.zeros(361, bool), 10) == []
+
+
+def test_a_film_of_few_frames_keeps_them_all() -> None:
+    """48 frames 5 to 12 degrees apart, two of whose turns flow hardly saw: windows of 8 degrees would drop some."""
+    steps = RNG.uniform(5, 12, 47)
+    steps[[20, 30]] = 1
+    total = np.radians(np.concatenate([[0], steps.cumsum()]))
+    usable = np.arange(48) != 40
+    assert selection.chosen(total, RNG.uniform(1, 3, 48), usable, 96) == np.nonzero(usable)[0].tolist()
 
 
 def test_an_object_that_does_not_turn_gives_one_frame() -> None:

@@ -34,7 +34,7 @@ from tumble.symmetry import mirrors
 from tumble.tracks import NONE, Tracks, followed, joined, of_match
 from tumble.trajectory import Trajectory
 
-VERSION = 5
+VERSION = 6
 POINTS = 150
 """Tracks that pass through a frame."""
 CONTRADICTS = 1.5
@@ -126,11 +126,12 @@ class Poses:
 
 
 def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
-    """Silhouettes, outlines and tracks of a capture and its matches.
+    """Silhouettes, outlines and tracks of a capture and its matches; its masks without the bands along silhouettes.
 
     Raises:
         ValueError: No frame shows the object.
     """
+    capture = replace(capture, masks=frontier.divided(capture.masks))
     shapes = pairwise.silhouettes(capture)
     if not bool(shapes.visible.any()):
         raise ValueError("no mask has an object pixel: there is nothing to find poses of")

@@ -39,6 +39,8 @@ TOUCH = 3
 """A hand lies at most this far from the object [pixels]."""
 MOVED_SHARE = 0.03
 """Of a hand that holds almost still, the share of pixels that differ from the backdrop: its edges."""
+REACHES_IN = 0.1
+"""Share of a hand, at least, that lies beyond where the object is expected."""
 LEAST_MOVING = 0.1
 """Share of the box that must differ from the backdrop for it to be of use there before the object is known."""
 OTHER_PART = 0.15
@@ -272,10 +274,12 @@ def _decided(
 
 
 def _hand(evidence: np.ndarray, about: np.ndarray, moving: np.ndarray, backdrop: Backdrop) -> np.ndarray:
-    """Pieces of the hand's colour that touch the object and are no part of the still background."""
+    """Pieces of the hand's colour that moved, touch the object and reach in from outside: one within it is a print."""
     pieces = _moved_pieces(_opened(evidence > HAND_EVIDENCE, 1), moving | ~backdrop.known)
     count, numbers = _pieces(pieces)
     touching = np.bincount(numbers[_dilated(about, TOUCH)], minlength=count) > 0
+    beyond = np.bincount(numbers[~_dilated(about, _reach(about))], minlength=count)
+    touching &= beyond > REACHES_IN * np.bincount(numbers.ravel(), minlength=count)
     touching[0] = False
     return touching[numbers]
 

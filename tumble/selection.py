@@ -16,6 +16,9 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 STEP = math.radians(8)
 """Turn between kept frames [radians]; with the choice inside a window, 4 to 12 degrees."""
+FEW = 2
+"""Frames per window up to which all are kept: to thin so few saves little, and single turns are measured too roughly to
+say which would leave a gap."""
 ANCHOR = math.radians(3)
 """Turns are measured from an earlier frame until they reach this, lest the noise of flow adds up [radians]."""
 TEXTURED = 12.0
@@ -87,6 +90,8 @@ def chosen(
 ) -> list[int]:
     """Indices of the frames to keep: the sharpest usable one in the middle half of every window of turning.
 
+    All usable ones of a film that has hardly more frames than windows.
+
     Args:
         total: From `turned`.
         blurs: From `blur`.
@@ -95,6 +100,9 @@ def chosen(
     """
     first, last = float(total[0]), float(total[-1])
     count = max(min(round((last - first) / STEP) + 1, n_frames), 1)
+    every = [int(i) for i in np.nonzero(usable)[0]]
+    if len(every) <= min(FEW * count, n_frames):
+        return every
     step = (last - first) / max(count - 1, 1)
     kept: list[int] = []
     for k in range(count):

@@ -4,6 +4,9 @@ A matcher answers on a plain surface too, and its answer there is "nothing moved
 light. Texture is what stands out from its surroundings, *moves* against the silhouette, and looks the same where it has
 moved to, but not where it would be had it stayed: slow shading does not stand out, noise does not come again, what the
 light paints does not move. Along an edge a point may slide: what is known is a matrix, not a number.
+
+Grain is noise that a film's compression carries from one frame to the next, on moving patches as well: patches are
+compared across more than a frame, and after a mean over few pixels, which leaves less of grain than of most texture.
 """
 
 import torch
@@ -14,17 +17,17 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from tumble.capture import OBJECT, Capture
 from tumble.tracks import Tracks
 
-BLUR = 5
-"""Window whose mean is the surroundings [pixels]."""
-HALF = 3
-"""Half side of the patches that are compared [pixels]."""
+GRAINS, BLUR = 3, 9
+"""Windows whose means are compared: what stands out, and its surroundings [pixels]."""
+HALF = 5
+"""Half side of the patches that are compared: of means, smaller ones look alike by chance [pixels]."""
 ALIKE = 0.7
 """Correlation of two patches from which they show one texture."""
 UNLIKE = 0.3
 """By how much that has to exceed the correlation with the patch that kept its place in the silhouette."""
-MOVED, AHEAD = 2.0, 8
-"""Way against the silhouette from which a point is known to move [pixels], and observations among which one that far is
-looked for."""
+MOVED, NEXT, AHEAD = 2.0, 2, 8
+"""Way against the silhouette from which a point is known to move [pixels], and the nearest and the farthest of its
+later observations among which one that far is looked for."""
 CORNER = 0.1
 """Information across the strongest direction, over that along it, from which it counts: a bent edge is no corner."""
 GRAIN = 2.0
@@ -47,10 +50,12 @@ def information(capture: Capture, tracks: Tracks) -> Float[Tensor, "o 2 2"]:
     slope = torch.stack([0.5 * (a[:, 1:-1, 2:] - a[:, 1:-1, :-2]), 0.5 * (a[:, 2:, 1:-1] - a[:, :-2, 1:-1])], -1)
     found = torch.einsum("nyxi,nyxj->nij", slope, slope)
     strength, axes = torch.linalg.eigh(found)
-    # Noise has slopes as well, the same in all directions.
-    strength = (strength - slope.shape[1] * slope.shape[2] * noise2[:, None] / 2).clamp_min(0)
+    # Noise has slopes as well, the same in all directions; means two pixels apart share a third of theirs.
+    shared = 1 - 2 / GRAINS
+    strength = (strength - slope.shape[1] * slope.shape[2] * (1 - shared) * noise2[:, None] / 2).clamp_min(0)
     strength[:, 0] *= strength[:, 0] > CORNER * strength[:, 1]
-    strength = strength * (good / noise2.clamp_min(GRAIN**2))[:, None]
+    # As many pixels share the noise of one mean, and say nothing new.
+    strength = strength * (good / (GRAINS**2 * noise2).clamp_min(GRAIN**2))[:, None]
     found = axes @ torch.diag_embed(strength) @ axes.mT
     return torch.zeros(len(tracks), 2, 2, dtype=torch.float64).index_copy_(0, first, found.double())
 
@@ -64,7 +69,7 @@ def _pairs(capture: Capture, tracks: Tracks) -> tuple[Int64[Tensor, " p"], Int64
     order = torch.argsort(tracks.point * len(capture) + tracks.frame)
     first, second = order[:0], order[:0]
     left = torch.ones(len(order), dtype=torch.bool)
-    for ahead in range(1, AHEAD + 1):
+    for ahead in range(NEXT, AHEAD + 1):
         a, b = order[:-ahead], order[ahead:]
         stayed = _stayed(tracks, area, centre, a, b)
         far = (tracks.uv[b] - stayed).norm(dim=-1) > MOVED
@@ -85,12 +90,13 @@ def _correlation(a: Float[Tensor, "n p p"], b: Float[Tensor, "n p p"]) -> Float[
 
 
 def _standing_out(capture: Capture) -> Float[Tensor, "t h w"]:
-    """Grey values minus the mean of the object's around them; zero off the object [code values]."""
+    """Means of the object's grey values minus those of wider windows; zero off the object [code values]."""
     inside = (capture.masks == OBJECT).float()[:, None]
     grey = capture.images.float().mean(-1)[:, None] * inside
-    around, share = (avg_pool2d(picture, BLUR, 1, BLUR // 2) for picture in (grey, inside))
-    mean = around / share.clamp_min(1e-6)
-    return ((grey - mean) * inside)[:, 0]
+    near, far = (
+        avg_pool2d(grey, n, 1, n // 2) / avg_pool2d(inside, n, 1, n // 2).clamp_min(1e-6) for n in (GRAINS, BLUR)
+    )
+    return ((near - far) * inside)[:, 0]
 
 
 def _patches(pictures: Float[Tensor, "t h w"], tracks: Tracks) -> Float[Tensor, "o p p"]:
