@@ -24,7 +24,8 @@ def ball(yaw: float, roll: float = 0.0, *, side: int = 200, radius: float = 70.0
     z = np.sqrt(np.maximum(1 - x * x - y * y, 0))
     u = (np.arctan2(x, z) - yaw) / (2 * np.pi) * 512 + 256
     v = (np.arcsin(np.clip(y, -1, 1)) / np.pi + 0.5) * 255
-    seen: np.ndarray = cv2.remap(texture.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    u, v = u.astype(np.float32), v.astype(np.float32)
+    seen = np.asarray(cv2.remap(texture.astype(np.float32), u, v, cv2.INTER_LINEAR))
     picture = np.where(inside, seen.clip(0, 255), 90).astype(np.uint8)
     return np.repeat(picture[..., None], 3, 2), inside
 

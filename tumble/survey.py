@@ -67,7 +67,7 @@ class Options:
     light: Literal["object", "camera"] = "object"
     """Pictures with poses by COLMAP: what the light stood still with. object: the camera went round the object; camera:
     the object turned, and the background was masked. (A film's light always stands still with the camera.)"""
-    frames: int = 96
+    frames: int = 144
     """Frames to keep at most."""
     size: int = 256
     """Longer side of the frames to write [pixels]; never more than the film has."""
