@@ -76,7 +76,7 @@ def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
     capture = Capture(images, masks, camera, tuple("abcd"), "camera")
     params = Params(points, gamma, light, torch.zeros(4, 6))
     inputs = refine.Inputs(capture, base)
-    for _ in range(2):
+    for _ in range(4):
         refine._realign(inputs, State(0, params, None, rng, {}))
     found = torch.stack([refine.pose(params, inputs, k).rotation.wxyz for k in range(4)])
     errors = np.degrees(angle_between(SO3(found), true.rotation).numpy())

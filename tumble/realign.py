@@ -31,7 +31,7 @@ def nudged(T_cam_obj: SE3, motion: Float[Tensor, "6"]) -> SE3:
 
 
 @torch.no_grad()
-def realign(residual: Callable[[SE3], Float[Tensor, " r"]], T_cam_obj: SE3, *, rounds: int = 2) -> SE3:
+def realign(residual: Callable[[SE3], Float[Tensor, " r"]], T_cam_obj: SE3, *, rounds: int = 1) -> SE3:
     """The pose near `T_cam_obj` with the least residuals, as far as a few steps reach; never one with larger ones.
 
     Args:

@@ -25,7 +25,7 @@ from tumble.realign import realign
 from tumble.se3 import SE3
 from tumble.trajectory import Trajectory, env_from_obj
 
-VERSION = 4
+VERSION = 5
 OUTLINE = 0.3
 """Weight of coverage against colours where poses are realigned."""
 
