@@ -161,7 +161,8 @@ def _turning(found: Survey, kept: list[int]) -> list[Finding]:
     findings.append(_finding("speed", _graded(fastest, FAST), state, "turn it more slowly, or film at 60 per second"))
     step = selection.largest_step(found.turned, kept)
     state = f"{len(kept)} to keep, at most {math.degrees(step):.0f} degrees apart"
-    advice = "keep more of them with --frames; or turn more slowly where the preview shows no green edge for long"
+    slower = "turn more slowly where the preview shows no green edge for long"
+    advice = slower if len(kept) == len(found.numbers) else f"keep more of them with --frames; or {slower}"
     return [*findings, _finding("frames", "warn" if step > WIDE_STEP else "good", state, advice)]
 
 
