@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 SETTINGS = ("handheld", "turntable", "dome")
+UNIFORM = "white"
+"""A light that says nothing about the claim: there is nothing to be confused."""
 Row = dict[str, Any]
 
 
@@ -33,8 +35,8 @@ def claim(rows: list[Row]) -> list[str]:
         "| relit fg: hand-held | turntable | dome | hand - dome |",
         "|" + "---|" * 11,
     ]
-    gaps: dict[str, list[tuple[float, float]]] = {}
-    for (env, material, model), group in _groups(rows, ("env", "material", "model")):
+    gaps: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for (material, env, model), group in _groups(rows, ("material", "env", "model")):
         found = {row["made_by"]["setting"]: row["shared"] for row in group}
         if not {"handheld", "dome"} <= found.keys():
             continue
@@ -43,11 +45,13 @@ def claim(rows: list[Row]) -> list[str]:
             values = [found[s][key] if s in found else None for s in SETTINGS]
             gap.append(found["handheld"][key] - found["dome"][key])
             cells += ["-" if v is None else f"{v:.1f}" for v in values] + [f"{gap[-1]:+.1f}"]
-        gaps.setdefault(material, []).append((gap[0], gap[1]))
+        for lights in (_stem(env), *(["all"] if env != UNIFORM else [])):
+            gaps.setdefault((material, lights), []).append((gap[0], gap[1]))
         lines.append(f"| {_stem(env)} | {material} | {_stem(model)} | " + " | ".join(cells) + " |")
-    for material, found in gaps.items():
+    for (material, lights), found in sorted(gaps.items()):
         albedo, relit = (statistics.fmean(g[i] for g in found) for i in (0, 1))
-        lines.append(f"| mean of {len(found)} | {material} | | | | | **{albedo:+.1f}** | | | | **{relit:+.1f}** |")
+        about = f"| {lights} | {material} | mean of {len(found)} |"
+        lines.append(f"{about} | | | **{albedo:+.1f}** | | | | **{relit:+.1f}** |")
     return lines
 
 
@@ -58,7 +62,7 @@ def level(rows: list[Row]) -> list[str]:
         "| run [s] | score [s] | memory [MiB] |",
         "|" + "---|" * 11,
     ]
-    hand = [row for row in rows if row["made_by"]["setting"] == "handheld"]
+    hand = [row for row in rows if row["made_by"]["setting"] == "handheld" and row["made_by"]["env"] != UNIFORM]
     for (material,), group in _groups(hand, ("material",)):
         for row in [*group, None]:
             picked = group if row is None else [row]
@@ -97,7 +101,7 @@ def _groups(rows: list[Row], keys: tuple[str, ...]) -> Iterable[tuple[tuple[str,
     found: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         found.setdefault(tuple(row["made_by"][key] for key in keys), []).append(row)
-    return found.items()
+    return sorted(found.items())
 
 
 def _mean(rows: list[Row], key: str) -> float:
