@@ -65,6 +65,19 @@ def test_a_print_of_the_colour_of_skin_belongs_to_the_object() -> None:
     assert (masks.labels[painted] == OBJECT).mean() > 0.95
 
 
+def test_a_wall_of_which_a_rim_was_taught_as_hand_is_no_hand() -> None:
+    """Past a plain wall a silhouette moves: what differs there from the backdrop shows the wall. An arm is hand."""
+    about = np.zeros((60, 80), bool)
+    about[20:40, 30:50] = True
+    rim = segment._dilated(about, 4) & ~about
+    wall = np.where(about, np.float32(-3), np.float32(3))
+    plain = Backdrop(np.zeros((60, 80, 3), np.uint8), np.ones((60, 80), np.float32), np.ones((60, 80), bool))
+    assert not segment._hand(wall, about, rim, plain).any()
+    arm = ~about & (np.arange(60) > 30)[:, None] & (np.arange(80) > 35)
+    found = segment._hand(np.where(arm, wall, np.float32(-3)), about, rim, plain)
+    assert (found == segment._opened(arm, 1)).all()
+
+
 def test_a_seed_in_the_middle_is_carried_both_ways() -> None:
     film = scene()
     masks, _ = found(film, Seed(10, film.box(10)))

@@ -39,8 +39,8 @@ TOUCH = 3
 """A hand lies at most this far from the object [pixels]."""
 MOVED_SHARE = 0.03
 """Of a hand that holds almost still, the share of pixels that differ from the backdrop: its edges."""
-REACHES_IN = 0.1
-"""Share of a hand, at least, that lies beyond where the object is expected."""
+REACHES_IN, WALL = 0.1, 0.5
+"""Share of a hand, at least, that lies beyond where the object is expected; share of all there that no hand fills."""
 LEAST_MOVING = 0.1
 """Share of the box that must differ from the backdrop for it to be of use there before the object is known."""
 OTHER_PART = 0.15
@@ -278,8 +278,10 @@ def _hand(evidence: np.ndarray, about: np.ndarray, moving: np.ndarray, backdrop:
     pieces = _moved_pieces(_opened(evidence > HAND_EVIDENCE, 1), moving | ~backdrop.known)
     count, numbers = _pieces(pieces)
     touching = np.bincount(numbers[_dilated(about, TOUCH)], minlength=count) > 0
-    beyond = np.bincount(numbers[~_dilated(about, _reach(about))], minlength=count)
-    touching &= beyond > REACHES_IN * np.bincount(numbers.ravel(), minlength=count)
+    outside = ~_dilated(about, _reach(about))
+    beyond = np.bincount(numbers[outside], minlength=count)
+    # A wall is taught as hand where a silhouette moves past it.
+    touching &= (beyond > REACHES_IN * np.bincount(numbers.ravel(), minlength=count)) & (beyond < WALL * outside.sum())
     touching[0] = False
     return touching[numbers]
 
