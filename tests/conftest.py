@@ -1,6 +1,7 @@
 """Shapes and types of every function of the package are checked while the tests run."""
 
 import os
+import signal
 from pathlib import Path
 
 from jaxtyping import install_import_hook
@@ -9,6 +10,9 @@ import tests.typechecker  # noqa: F401 (the hook finds it by name)
 
 # Two test processes share two cores: one thread each, and the same floating-point sums on every machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A shell starts jobs in the background deaf to Ctrl-C, which some tests press.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 install_import_hook("tumble", "tests.typechecker.check")
 
 import pytest  # noqa: E402
