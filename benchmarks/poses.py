@@ -124,8 +124,8 @@ def report(rows: Sequence[Row]) -> str:
         both = sorted((row for row in rows if row["name"] in others), key=lambda row: (row["name"], row["route"]))
         parts += [
             "\n## The paper's progressive route against the graph\n",
-            "With the network, rays and steps of `recipes.QUICK_TRACK`, a hundredth of the paper's work: it says nothing "
-            "of the route at full size, which takes days on a CPU and has not been run.\n",
+            "With the network, rays and steps of `recipes.QUICK_TRACK`, a hundredth of the paper's work: it says "
+            "nothing of the route at full size, which takes days on a CPU and has not been run.\n",
             table(["name", "route", *SCORES], both),
         ]
     return "\n".join(parts) + "\n"
