@@ -5,6 +5,7 @@ paper's static colour per Gaussian is an ablation (`Config.colour`).
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -357,19 +358,19 @@ def _realignments(cfg: Config) -> list[int]:
 
 @torch.no_grad()
 def _realign(inputs: Inputs, state: State) -> None:
-    params, capture = state.params, inputs.capture
+    params, base = state.params, inputs.trajectory.T_cam_obj
+    for number in range(len(inputs.capture)):
+        unexplained = partial(_unexplained, params, inputs, frame(inputs.capture, number, params.gamma))
+        T_cam_obj = realign(unexplained, pose(params, inputs, number))
+        params.poses[number] = (T_cam_obj @ base[number].inverse()).log()
 
-    for number in range(len(capture)):
 
-        def residual(T_cam_obj: SE3, number: int = number) -> Tensor:
-            view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, capture.camera)
-            truth = frame(capture, number, view.alpha)
-            colour = losses.developed(view.rgb, truth.image) - truth.image
-            outline = OUTLINE * (view.alpha - truth.mask)[..., None]
-            return (torch.cat([colour, outline], -1) * truth.valid).flatten()
-
-        T_cam_obj = realign(residual, pose(params, inputs, number))
-        params.poses[number] = (T_cam_obj @ inputs.trajectory.T_cam_obj[number].inverse()).log()
+def _unexplained(params: Params, inputs: Inputs, truth: Frame, T_cam_obj: SE3) -> Float[Tensor, " r"]:
+    """Colours and, with less weight, coverage that a pose leaves over of a photograph, sRGB."""
+    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)
+    colour = losses.developed(view.rgb, truth.image) - truth.image
+    outline = OUTLINE * (view.alpha - truth.mask)[..., None]
+    return (torch.cat([colour, outline], -1) * truth.valid).flatten()
 
 
 @torch.no_grad()
