@@ -7,6 +7,7 @@
     light        the true light map at 32 rows, kept
     both         both
     geometry     Gaussians on the true surface with its normals, kept (their size and opacity are still fitted)
+    all          all of it: what is left is the albedo alone
 
 Foreground PSNR of the sRGB albedo over the shared evaluation views after the scale per channel, and that scale (1 where
 albedo and light share their product as the truth does); mean error of normals [deg].
@@ -35,7 +36,7 @@ from tumble.loop import State
 from tumble.material import TEMPERATURE
 from tumble.recipes import DRAFT
 
-GIVEN = ("nothing", "roughness", "light", "both", "geometry")
+GIVEN = ("nothing", "roughness", "light", "both", "geometry", "all")
 ROWS = 32
 """Of the light map, as DRAFT ends."""
 
@@ -50,8 +51,9 @@ def main() -> None:
     for path in arguments.captures:
         capture, truth = folder.load(path), folder.load_truth(path)
         refined = loop.drive(refine, DRAFT.refine, refine.Inputs(capture, _known(capture)), seed=0)
+        true_surface = on_the_surface(path, capture) if {"geometry", "all"} & set(arguments.given) else refined
         for given in arguments.given:
-            surface = on_the_surface(path, capture) if given == "geometry" else refined
+            surface = true_surface if given in ("geometry", "all") else refined
             found = score(material(capture, truth, surface, given), truth, capture)
             rows.append({"capture": path.name, "given": given, **found})
             print(rows[-1], flush=True)
@@ -68,16 +70,16 @@ def material(capture: Capture, truth: Any, refined: refine.Refined, given: str) 
     """Stage 3 with what is given held at its true value."""
     cfg, rates = DRAFT.decompose, DRAFT.decompose.rates
     assert isinstance(cfg, decompose.Config), "DRAFT is the method, not a baseline"
-    if given in ("roughness", "both"):
+    if given in ("roughness", "both", "all"):
         rough = float(truth.roughness[truth.foreground].mean())
         cfg, rates = replace(cfg, roughness=rough), replace(rates, roughness=0.0)
-    if given in ("light", "both"):
+    if given in ("light", "both", "all"):
         cfg, rates = replace(cfg, rows=ROWS, doublings=0), replace(rates, light=0.0)
     light: Environment = truth.light.resampled(ROWS, 2 * ROWS)
 
     def init(cfg: decompose.Config, inputs: decompose.Inputs, rng: torch.Generator) -> State:
         state = decompose.init(cfg, inputs, rng)
-        if given in ("light", "both"):
+        if given in ("light", "both", "all"):
             with torch.no_grad():
                 environment, albedo_logits = state.params.environment, state.params.material.albedo_logits
                 # Albedo and light share one product per channel.
@@ -117,7 +119,8 @@ def score(asset: Asset, truth: Any, capture: Capture) -> dict[str, Any]:
     """Of the shared evaluation views."""
     numbers = truth.views("shared")
     views = [buffers_of(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
-    shown = torch.stack([view.features["albedo"] * (view.alpha >= 0.5)[..., None] for view in views])
+    least = DRAFT.relight.alpha_min
+    shown = torch.stack([view.features["albedo"] * (view.alpha >= least)[..., None] for view in views])
     normals = torch.stack([normalize(view.normal, dim=-1) for view in views])
     foreground, albedo = truth.foreground[numbers], truth.albedo[numbers]
     scale = metrics.albedo_scale(shown, albedo, foreground)

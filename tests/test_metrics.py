@@ -236,15 +236,27 @@ def test_a_black_prediction_has_no_albedo_scale() -> None:
 
 def test_albedo_scores_follow_the_scale() -> None:
     truth, mask = albedos()
-    view = (truth[0] * 1.1, truth[0], torch.full((3,), 1 / 1.1), mask[0], everywhere(mask[0]), [])
+    view = (truth[0] * 1.1, truth[0], mask[0], torch.full((3,), 1 / 1.1), mask[0], everywhere(mask[0]), [])
     scores = metrics.albedo_scores(*view)
     # What 1.1 / 1.1 leaves in float32 is 1e-7, or 140 dB.
     assert scores["psnr_fg_linear"] == scores["psnr_full_linear"] == metrics.BEST_PSNR
     error = (0.1 * truth[0][mask[0]]).square().mean()
     assert scores["psnr_fg_linear_unscaled"] == pytest.approx(-10 * math.log10(error), abs=1e-4)
     linear = skimage_metrics.peak_signal_noise_ratio(truth[0].numpy() * 0.5, truth[0].numpy(), data_range=1)
-    halved = metrics.albedo_scores(truth[0], truth[0] * 0.5, torch.ones(3), mask[0], everywhere(mask[0]), [])
+    rest = (mask[0], torch.ones(3), mask[0], everywhere(mask[0]), [])
+    halved = metrics.albedo_scores(truth[0], truth[0] * 0.5, *rest)
     assert halved["psnr_full_linear"] == pytest.approx(linear, abs=1e-4)
+
+
+def test_a_silhouette_cuts_the_picture_of_the_albedo_but_not_its_map() -> None:
+    truth, mask = albedos()
+    half, everything = mask[0].clone(), everywhere(mask[0])
+    half[:, : half.shape[1] // 2] = False
+    beyond = torch.where(mask[0][..., None], truth[0], 0.7)
+    scores = metrics.albedo_scores(beyond, truth[0], half, torch.ones(3), mask[0], everything, [])
+    assert scores["psnr_fg_srgb"] == scores["psnr_fg_linear"] == metrics.BEST_PSNR
+    missing = truth[0][mask[0] & ~half].square().sum() / truth[0].numel()
+    assert scores["psnr_full_linear"] == pytest.approx(-10 * math.log10(missing), abs=1e-3)
 
 
 def normals(dtype: torch.dtype = torch.float32) -> Tensor:

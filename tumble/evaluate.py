@@ -62,7 +62,8 @@ PROTOCOLS = {
     "rotation_longest_run_percent": "most training frames in a row with a rotation error below 10 degrees [% of all]",
 }
 PREFIXES = {
-    "albedo": "predicted albedo times albedo_scale (per-channel median of truth / prediction, foreground of all views)",
+    "albedo": "predicted albedo times albedo_scale (per channel, median of truth / prediction over all foregrounds); "
+    "cut at the predicted silhouette, except for fg",
     "relit": "pictures as the prediction holds them, rendered with albedo times albedo_scale (docs/prediction.md)",
     "image": "views under the capture's own light, albedo and light as estimated",
     "normal": "shading normals, true object frame",
@@ -243,7 +244,8 @@ def _view_scores(
         return metrics.picture_scores(x[i] / 255, y[i] / 255, foreground, counted, networks)
 
     if predicted.albedo is not None and truth.albedo is not None and scale is not None:
-        maps = (predicted.albedo[i], truth.albedo[i])
+        assert predicted.silhouettes is not None, "albedo tells where the object is"
+        maps = (predicted.albedo[i], truth.albedo[i], predicted.silhouettes[i])
         add("albedo", metrics.albedo_scores(*maps, scale, foreground, counted, networks))
     if predicted.normals is not None and truth.normals is not None:
         add("normal", metrics.normal_scores(predicted.normals[i], truth.normals[i], foreground, counted))

@@ -53,15 +53,17 @@ def predict(
         return posed
     views = alignment.to_prediction(truth.trajectory)
     buffers = [buffers_of(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
-    solid = torch.stack([view.alpha >= SILHOUETTE for view in buffers])
-    albedo = torch.stack([view.features["albedo"] for view in buffers]) * solid[..., None]
-    normals = torch.stack([normalize(view.normal, dim=-1) for view in buffers]) * solid[..., None]
+    coverage = torch.stack([view.alpha for view in buffers])
+    # Maps reach as far as anything is known; where the object ends, the masks say.
+    known = coverage >= cfg.alpha_min
+    albedo = torch.stack([view.features["albedo"] for view in buffers]) * known[..., None]
+    normals = torch.stack([normalize(view.normal, dim=-1) for view in buffers]) * known[..., None]
     return replace(
         posed,
         albedo=albedo,
         normals=alignment.R_true_pred @ normals,
-        roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * solid,
-        masks=solid,
+        roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
+        masks=coverage >= SILHOUETTE,
         images=_pictures(cfg, asset, own, views, capture),
         relit=_relit(cfg, asset, albedo, alignment, capture, truth),
     )

@@ -137,7 +137,8 @@ def _pictures(
         assert light is not None
         return _pair(truth.relit[light], predicted.relit.get(light), i, lambda x: x / 255, _mean_error_of_codes)
     scale = torch.tensor(report["albedo_scale"] or [1.0, 1.0, 1.0])
-    scaled = None if predicted.albedo is None else predicted.albedo * scale
+    albedo, silhouettes = predicted.albedo, predicted.silhouettes
+    scaled = None if albedo is None or silhouettes is None else albedo * scale * silhouettes[..., None]
     return _pair(truth.albedo, scaled, i, _srgb, lambda x, y: (_srgb(x) - _srgb(y)).abs().mean(-1))
 
 
