@@ -69,6 +69,20 @@ def test_normals_of_a_plane_are_the_planes() -> None:
     assert losses.normal_consistency(-n_obj.expand(32, 40, 3), found, known) > 1.0
 
 
+def test_a_crease_counts_no_more_than_its_share() -> None:
+    up, known = torch.tensor([0.0, 0.0, 1.0]).expand(4, 5, 3), torch.ones(4, 5, dtype=torch.bool)
+
+    def term(degrees: float, crease: float) -> float:
+        a = math.radians(degrees)
+        leaning = torch.tensor([math.sin(a), 0.0, math.cos(a)]).expand(4, 5, 3)
+        return float(losses.normal_consistency(leaning, up, known, crease=crease))
+
+    assert term(90, 0.0) == pytest.approx(1.0)
+    assert term(90, 25.0) == pytest.approx(1 / 26)
+    # Small differences count as ever.
+    assert term(2, 25.0) == pytest.approx(term(2, 0.0), rel=0.02)
+
+
 def test_silhouette_counts_known_pixels_alone() -> None:
     mask, valid = torch.zeros(4, 4), torch.ones(4, 4, 1)
     alpha = torch.zeros(4, 4)

@@ -90,12 +90,20 @@ def normal_consistency(
     normal: Float[Tensor, "h w 3"],
     from_depth: Float[Tensor, "h w 3"],
     known: Bool[Tensor, "h w"],
+    *,
+    crease: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """1 - cosine between rendered normals and those of the rendered depth (eq. 10), averaged over the whole picture."""
+    """x = 1 - cosine between rendered normals and those of the rendered depth (eq. 10), averaged over the picture.
+
+    Args:
+        crease: With c above 0, x / (1 + c x): differences beyond 1 / c are an edge or a groove, which smoothing would
+            round off or fill.
+    """
     # One plane per axis: sums over short rows are slow.
     a, b = planes(normal), planes(from_depth)
     cosine = (a * b).sum(0) / a.square().sum(0).clamp_min(1e-24).sqrt()
-    return ((1 - cosine) * known).mean()
+    apart = 1 - cosine
+    return (apart / (1 + crease * apart) * known).mean()
 
 
 def variance(depth_var: Float[Tensor, "h w"]) -> Float[Tensor, ""]:

@@ -26,7 +26,7 @@ from tumble.realign import realign
 from tumble.se3 import SE3
 from tumble.trajectory import Trajectory, env_from_obj
 
-VERSION = 5
+VERSION = 6
 OUTLINE = 0.3
 """Weight of coverage against colours where poses are realigned."""
 
@@ -91,6 +91,8 @@ class Config:
     """Share of 1 - SSIM in the photometric term."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
+    crease: float = 0.0
+    """Of the normal term (`losses.normal_consistency`); 0 as in the paper."""
     ramp: float = 0.1
     """Share of the run over which normal and variance terms come in."""
     every: int = 500
@@ -296,10 +298,11 @@ def _terms(
     view, truth, camera, share = _window(view, truth, camera)
     image = losses.developed(view.rgb, truth.image)
     from_depth, known = losses.surface_normals(view.depth, view.alpha > 0.5, camera, T_cam_obj)
+    normal = losses.normal_consistency(view.normal, from_depth, known, crease=cfg.crease)
     return {
         "render": losses.photometric(image, truth.image, truth.valid, ssim_weight=cfg.ssim, size=size),
         "mask": share * weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
-        "normal": share * ramp * weights.normal * losses.normal_consistency(view.normal, from_depth, known),
+        "normal": share * ramp * weights.normal * normal,
         "variance": share * ramp * weights.variance * losses.variance(view.depth_var),
         "rank": weights.rank * losses.effective_rank(gaussians.log_scales),
         "gamma": weights.gamma * losses.sharpness(gaussians.sdf, params.gamma, floor=cfg.gamma_floor) * 1e-2,
