@@ -20,7 +20,7 @@ LAYERS = [
     {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"}
     | {"texture", "symmetry"},
     {"prefilter", "shade", "importance", "mesh", "hull"},
-    {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching"}
+    {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching", "comeback"}
     | {"pairwise", "averaging", "bundle", "relocate", "gauge", "realign"},
     {"loop"},
     {"track", "lift", "graph", "progressive", "refine", "decompose", "average", "relight"},

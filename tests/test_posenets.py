@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.nn.functional import pad
 
 from tumble import optim, posenets
 from tumble.camera import Camera
@@ -74,23 +75,26 @@ def test_one_row_of_a_frame_mlp_is_that_mlp_written_out() -> None:
 
 
 def test_an_orbit_keeps_where_the_object_is_seen() -> None:
-    """Four degrees of freedom: the projection of the object's centre stays, the rest moves."""
+    """Without a shift the projection of the object's centre stays, the rest moves."""
     rng = torch.Generator().manual_seed(2)
     camera = Camera.from_fov(0.5, 100, 120)
     base = SE3(SO3.exp(torch.randn(3, generator=rng)).wxyz, torch.tensor([0.3, -0.2, 4.0]))
-    raw = 0.2 * torch.randn(20, 4, generator=rng)
+    raw = 0.2 * torch.randn(20, 6, generator=rng) * torch.tensor([1.0, 1, 1, 1, 0, 0])
     moved = posenets.orbit(base, raw)
     assert torch.allclose(camera.project(moved.xyz), camera.project(base.xyz).expand(20, 2), atol=1e-4)
     assert torch.allclose(moved.xyz[:, 2], 4.0 * (1 + raw[:, 3]))
     turn = angle_between(moved.rotation, base.rotation)
     assert torch.allclose(turn, math.pi * raw[:, :3].norm(dim=-1), atol=1e-5)
+    shifted = posenets.orbit(base, raw + torch.tensor([0.0, 0, 0, 0, 0.05, -0.03]))
+    assert torch.allclose(shifted.xyz - moved.xyz, torch.tensor([0.05, -0.03, 0.0]).expand(20, 3), atol=1e-6)
+    assert torch.equal(shifted.wxyz, moved.wxyz)
 
 
 def test_an_orbit_is_fmov_s_camera() -> None:
     """`T_obj_cam = [Exp(pi rho) | 0] @ [R | s c]`, with matrices."""
     rng = torch.Generator().manual_seed(3)
     base = SE3(SO3.exp(torch.randn(3, generator=rng)).wxyz, torch.tensor([0.0, 0.0, 5.0])).inverse()
-    raw = 0.3 * torch.randn(4, generator=rng)
+    raw = pad(0.3 * torch.randn(4, generator=rng), (0, 2))
     scaled = base.matrix()
     scaled[:3, 3] *= 1 + raw[3]
     left = torch.eye(4)

@@ -90,8 +90,9 @@ def test_on_a_shape_that_is_right_a_turning_ball_is_followed() -> None:
     cfg = replace(
         SMOKE,
         warmup=1,
-        pose_steps=15,
-        joint_steps=15,
+        rays=96,
+        pose_steps=20,
+        joint_steps=20,
         sizes=replace(SMOKE.sizes, width=48, depth=3, octaves=0, radius=radius),
         rates=replace(SMOKE.rates, fields=1e-9, sharpness=1e-9),
     )
@@ -100,8 +101,9 @@ def test_on_a_shape_that_is_right_a_turning_ball_is_followed() -> None:
     for frame in range(1, 5):
         motion = found.rotation[0].inverse() @ found.rotation[frame]
         true = TRUTH.rotation[0].inverse() @ TRUTH.rotation[frame]
-        # A tenth: thirty steps, and a network that is a ball to five percent.
-        assert math.degrees(float(angle_between(motion, true))) < 2.5
+        # A network that is a ball to five percent; and a ball of nine pixels may shift by a thirtieth of its radius,
+        # which looks like two degrees.
+        assert math.degrees(float(angle_between(motion, true))) < 4
     assert tracked.health.iou.min() > 0.8
     assert tracked.health.match[1:].max() < 3
     assert torch.isinf(tracked.health.match[0])
@@ -151,6 +153,22 @@ def test_far_turns_start_the_shape_over_and_keep_the_poses() -> None:
     terms = track.step(cfg, INPUTS, state)
     assert {"render", "mask", "eikonal", "frame"} == set(terms)
     assert torch.equal(track.poses(state.params, state.memory, [0, 1]).wxyz, poses.wxyz)
+
+
+def test_a_steady_turn_goes_on_without_stretching_quaternions() -> None:
+    """Three rotations make the next: lengths off by one percent would be off by three, then by seven, then by 17."""
+    cfg = replace(SMOKE, motion="steady", warmup=1, pose_steps=1, joint_steps=1)
+    state = track.init(cfg, INPUTS, torch.Generator().manual_seed(0))
+    while not (here := schedule.place(cfg.phases, state.step)).first or here.turn < 2:
+        track.step(cfg, INPUTS, state)
+        state.step += 1
+    turn = SO3.exp(STEP).wxyz
+    state.memory["base"][:2, :4] = 1.01 * torch.stack([SO3.identity().wxyz, turn])
+    for leaf in state.params.poses.values.values():
+        leaf.data.zero_()
+    track.step(cfg, INPUTS, state)
+    twice = SO3.exp(2 * STEP).wxyz
+    assert torch.allclose(state.memory["base"][2, :4], twice, atol=1e-5)
 
 
 @pytest.mark.parametrize("poses", ["vectors", "mlps"])

@@ -18,23 +18,23 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble import bundle, frontier, matching, pairwise
+from tumble import bundle, frontier, pairwise
 from tumble.averaging import average
 from tumble.bundle import Problem, Scene
 from tumble.capture import Capture
+from tumble.comeback import comebacks
 from tumble.frontier import Outlines
 from tumble.gauge import Solution, Tracked, finished
 from tumble.loop import State
 from tumble.match import Match
-from tumble.pairs import loops_by_rotation
 from tumble.pairwise import Silhouettes
 from tumble.relocate import FEW, LEAP, Judge, cost, hypotheses, relocate, unbroken
-from tumble.se3 import SO3, angle_between, mean_rotation
+from tumble.se3 import SE3, SO3, angle_between, mean_rotation
 from tumble.symmetry import mirrors
 from tumble.tracks import NONE, Tracks, followed, joined, of_match
 from tumble.trajectory import Trajectory
 
-VERSION = 6
+VERSION = 7
 POINTS = 150
 """Tracks that pass through a frame."""
 CONTRADICTS = 1.5
@@ -44,9 +44,10 @@ FORGIVEN = 0.1
 """Such loss that is always forgiven: a quarter of a pixel."""
 PREFERENCE = 6.0
 """Factor on the weight of outlines when one witness is preferred: without the other neither holds all poses."""
-MOST_LOOPS, AGAIN, SURE = 60, 12, 0.6
-"""Pairs of frames that see the same side again, their least distance in time [frames], and the confidence of matches
-that are taken from them."""
+MOST_LOOPS, AGAIN = 60, 12
+"""Pairs of frames that see the same side again, and their least distance in time [frames]."""
+ROOM = 1.3
+"""Radius of the ball about the origin in which the object surely lies, over the object's."""
 STILL = 0.01
 """Weight of the belief that the object does not turn from one frame to the next, of a match 1."""
 FULL = 1.1
@@ -84,8 +85,6 @@ class Config:
     """Likewise, after frames have been relocated."""
     preferring: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
     """Likewise, where tracks or outlines are preferred, whose difference tells how far to trust the poses."""
-    loops: float = 0.6
-    """Angle between viewing directions up to which a body of revolution is matched with itself [radians]."""
     relocations: int = 2
     """How often contradicting frames are given a second look."""
     frontier: float = 12.0
@@ -155,9 +154,8 @@ def plan(cfg: Config) -> list[tuple[str, float, int]]:
     for start, windows in enumerate((cfg.windows, *(other.windows for other in cfg.others))):
         phases += [("pairs", 0.0, start), *(("windows", float(size), start) for size in windows)]
         phases += [*(("whole", scale, start) for scale in cfg.rounds), ("keep", cfg.rounds[-1], start)]
-    phases += [("loops", cfg.loops, 0)]
     for _ in range(cfg.relocations):
-        phases += [("relocate", 0.7, 0), *(("whole", scale, 0) for scale in cfg.again)]
+        phases += [("loops", 0.0, 0), ("relocate", 0.7, 0), *(("whole", scale, 0) for scale in cfg.again)]
     return phases
 
 
@@ -275,17 +273,16 @@ def _keep(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
     return Poses(memory["R"], memory["t"]), {"loss": memory["loss"]}
 
 
-def _loops(cfg: Config, inputs: Inputs, state: State, widest: float) -> Outcome:
+def _loops(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
     """Points that are seen again when a body of revolution comes round: its outlines do not tell how it turned."""
-    capture = inputs.capture
-    if not mirrors(capture.masks).revolves:
+    if not mirrors(inputs.capture.masks).revolves:
         return state.params, {}
-    pairs = loops_by_rotation(SO3.from_matrix(state.params.R), count=MOST_LOOPS, gap=AGAIN, widest=widest, spread=1)
-    found = [m.select(m.confidence > SURE) for m in matching.match_pairs(matching.views_of(capture), pairs, "sift")]
-    parts = [of_match(m) for m in found if len(m) >= pairwise.LEAST]
-    for name, x in vars(joined(NONE, *parts)).items():
+    R, t = state.params.R.float(), state.params.t.float() / (ROOM * inputs.radius)
+    trajectory = Trajectory(SE3.from_rotation(SO3.from_matrix(R), t), inputs.capture.light)
+    found = comebacks(inputs.capture, trajectory, count=MOST_LOOPS, gap=AGAIN)
+    for name, x in vars(joined(NONE, *(of_match(match) for match in found))).items():
         state.memory[f"loop_{name}"] = x
-    return state.params, {"loops": float(len(parts))}
+    return state.params, {"loops": float(len(found))}
 
 
 def _round(

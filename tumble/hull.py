@@ -68,7 +68,7 @@ def surface(inside: Float[Tensor, "x y z"], n: int, rng: torch.Generator) -> Ori
 def _crossings(inside: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Points on grid edges where `inside` crosses one half, with outward normals from its blurred gradient."""
     resolution = inside.shape[0]
-    gradient = torch.stack(torch.gradient(_blurred(inside)), -1)
+    outwards = outward(inside)
     positions, normals = [], []
     for axis in range(3):
         low, high = inside.narrow(axis, 0, resolution - 1), inside.narrow(axis, 1, resolution - 1)
@@ -77,8 +77,13 @@ def _crossings(inside: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "m 3"], Fl
         at = index.to(inside)
         at[:, axis] += (0.5 - a) / (b - a)
         positions.append((at + 0.5) / resolution * 2 - 1)
-        normals.append(-gradient[tuple(index.T)])
+        normals.append(outwards[tuple(index.T)])
     return torch.cat(positions), normalize(torch.cat(normals), dim=-1)
+
+
+def outward(inside: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z 3"]:
+    """Where it gets emptier, at every cell; its direction near a surface is the normal's, its length says nothing."""
+    return -torch.stack(torch.gradient(_blurred(inside)), -1)
 
 
 def _blurred(inside: Float[Tensor, "x y z"], sigma: float = 1.5) -> Float[Tensor, "x y z"]:

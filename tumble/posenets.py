@@ -1,8 +1,8 @@
 """What poses come from: networks, or plain numbers, behind one function of the frames' numbers.
 
 A *pose source* is a tree of weights with `raw(source, frames) -> [f k]`. What the numbers mean is a second choice:
-`orbit` reads four of them (turn the object about its centre, scale its distance: stage 1), `delta` six of them (a small
-bounded motion in the camera frame: stages 2 and 3, `delta(raw, ...) @ base`). All start (nearly) at "no change".
+`orbit` turns the object about its centre, scales its distance and shifts it across (stage 1), `delta` is a small
+bounded motion in the camera frame (stages 2 and 3, `delta(raw, ...) @ base`). All start (nearly) at "no change".
 """
 
 import math
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import gelu
+from torch.nn.functional import gelu, pad
 
 from tumble.se3 import SE3, SO3
 
@@ -90,14 +90,15 @@ def raw(source: PoseSource, frames: Sequence[int]) -> Float[Tensor, "f k"]:
     return _through(weights, inputs, source.width, source.out)
 
 
-def orbit(base: SE3, raw: Float[Tensor, "*b 4"]) -> SE3:
-    """Turn the object about its own centre by `pi raw[:3]` (object axes) and scale its distance by `1 + raw[3]`.
+def orbit(base: SE3, raw: Float[Tensor, "*b 6"]) -> SE3:
+    """Turn the object about its own centre by `pi raw[:3]` (object axes), scale its distance by `1 + raw[3]`, and shift
+    it across the view by `raw[4:]` [object radius].
 
-    The four degrees of freedom of FMOV. Its camera orbits, `[Exp | 0] @ [R | s c]` for camera to object; this is the
-    same motion seen from the camera: the direction in which the object's centre is seen stays.
+    The first four are FMOV's. Its camera orbits, `[Exp | 0] @ [R | s c]` for camera to object; this is the same motion
+    seen from the camera: without a shift, the direction in which the object's centre is seen stays.
     """
     turned = base.rotation @ SO3.exp(-math.pi * raw[..., :3])
-    return SE3.from_rotation(turned, base.xyz * (1 + raw[..., 3:]))
+    return SE3.from_rotation(turned, base.xyz * (1 + raw[..., 3:4]) + pad(raw[..., 4:], (0, 1)))
 
 
 def delta(raw: Float[Tensor, "*b 6"], *, rotation: float, translation: float) -> SE3:
