@@ -91,3 +91,17 @@ def test_smoothing_takes_specks_away_and_respects_edges() -> None:
     field[5, 5], field[5, 25] = 2.0, -2.0
     found = appearance.smoothed(field.astype(np.float32), picture) > 0.5
     assert np.array_equal(found, np.broadcast_to(np.arange(30) >= 15, SHAPE))
+
+
+@pytest.mark.parametrize("wall", [WALL, (0, 0, 0)])
+def test_a_silhouette_ends_where_pixels_are_half_object(wall: tuple[int, int, int]) -> None:
+    """A red half-plane up to column 12.6, blurred: half is covered up to column 12. Found too wide, it is cut back."""
+    coverage = cv2.blur(np.broadcast_to((12.6 - np.arange(SHAPE[1])).clip(0, 1), SHAPE), (3, 3))[..., None]
+    mixed = (coverage * np.array(RED) + (1 - coverage) * np.array(wall)).round().astype(np.uint8)
+    still = Backdrop(np.full_like(mixed, wall), STILL.noise, STILL.known)
+    wide = np.broadcast_to(np.arange(SHAPE[1]) < 14, SHAPE)
+    assert (appearance.trimmed(wide, mixed, still) == (coverage[..., 0] >= 0.5)).all()
+    # Not where nothing is known of the backdrop, and never deeper than the rim.
+    assert (appearance.trimmed(wide, mixed, Backdrop(still.picture, still.noise, NEVER.known)) == wide).all()
+    hidden = Backdrop(mixed, still.noise, still.known)
+    assert (appearance.trimmed(wide, mixed, hidden) >= (np.arange(SHAPE[1]) < 14 - appearance.RIM)).all()

@@ -55,3 +55,13 @@ def test_an_object_that_never_turns_is_not_believed() -> None:
     still = replace(GOOD, turn=torch.tensor(0.05))
     assert still.verdict == "bad"
     assert still.sentence.startswith("Rotation is not observable")
+
+
+def test_an_unseen_axis_may_be_the_objects_or_the_films_fault() -> None:
+    """A printed can filmed with much grain looks as bare as a bare one: advice is for both."""
+    spin = Observability(torch.tensor([0.0, 1.0, torch.nan]), torch.tensor([math.pi, 0.05, 0.05]))
+    hidden = replace(GOOD, observability=spin)
+    assert hidden.verdict == "bad"
+    assert "axis (0.00, 1.00) of the first picture" in hidden.sentence
+    assert "more light" in hidden.sentence
+    assert "stick something" in hidden.sentence

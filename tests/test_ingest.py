@@ -14,6 +14,8 @@ from tumble.files import BadFile
 from tumble.segment import overlap
 from tumble.survey import Options, survey
 
+SHOWN = Options(box=scene().box())
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
@@ -130,7 +132,8 @@ def test_an_empty_mask_drops_its_frame_and_only_empty_ones_are_refused(tmp_path:
     ("pictures", "options", "message"),
     [
         (scene().pictures[:1], Options(), "nothing that moves"),
-        (scene(still=True).pictures, Options(box=scene().box()), "turns by"),
+        (scene(still=True).pictures, SHOWN, "turns by"),
+        (np.stack([np.roll(p, 2 * i, 1) for i, p in enumerate(scene().pictures)]), SHOWN, "a camera that moved"),
         (scene().pictures, Options(box=(100, 100, 100, 100)), "the hint lies outside"),
         (scene().pictures, Options(box=(1, 1, 20, 20), at=99), "--at is 99"),
         (np.repeat(scene().background[None], 8, 0), Options(), "nothing that moves"),

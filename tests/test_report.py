@@ -38,7 +38,7 @@ RECORDS = [
     {"name": "decompose", "event": "done", "seconds": 201.0},
 ]
 RECIPE = {"refine": {"steps": 200, "weights": {"mask": 0.125}}, "decompose": {"bounce": "none"}, "seed": 7}
-STORY = report.Story("a <mug> & more", RECORDS, RECIPE)
+STORY = report.Story("a <mug> & more", RECORDS, RECIPE, "guess")
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +99,13 @@ def test_the_page_loads_nothing(page: Path) -> None:
     assert set(re.findall(r"https?://[\w./#-]+", source)) <= {"http://www.w3.org/1999/xhtml"}
     assert "default-src 'none'" in source
     assert "{{" not in markup
+
+
+def test_a_guessed_focal_length_is_called_one(page: Path, asset: Asset, capture: Capture) -> None:
+    """Half the width over the tangent of half the field of view."""
+    focal = f"{0.5 * SIDE / math.tan(math.radians(15)):.0f} pixels"
+    assert f"{focal}, a guess" in text(page)
+    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(STORY, focal_source="given"))
 
 
 def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:

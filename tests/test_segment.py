@@ -122,7 +122,7 @@ def test_an_object_that_leaves_is_not_invented() -> None:
 
 def test_a_box_on_the_bare_wall_finds_nothing_or_says_so() -> None:
     film = scene()
-    with pytest.raises(ValueError, match="give a --box around the whole object"):
+    with pytest.raises(ValueError, match="no object at the hint on frame 0"):
         segment.segment(film.pictures, backdrop(film.pictures), Seed(0, (0, 100, 20, 20)))
 
 

@@ -12,11 +12,9 @@ from typing import Literal
 import numpy as np
 
 from tumble import ingest, posed, selection, video
-from tumble.backdrop import shake
-from tumble.capture import BACKGROUND
 from tumble.survey import Options, Survey, survey
 
-SHAKEN = (0.004, 0.02)
+SHAKEN = (0.004, ingest.SHAKEN)
 """Motion of the background, as a share of the picture's longer side: from here it warns, and stops (8, 38 of 1920)."""
 BLURRED = (1.2, 2.5)
 """Blur of the object's edges on the frames that would be kept [pixels of the written frames]."""
@@ -38,8 +36,6 @@ FAST = (math.radians(12), math.radians(25))
 """Turn between neighbouring frames of the film [radians]."""
 WIDE_STEP = math.radians(15)
 """Turn between kept frames above which matching suffers [radians]."""
-COMPARED = 12
-"""Frames on which the camera's shake is measured."""
 MISSED = (1.0, 3.0)
 """Mean reprojection error of a COLMAP model [pixels]."""
 APART = (0.4, 0.8)
@@ -116,9 +112,7 @@ def _hint(found: Survey) -> Finding:
 
 
 def _camera(found: Survey) -> Finding:
-    samples = np.unique(np.linspace(0, len(found.pictures) - 1, COMPARED).round().astype(int))
-    covered = found.masks.labels[samples] != BACKGROUND
-    moved = float(np.percentile(shake(found.pictures[samples], found.backdrop, covered), 75))
+    moved = ingest.shaken(found)
     state = f"the background moves by {100 * moved:.1f} % of the picture"
     return _finding("camera", _graded(moved, SHAKEN), state, "put the camera on a tripod: it must stand still")
 

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 
 # Torch's own threads otherwise spin while they wait, on the cores that the kernels need. Read when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -50,6 +51,7 @@ def main() -> None:
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
         return
+    warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
     try:
         about = "From one video of an object turned in the hand to its motion, shape, material and light."
         tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=about)

@@ -56,8 +56,8 @@ class Observability:
             )
         if self.unseen:
             return (
-                f"Rotation about axis {where} is not observable: the object looks the same when it turns about it. "
-                f"Stick something on it that breaks the symmetry."
+                f"Rotation about axis {where} is not observable: neither outline nor texture shows it. If the object "
+                f"has a print, grain hides it: film in more light. If it has none, stick something on it."
             )
         return f"Rotations are seen about every axis, to about {_degrees(self.sigma[0])} degrees about the worst."
 

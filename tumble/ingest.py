@@ -21,15 +21,19 @@ import torch
 from jaxtyping import UInt8
 
 from tumble import capture_writer, files, segment, selection, video
-from tumble.backdrop import compensate
+from tumble.backdrop import compensate, shake
 from tumble.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.files import BadFile
 from tumble.footage import Frame, frames
 from tumble.images import linear_from_srgb, photograph
 from tumble.survey import ALIKE, LEAST_FRAMES, Options, Survey, small_mask, survey, undistorted
 
-LEAST_TURN = math.radians(20)
-"""Less turning cannot be reconstructed, and half of it may be the noise of flow [radians]."""
+LEAST_TURN = math.radians(40)
+"""Less turning cannot be reconstructed, and most of it may be the noise of flow and masks [radians]."""
+SHAKEN = 0.02
+"""Motion of the background, as a share of the picture's longer side, from which no mask comes of it (38 of 1920)."""
+COMPARED = 12
+"""Frames on which the camera's shake is measured."""
 MARGIN = 0.08
 """Room around the object's path, as a share of its longer side."""
 UNSURE, KEPT, LEFT = (220, 30, 30), (40, 200, 60), (60, 60, 60)
@@ -87,9 +91,12 @@ def keep(found: Survey, options: Options) -> list[int]:
     """Indices, in the survey, of the frames to keep: by turning and sharpness for a film, all of a folder of pictures.
 
     Raises:
-        BadFile: The object hardly turns, or is found on too few frames.
+        BadFile: The camera moved, the object hardly turns, or it is found on too few frames.
     """
     path, usable = found.footage.path, found.usable
+    if found.seed is not None and options.segmenter == "grabcut" and (moved := shaken(found)) > SHAKEN:
+        rule = f"was filmed by a camera that moved: the background by {100 * moved:.1f} % of the picture"
+        raise BadFile(path, rule, "put the camera on a tripod, or give --masks")
     if found.footage.pictures:
         all_good = np.nonzero(usable)[0]
         spread = np.linspace(0, len(all_good) - 1, min(options.frames, len(all_good))).round().astype(int)
@@ -102,6 +109,13 @@ def keep(found: Survey, options: Options) -> list[int]:
     if len(kept) < LEAST_FRAMES:
         raise BadFile(path, f"shows the object on {len(kept)} usable frames", "see `tumble check` for what is wrong")
     return kept
+
+
+def shaken(found: Survey) -> float:
+    """How far the background moves in three frames of four, as a share of the picture's longer side."""
+    samples = np.unique(np.linspace(0, len(found.pictures) - 1, COMPARED).round().astype(int))
+    covered = found.masks.labels[samples] != BACKGROUND
+    return float(np.percentile(shake(found.pictures[samples], found.backdrop, covered), 75))
 
 
 def crop_window(found: Survey, kept: list[int]) -> tuple[int, int, int, int]:

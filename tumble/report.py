@@ -60,6 +60,8 @@ class Story:
     """Lines of the run's log."""
     recipe: dict[str, Any]
     """Settings by stage."""
+    focal_source: str = ""
+    """Where the capture's focal length is from, as docs/format.md has it; empty where nobody said."""
 
 
 def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Health | None = None) -> Path:
@@ -78,7 +80,9 @@ def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Healt
         raise BadFile(path, "is the run's capture and is gone", "say where it is: --capture")
     taken = of_run(which(path).load(path), asset, list(files.read_json(out / "poses.json")), path)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
-    story = Story(name, run.records(out), known["recipe"])
+    document = path / "transforms.json"
+    said = files.read_json(document).get("focal_source", "") if document.is_file() else ""
+    story = Story(name, run.records(out), known["recipe"], said)
     with tempfile.TemporaryDirectory() as folder:
         glb = model(asset, Path(folder))
         build(asset, taken, glb, story, health, out / REPORT)
@@ -176,9 +180,11 @@ def _fill(template: str, parts: dict[str, str]) -> str:
 def _facts(asset: Asset, capture: Capture, story: Story) -> str:
     seconds = sum(_seconds(story.records).values())
     camera = asset.camera
+    focal = f"{float(camera.fx_fy_cx_cy[0]):.0f} pixels"
     facts = {
         "Frames": f"{len(capture)}",
         "Size": f"{camera.width} x {camera.height}",
+        "Focal length": f"{focal}, a guess" if story.focal_source == "guess" else focal,
         "Light stands still with": {"camera": "the camera", "object": "the object"}[asset.trajectory.light],
         "Gaussians": f"{len(asset.gaussians):,}".replace(",", " "),
         "Time": _duration(seconds) if seconds else "-",

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from tumble.appearance import FIRST, Colours, at_first, object_odds, skin_coloured, smoothed
+from tumble.appearance import FIRST, Colours, at_first, object_odds, skin_coloured, smoothed, trimmed
 from tumble.backdrop import Backdrop
 from tumble.capture import BACKGROUND, OBJECT, UNKNOWN
 
@@ -95,13 +95,13 @@ def segment(pictures: UInt8[np.ndarray, "t h w 3"], backdrop: Backdrop, seed: Se
     """
     first, colours = _cut_seed(pictures[seed.index], backdrop, seed)
     if first.inside.sum() < LEAST_PIXELS:
-        raise ValueError(f"no object found at the hint on frame {seed.index}: give a --box around the whole object")
+        raise ValueError(f"shows no object at the hint on frame {seed.index}")
     labels = np.zeros(pictures.shape[:3], np.uint8)
     confidence, unsure = np.ones(len(pictures), np.float32), np.zeros(len(pictures), bool)
-    labels[seed.index] = three_valued(first.inside, first.other, 1)
+    labels[seed.index] = three_valued(trimmed(first.inside, pictures[seed.index], backdrop), first.other, 1)
     for order in (range(seed.index + 1, len(pictures)), range(seed.index - 1, -1, -1)):
         for i, cut, agreement, doubtful in _follow(pictures, order, seed.index, first, backdrop, colours):
-            labels[i] = three_valued(cut.inside, cut.other, 1)
+            labels[i] = three_valued(trimmed(cut.inside, pictures[i], backdrop), cut.other, 1)
             confidence[i], unsure[i] = agreement, doubtful
     return Masks(labels, confidence, unsure)
 

@@ -301,7 +301,8 @@ def _masks(path: Path, pictures: np.ndarray, still: Backdrop, seed: Seed, option
     try:
         return segment.segment(pictures, still, seed)
     except ValueError as error:
-        raise BadFile(path, str(error)) from None
+        fix = "the camera must stand still; if it does, give a --box around the whole object"
+        raise BadFile(path, str(error), fix) from None
 
 
 def _given(path: Path, labels: UInt8[np.ndarray, "t h w"]) -> Masks:
