@@ -161,8 +161,7 @@ def report(rows: Sequence[Row]) -> str:
         parts += [
             "\n## The paper's progressive route against the graph\n",
             "With the network, rays and steps of `recipes.QUICK_TRACK`, a hundredth of the paper's work: it says "
-            "nothing of the route at full size, which takes days on a CPU and has not been run. The cracker box is "
-            "followed for 12 frames and 110 degrees (3.2 degrees in the median), then lost where it stands edge-on.\n",
+            "nothing of the route at full size, which takes days on a CPU and has not been run.\n",
             table(["name", "route", *SCORES], both),
         ]
     return "\n".join(parts) + "\n"

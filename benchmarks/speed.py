@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.kernels import machine
+from benchmarks.swap import albedo_psnr
 from tumble import decompose, files, metrics, optim, refine
 from tumble.capture import Capture, Truth
 from tumble.datasets import folder
@@ -172,17 +173,10 @@ def _of_decompose(params: decompose.Params, capture: Capture, truth: Truth) -> d
 
 def _albedo(gaussians: Any, gamma: Tensor, albedo: Tensor, capture: Capture, truth: Truth) -> dict[str, float]:
     assert truth.trajectory is not None
-    assert truth.albedo is not None
-    numbers, shown = truth.views("shared"), []
     corners = albedo if albedo.ndim == 3 else albedo[:, None].expand(-1, 4, -1)
-    for number in numbers:
-        view = rasterize(gaussians, gamma, truth.trajectory.T_cam_obj[number], capture.camera, {"albedo": corners})
-        shown.append(view.features["albedo"] * (view.alpha >= DRAFT.relight.alpha_min)[..., None])
-    true, foreground = truth.albedo[numbers], truth.foreground[numbers]
-    scaled = (torch.stack(shown) * metrics.albedo_scale(torch.stack(shown), true, foreground)).clamp(0, 1)
-    pictures = zip(srgb_from_linear(scaled), srgb_from_linear(true), foreground, strict=True)
-    psnr = [metrics.psnr(a, b, mask) for a, b, mask in pictures]
-    return {"albedo": round(sum(psnr) / len(psnr), 2)}
+    places = (truth.trajectory.T_cam_obj[number] for number in truth.views("shared"))
+    views = [rasterize(gaussians, gamma, T_cam_obj, capture.camera, {"albedo": corners}) for T_cam_obj in places]
+    return {"albedo": round(albedo_psnr(views, truth)[0], 2)}
 
 
 def page(command: str, rows: list[dict[str, Any]]) -> str:

@@ -14,6 +14,7 @@ albedo and light share their product as the truth does); mean error of normals [
 """
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from torch.nn.functional import normalize
 from benchmarks.kernels import machine
 from tumble import decompose, files, hull, loop, metrics, refine
 from tumble.asset import Asset
+from tumble.buffers import Buffers
 from tumble.capture import Capture
 from tumble.datasets import folder
 from tumble.decompose import buffers_of
@@ -119,19 +121,25 @@ def score(asset: Asset, truth: Any, capture: Capture) -> dict[str, Any]:
     """Of the shared evaluation views."""
     numbers = truth.views("shared")
     views = [buffers_of(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
-    least = DRAFT.relight.alpha_min
-    shown = torch.stack([view.features["albedo"] * (view.alpha >= least)[..., None] for view in views])
     normals = torch.stack([normalize(view.normal, dim=-1) for view in views])
-    foreground, albedo = truth.foreground[numbers], truth.albedo[numbers]
-    scale = metrics.albedo_scale(shown, albedo, foreground)
-    pictures = zip(srgb_from_linear((shown * scale).clamp(0, 1)), srgb_from_linear(albedo), foreground, strict=True)
-    psnr = [float(metrics.psnr(a, b, mask)) for a, b, mask in pictures]
-    angles = metrics.normal_angles(normals, truth.normals[numbers])[foreground]
+    psnr, scale = albedo_psnr(views, truth)
+    angles = metrics.normal_angles(normals, truth.normals[numbers])[truth.foreground[numbers]]
     return {
-        "albedo_fg": round(sum(psnr) / len(psnr), 2),
+        "albedo_fg": round(psnr, 2),
         "scale": [round(float(x), 2) for x in scale],
         "normal_degrees": round(float(angles.mean()), 2),
     }
+
+
+def albedo_psnr(views: Sequence[Buffers], truth: Any) -> tuple[float, Tensor]:
+    """Foreground PSNR of the albedo of the shared evaluation views, sRGB, and the scale per channel before it."""
+    numbers, least = truth.views("shared"), DRAFT.relight.alpha_min
+    shown = torch.stack([view.features["albedo"] * (view.alpha >= least)[..., None] for view in views])
+    foreground, albedo = truth.foreground[numbers], truth.albedo[numbers]
+    scale = metrics.albedo_scale(shown, albedo, foreground)
+    pictures = zip(srgb_from_linear((shown * scale).clamp(0, 1)), srgb_from_linear(albedo), foreground, strict=True)
+    psnr = [metrics.psnr(a, b, mask) for a, b, mask in pictures]
+    return sum(psnr) / len(psnr), scale
 
 
 if __name__ == "__main__":

@@ -57,9 +57,13 @@ def comebacks(capture: Capture, trajectory: Trajectory, *, count: int, gap: int)
     normals = hull.outward(cells)
     pairs = _sharing(hull.surface(cells, POINTS, torch.Generator().manual_seed(0)), trajectory, count=count, gap=gap)
     eyes = trajectory.T_cam_obj.inverse().xyz
+    shown = {
+        i: _seen(cells, normals, capture.masks[i] == OBJECT, trajectory.T_cam_obj[i], capture.camera)
+        for i in {i for i, _ in pairs}
+    }
     found = []
     for i, j in pairs:
-        seen = _seen(cells, normals, capture.masks[i] == OBJECT, trajectory.T_cam_obj[i], capture.camera)
+        seen = shown[i]
         slant = torch.minimum(*(_cosine(eyes[k], seen.x_obj, seen.normals) for k in (i, j)))
         uv = capture.camera.project(trajectory.T_cam_obj[j] @ seen.x_obj)
         found.append(_through(capture, i, j, seen, uv, slant > STEEP))
