@@ -66,7 +66,7 @@ DRAFT = replace(
     PAPER,
     # The paper's weight of the normal term (0.05) leaves normals 3 degrees rougher on the mustard bottle at 128 pixels,
     # and any weight that smooths fills the grooves of the chess knight unless creases are left alone: under the indoor
-    # map 10.0 degrees and 27.4 dB of albedo at a weight of 0.5 without, 8.3 and 28.0 at 2 with (0.5: 9.2, 1: 8.7).
+    # map 10.5 degrees and 27.4 dB of albedo at a weight of 0.5 without, 8.5 and 28.0 at 2 with (0.5: 9.4, 1: 8.9).
     refine=replace(
         PAPER.refine,
         steps=3_000,
