@@ -151,8 +151,8 @@ def _run():
 
         Args:
             capture: A film of an object turned in front of a still camera; a folder of pictures with masks, with or
-                without a COLMAP model; or a capture: a folder of docs/format.md, or another layout that it lists. Truth
-                is never read.
+                without a COLMAP model; or a capture: a folder of docs/format.md, or another layout that it lists (its
+                truth is never read).
             options: How a film, or pictures, become a capture; no matter where it is one already.
             out: The run directory; the same command goes on where an interrupted one stopped.
             quality: draft: two CPU cores, minutes; standard: one GPU, minutes; paper: the published numbers, hours.
