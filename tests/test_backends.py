@@ -152,6 +152,17 @@ def test_features_alone_get_the_gradient_they_get_with_the_rest(backend: backend
     torch.testing.assert_close(alone, gradients[5])
 
 
+def test_kernels_keep_the_threads_that_torch_gives_up() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with backends.threads_for_kernels(), backends.threads_for_kernels():
+            assert (torch.get_num_threads(), backends.threads()) == (1, 2)
+        assert (torch.get_num_threads(), backends.threads()) == (2, 2)
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_results_repeat_bit_for_bit_and_hardly_depend_on_threads(backend: backends.Backend) -> None:
     scene = cases.hard()
     threads = torch.get_num_threads()

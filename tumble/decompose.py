@@ -16,6 +16,7 @@ from torch.nn.functional import interpolate, max_pool2d
 
 from tumble import coarse_light, highlight, losses, optim
 from tumble.asset import Asset
+from tumble.backends import threads_for_kernels
 from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.capture import Capture
@@ -106,8 +107,7 @@ class Config:
     visibility: bool = True
     """Whether the object shadows itself."""
     bounce: Literal["none", "average", "frame"] = "frame"
-    """How the object lights itself. average: with its mean colour over all frames, as in the paper; frame: with the
-    light of the frame, for that of a point changes as the object turns."""
+    """How the object lights itself: with its mean colour over all frames, as in the paper, or as the frame is lit."""
     corners: bool = True
     """Whether material varies within a Gaussian, between its corners."""
     weights: Weights = field(default_factory=Weights)
@@ -143,6 +143,7 @@ def length(cfg: Config, inputs: Inputs) -> int:
     return cfg.steps
 
 
+@threads_for_kernels()
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     """Materials and light as stage 2 found them; visibility traced."""
     refined = inputs.refined
@@ -272,6 +273,7 @@ def uncornered(params: Params) -> Params:
     return replace(params, material=material)
 
 
+@threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
     _grow_light(cfg, state)
@@ -294,12 +296,10 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         "material": cfg.weights.material * losses.material(view, truth.mask, truth.image),
         "highlight": cfg.weights.highlight * (1 - (-params.log_tint.exp().mean() / FAINT).exp()),
     }
-    joined = float(state.step >= cfg.warmup)
     slow = 0.1 ** (state.step / cfg.steps)
-    optim.anneal(
-        state.optimizer,
-        {"material": slow, "environment": slow, "log_tint": slow, "gaussians": joined * slow, "poses": joined * slow},
-    )
+    joined = slow * (state.step >= cfg.warmup)
+    rates = {"material": slow, "environment": slow, "log_tint": slow, "gaussians": joined, "poses": joined}
+    optim.anneal(state.optimizer, rates)
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble import coarse_light, densify, hull, losses, optim
+from tumble.backends import threads_for_kernels
 from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.capture import OBJECT, UNKNOWN, Capture
@@ -177,6 +178,7 @@ def length(cfg: Config, inputs: Inputs) -> int:
     return cfg.steps
 
 
+@threads_for_kernels()
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     """Gaussians on the visual hull, grey, under a uniform light."""
     like = inputs.trajectory.T_cam_obj.xyz
@@ -258,6 +260,7 @@ def render(
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
 
 
+@threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
     progress = state.step / cfg.steps

@@ -23,6 +23,9 @@ Frames: OpenCV camera with pixel centres at +0.5, object radius 1, linear radian
 import importlib
 import pkgutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
@@ -52,6 +55,31 @@ VISIBLE = 0.5
 """A direction is visible from a point where transmittance is at least this."""
 ROUGHNESS_MIN = 0.05
 """Roughness below this shades as this: the lobe would be narrower than any set of directions."""
+
+
+_threads: ContextVar[int | None] = ContextVar("threads", default=None)
+
+
+def threads() -> int:
+    """How many a kernel on the processor may take: torch's number, or what that was before `threads_for_kernels`."""
+    return _threads.get() or torch.get_num_threads()
+
+
+@contextmanager
+def threads_for_kernels() -> Iterator[None]:
+    """Leave all threads to the kernels: torch's own operations take one.
+
+    Those of a training step are so small that a second thread costs more than it gives: stages 2 and 3 of a capture of
+    128 pixels took 164 s with two threads for both, 120 s with one for both, and take 104 s so.
+    """
+    before = torch.get_num_threads()
+    token = _threads.set(threads())
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _threads.reset(token)
 
 
 class Rendering(NamedTuple):

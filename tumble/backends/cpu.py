@@ -1,6 +1,6 @@
 """The contract of this folder on the processor: float32, SIMD and threads, through a plain C ABI (see `native/`).
 
-`autograd.Function`s around the kernels: save, launch, return. The number of threads is torch's.
+`autograd.Function`s around the kernels: save, launch, return.
 """
 
 import ctypes
@@ -26,6 +26,7 @@ from tumble.backends import (
     Hits,
     Rendering,
     _native,
+    threads,
 )
 from tumble.backends._structs import Bvh, Raster, Rays, Shade, point
 
@@ -158,7 +159,7 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
         c=c,
         height=height,
         width=width,
-        threads=max(1, min(torch.get_num_threads(), ROOM // max(1, n * gradient_size))),
+        threads=max(1, min(threads(), ROOM // max(1, n * gradient_size))),
         alpha_max=ALPHA_MAX,
         alpha_min=ALPHA_MIN,
         T_min=T_MIN,
@@ -291,7 +292,7 @@ def _rays(bvh: Tree, origins: Tensor, directions: Tensor, **more: Tensor) -> _La
         n_rays=len(origins),
         n_directions=len(directions),
         words=-(-len(directions) // 32),
-        threads=torch.get_num_threads(),
+        threads=threads(),
         has_radiance=int("radiance" in more and len(more["radiance"]) > 0),
     )
     tensors = {"origins": origins, "directions": directions, **more}
@@ -362,7 +363,7 @@ def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
         stride=len(directions) + padding,
         words=visibility.shape[1],
         n_blockers=len(blocker_radiance),
-        threads=torch.get_num_threads(),
+        threads=threads(),
         blocker_point_stride=blocker.stride(0) if blocker.shape[0] > 1 else 0,
         blocker_direction_stride=blocker.stride(1) if blocker.shape[1] > 1 else 0,
         f0=f0,
