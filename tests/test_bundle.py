@@ -59,6 +59,14 @@ def shaken(truth: Scene, turn: float, seed: int = 7) -> Scene:
     return Scene(R, truth.t + shift, truth.X + moved)
 
 
+def guessing(truth: Scene, problem: Problem, factor: float) -> tuple[Problem, Scene]:
+    """The same pixels through a camera whose focal length is the true one times a factor, and where that begins."""
+    g = len(truth.R)
+    shrink = torch.tensor([1 / factor, 1 / factor, 1.0]).double()
+    start = Scene(truth.R, shrink * truth.t, truth.X / factor, torch.zeros(g, dtype=torch.float64))
+    return replace(problem, camera=CAMERA.zoomed(factor), reach=problem.reach / factor), start
+
+
 def relative_errors(found: Scene, truth: Scene) -> Tensor:
     """Angles between the found and true motions from the first frame of each group [radians]."""
     a, b = (s.R @ s.R[:, :1].mT for s in (found, truth))
@@ -87,15 +95,45 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         assert float(slope) == pytest.approx(2 * float(system.g_point.flatten()[index]), rel=1e-4, abs=1e-3)
 
 
+def test_the_derivatives_by_the_focal_length_are_those_of_the_cost() -> None:
+    """Two groups, each with its own: by central differences, priors in place. Of the second derivatives those by
+    cameras and points, without the loss that forgives, against differences of the gradient where residuals vanish
+    (those of points beyond any reach nearly do)."""
+    truth = scene(2, 3, 5)
+    problem, at = guessing(truth, seen(truth, noise=1.0), 1.1)
+    h = 1e-6
+
+    def at_focal(d: Tensor, problem: Problem = problem, at: Scene = at, scale: float = 1.5) -> bundle._System:
+        return bundle._linearise(problem, replace(at, log_focal=d), scale)
+
+    system = at_focal(torch.full((2,), 0.02).double(), replace(problem, guess=-0.1))
+    for group in range(2):
+        d = torch.zeros(2).double().index_fill(0, torch.tensor([group]), h)
+        a, b = (at_focal(0.02 + s * d, replace(problem, guess=-0.1)).cost.sum() for s in (1, -1))
+        assert system.border is not None
+        assert float((a - b) / (2 * h)) == pytest.approx(2 * float(system.border.g[group]), rel=1e-5)
+    places = CAMERA.project(truth.t).double()
+    exact, where = replace(seen(truth), centre=places, reach=1e3), replace(truth, log_focal=torch.zeros(2).double())
+    border = at_focal(torch.zeros(2).double(), exact, where, 1e9).border
+    a, b = (at_focal(torch.full((2,), s * h).double(), exact, where, 1e9) for s in (1, -1))
+    assert border is not None
+    torch.testing.assert_close((a.g_point - b.g_point) / (2 * h), border.point, rtol=1e-5, atol=1e-2)
+    torch.testing.assert_close((a.g_cam - b.g_cam) / (2 * h), border.cam, rtol=1e-5, atol=1e-2)
+
+
+@pytest.mark.parametrize("factor", [None, 1.1])
 @pytest.mark.parametrize("short", [0, 3])
-def test_elimination_solves_the_whole_system(short: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One group: the step equals that of the dense normal equations, whichever way points are summed."""
+def test_elimination_solves_the_whole_system(short: int, factor: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One group: the step equals that of the dense normal equations, whichever way points are summed, with and without
+    a focal length to find."""
     monkeypatch.setattr(bundle, "SHORT", short)
     truth = scene(1, 3, 6)
     problem, at = seen(truth, noise=0.5), shaken(truth, 0.02)
+    if factor is not None:
+        problem, at = guessing(at, problem, factor)
     system = bundle._linearise(problem, at, 2.0)
     damping = torch.tensor([0.01]).double()
-    d_cam, d_point = bundle._solve(problem, at, system, damping, bundle._layout(problem))
+    d_cam, d_point, d_focal = bundle._solve(problem, at, system, damping, bundle._layout(problem))
     H = torch.zeros(36, 36).double()
     for c in range(3):
         H[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] = system.U[c]
@@ -104,10 +142,16 @@ def test_elimination_solves_the_whole_system(short: int, monkeypatch: pytest.Mon
     for o, (c, p) in enumerate(zip(problem.tracks.frame.tolist(), problem.tracks.point.tolist(), strict=True)):
         H[6 * c : 6 * c + 6, 18 + 3 * p : 21 + 3 * p] += system.W[o]
         H[18 + 3 * p : 21 + 3 * p, 6 * c : 6 * c + 6] += system.W[o].T
-    H = H + torch.diag(0.01 * H.diagonal() + 1e-9)
     g = torch.cat([system.g_cam.flatten(), system.g_point.flatten()])
-    step = torch.linalg.solve(H, -g)
-    torch.testing.assert_close(torch.cat([d_cam.flatten(), d_point.flatten()]), step, rtol=1e-6, atol=1e-9)
+    found = torch.cat([d_cam.flatten(), d_point.flatten()])
+    if system.border is not None:
+        assert d_focal is not None
+        side = torch.cat([system.border.cam.flatten(), system.border.point.flatten()])[:, None]
+        H = torch.cat([torch.cat([H, side], 1), torch.cat([side.T, system.border.H[:, None]], 1)])
+        g, found = torch.cat([g, system.border.g]), torch.cat([found, d_focal])
+    assert (system.border is None) == (d_focal is None) == (factor is None)
+    H = H + torch.diag(0.01 * H.diagonal() + 1e-9)
+    torch.testing.assert_close(found, torch.linalg.solve(H, -g), rtol=1e-6, atol=1e-9)
 
 
 def test_exact_pixels_give_exact_motions() -> None:
@@ -118,6 +162,30 @@ def test_exact_pixels_give_exact_motions() -> None:
     assert bundle.residuals(seen(truth), found)[0].abs().max() < 0.1
     # What is left is the priors': a few of the truth's own sigmas, NOISE^2 each.
     assert (cost < 3).all()
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_a_guessed_focal_length_is_found(factor: float) -> None:
+    """Pixels of 0.2 noise, two groups: by the inverse of the normal equations at the truth one sigma of the focal
+    length is below a hundredth, and the prior pulls by less."""
+    truth = scene(2, 12, 60)
+    problem, start = guessing(truth, seen(truth, noise=0.2), factor)
+    for scale in (3.0, 1.0, 1.0):
+        start, _ = bundle.adjust(problem, start, steps=30, scale=scale, tolerance=0.0)
+    assert start.log_focal is not None
+    torch.testing.assert_close(start.log_focal.exp() * factor, torch.ones(2).double(), atol=0.03, rtol=0)
+    assert relative_errors(start, truth).rad2deg().max() < 0.5
+
+
+def test_a_known_focal_length_stays_as_it_is() -> None:
+    """Even a wrong one: the scene has none of its own, and the poses are those that fit it best."""
+    truth = scene(1, 8, 30)
+    problem, start = guessing(truth, seen(truth), 0.8)
+    kept, cost = bundle.adjust(problem, replace(start, log_focal=None), steps=30, scale=3.0)
+    found, least = bundle.adjust(problem, start, steps=30, scale=3.0)
+    assert kept.log_focal is None
+    assert found.log_focal is not None
+    assert least < cost
 
 
 def test_outliers_are_forgiven() -> None:

@@ -83,3 +83,13 @@ def test_selected_frames_keep_their_order() -> None:
     trajectory = Trajectory(SE3.from_rotation(SO3.identity((4,)), torch.arange(12.0).reshape(4, 3)), "camera")
     assert trajectory.select([2, 0]).T_cam_obj.xyz[:, 0].tolist() == [6, 0]
     assert len(trajectory) == 4
+
+
+def test_zooming_moves_pictures_away_from_the_principal_point() -> None:
+    """And changes nothing else: where a point is seen, from the principal point, times the factor."""
+    camera = Camera(torch.tensor([100.0, 110.0, 30.0, 20.0]), 40, 60)
+    x_cam = torch.tensor([0.1, -0.2, 2.0])
+    centre = torch.tensor([30.0, 20.0])
+    seen = camera.zoomed(1.5).project(x_cam)
+    torch.testing.assert_close(seen - centre, 1.5 * (camera.project(x_cam) - centre))
+    assert (camera.zoomed(1.5).height, camera.zoomed(1.5).width) == (40, 60)

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,15 @@ def test_a_pose_free_capture_keeps_its_true_poses_apart(tmp_path: Path) -> None:
     assert folder.load(tmp_path / "capture").trajectory is None
     assert again is not None
     assert_same_poses(again.poses, truth.poses)
+
+
+def test_a_guessed_focal_length_stays_one(tmp_path: Path) -> None:
+    capture, truth = a_capture()
+    capture_writer.save(tmp_path / "guess", replace(capture, focal_guessed=True), truth)
+    capture_writer.save(tmp_path / "known", capture, truth)
+    assert folder.load(tmp_path / "guess").focal_guessed
+    assert folder.load(tmp_path / "guess").select([1]).focal_guessed
+    assert not folder.load(tmp_path / "known").focal_guessed
 
 
 def test_saving_over_a_folder_is_refused(written: Path) -> None:

@@ -91,7 +91,8 @@ def test_the_graph_route_takes_them_for_points_of_a_body_of_revolution(monkeypat
     monkeypatch.setattr(graph, "AGAIN", HALF - 1)
     inputs, cfg, T = graph.gather(capture, []), graph.Config(), truth.T_cam_obj
     state = graph.init(cfg, inputs, torch.Generator().manual_seed(0))
-    state.params = graph.Poses(T.rotation.matrix().double(), T.xyz.double() / DISTANCE)
+    known = torch.zeros((), dtype=torch.float64)
+    state.params = graph.Poses(T.rotation.matrix().double(), T.xyz.double() / DISTANCE, known)
     state.step = next(k for k, (phase, _, _) in enumerate(graph.plan(cfg)) if phase == "loops")
     graph.step(cfg, inputs, state)
     point, frame, uv = (state.memory[f"loop_{name}"] for name in ("point", "frame", "uv"))

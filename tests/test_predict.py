@@ -196,6 +196,25 @@ def test_a_drifting_tracker_still_shows_the_object_in_its_place() -> None:
     assert scores["regions"]["shared"]["silhouette.iou"] > 0.97
 
 
+def test_what_another_lens_saw_is_brought_to_where_this_one_sees_it_as_large() -> None:
+    """A lens longer by a fifth sees the object as large from a fifth farther off: nothing else is to be aligned."""
+    asset = an_asset("camera")
+    capture, truth = a_truth(asset)
+    T = asset.trajectory.T_cam_obj
+    farther = Trajectory(dataclasses.replace(T, xyz=T.xyz * torch.tensor([1.0, 1.0, 1.2])), "camera")
+    found, words = predict.aligned(farther, NAMES, capture, truth, given=False, lens=1 / 1.2)
+    assert found is not None
+    assert float(found.scale) == pytest.approx(1, abs=1e-4)
+    assert float(found.R_true_pred.angle()) < 1e-3
+    assert found.shift.abs().max() < 1e-4
+    assert "depths times 0.8333" in words
+    plain, words = predict.aligned(farther, NAMES, capture, truth, given=False)
+    assert plain is not None
+    # Otherwise the object would be drawn a fifth too large.
+    assert float(plain.scale) == pytest.approx(1 / 1.2, abs=0.01)
+    assert "depths" not in words
+
+
 def test_what_cannot_be_aligned_is_a_prediction_of_poses_and_says_so() -> None:
     asset = an_asset("camera")
     capture, truth = a_truth(asset)

@@ -8,10 +8,25 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.lopsided import truth, tumbling
+from tests.test_graph import QUICK, matches
 from tests.test_hull import silhouettes
-from tumble import average, capture_writer, decompose, evaluate, files, loop, recipes, reconstruct, refine, tree
+from tumble import (
+    average,
+    capture_writer,
+    decompose,
+    evaluate,
+    files,
+    loop,
+    matching,
+    recipes,
+    reconstruct,
+    refine,
+    tree,
+)
+from tumble import run as runs
 from tumble.asset import Asset
-from tumble.capture import OBJECT, Capture, Truth
+from tumble.capture import OBJECT, Capture, Truth, no_views
 from tumble.datasets import folder
 from tumble.environment import Environment
 from tumble.files import BadFile
@@ -149,6 +164,38 @@ def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
             assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.3), key
         key = "normal.mean_fg_degrees"
         assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.5)
+
+
+def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A capture whose focal length is a guess, a fifth too short, and its twin with the true one, to score against."""
+    scene = tumbling(16, size=96, points=150)
+    true = scene.capture.camera
+    guess = dataclasses.replace(scene.capture, camera=true.zoomed(0.8), focal_guessed=True)
+    capture_writer.save(tmp_path / "guess", guess)
+    capture_writer.save(tmp_path / "true", scene.capture, dataclasses.replace(no_views(true), poses=truth(scene)))
+    monkeypatch.setattr(matching, "match_pairs", lambda *_, **__: matches(scene))
+    recipe = dataclasses.replace(RECIPE, track=QUICK)
+    run = tmp_path / "run"
+    asset = reconstruct.reconstruct(tmp_path / "guess", run, recipe, poses="estimate")
+    focal = float(asset.camera.fx_fy_cx_cy[0])
+    assert focal == pytest.approx(float(true.fx_fy_cx_cy[0]), rel=0.1)
+    said = [record["said"] for record in runs.records(run) if record.get("event") == "focal"]
+    begun = float(guess.camera.fx_fy_cx_cy[0])
+    assert said == [f"focal length {focal:.0f} pixels (estimated; the guess was {begun:.0f})"]
+    assert_same(reconstruct.reconstruct(tmp_path / "guess", run, recipe, poses="estimate"), asset)
+    # Scored through the true camera: a folder, a film, a window of a film, a film whose lens is known.
+    ratio = float(true.fx_fy_cx_cy[0]) / focal
+    report = reconstruct.evaluate_run(run, tmp_path / "true", run)
+    assert f"depths times {ratio:.4g}" in report["notes"][0]
+    note = {"focal_source": "guess", "window_top_left_height_width": [0, 0, 192, 192], "frames": []}
+    assert reconstruct._lens(run, asset, guess) == pytest.approx(begun / focal)
+    files.write_json(run / "capture" / "ingest.json", note)
+    assert reconstruct._lens(run, asset, scene.capture) == pytest.approx(ratio)
+    window = dataclasses.replace(asset, camera=asset.camera.resized(192, 192).cropped(20, 30, 120, 100).resized(60, 50))
+    files.write_json(run / "capture" / "ingest.json", note | {"window_top_left_height_width": [20, 30, 120, 100]})
+    assert reconstruct._lens(run, window, scene.capture) == pytest.approx(ratio)
+    files.write_json(run / "capture" / "ingest.json", note | {"focal_source": "given"})
+    assert reconstruct._lens(run, asset, scene.capture) == 1
 
 
 def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Path, tmp_path: Path) -> None:

@@ -38,7 +38,8 @@ RECORDS = [
     {"name": "decompose", "event": "done", "seconds": 201.0},
 ]
 RECIPE = {"refine": {"steps": 200, "weights": {"mask": 0.125}}, "decompose": {"bounce": "none"}, "seed": 7}
-STORY = report.Story("a <mug> & more", RECORDS, RECIPE, "guess")
+FOCAL = float(Camera.from_fov(math.radians(30), SIDE, SIDE).fx_fy_cx_cy[0])
+STORY = report.Story("a <mug> & more", RECORDS, RECIPE, FOCAL)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,9 @@ def test_a_guessed_focal_length_is_called_one(page: Path, asset: Asset, capture:
     """Half the width over the tangent of half the field of view."""
     focal = f"{0.5 * SIDE / math.tan(math.radians(15)):.0f} pixels"
     assert f"{focal}, a guess" in text(page)
-    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(STORY, focal_source="given"))
+    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(STORY, guess=None))
+    better = report._facts(asset, capture, dataclasses.replace(STORY, guess=60.0))
+    assert f"{focal} (estimated; the guess was 60)<" in better
 
 
 def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:

@@ -288,6 +288,7 @@ def test_all_that_a_method_may_see_decides_the_captures_key() -> None:
         ),
         replace(capture, light="object", trajectory=replace(poses, light="object")),
         replace(capture, names=("0.png", "2.png")),
+        replace(capture, focal_guessed=True),
     ]
     keys = [run.capture_key(variant) for variant in variants]
     assert len(set(keys)) == len(keys)

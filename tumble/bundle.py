@@ -5,11 +5,14 @@ equal size that share no point: many short windows are adjusted side by side as 
 its own damping.
 
 Two priors hold what pixels say little about: the object's origin stays near the middle of its silhouette, and at about
-the same distance. Everything is float64. Unit of length: the origin's mean distance from the camera, until the gauge is
-fixed at the end of the stage.
+the same distance. Where the focal length is a guess, one factor on it per group is found as well; the guess is a third
+prior. Everything is float64. Unit of length: the origin's mean distance from the camera, until the gauge is fixed at
+the end of the stage.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -29,6 +32,11 @@ FRONT = 0.6
 """How far towards the camera a visible point is first believed to be [half chord]."""
 TRUST_FRONT = 0.003
 """Weight of that belief against the rays of all frames that show the point."""
+GUESS = math.log(1.25)
+"""One sigma of the logarithm of a guessed focal length: phones film at equivalents of 24 to 35 mm."""
+GUESS_NOISE = 0.02
+"""What that sigma weighs against the residuals of all observations, whose errors are not independent [pixels]: where
+they say nothing (a bare ball) little moves, elsewhere a guess 25 % off pulls by one percent."""
 SHORT = 3
 """Observations of a point up to which pairs of them are summed one by one."""
 
@@ -43,6 +51,8 @@ class Scene:
     """The object's origin, camera frame."""
     X: Float[Tensor, "n 3"]
     """Points, object frame of their group."""
+    log_focal: Float[Tensor, " g"] | None = None
+    """Logarithm of the focal length over the camera's; None: the camera's is known."""
 
 
 @dataclass(frozen=True)
@@ -64,15 +74,34 @@ class Problem:
     """Of the logarithm of the origin's distance about 0."""
     reach: float
     """Radius about the origin in which points are expected."""
+    guess: float = 0.0
+    """Logarithm of the guessed focal length over the camera's; counts where the scene has one of its own."""
 
 
 def residuals(problem: Problem, scene: Scene) -> tuple[Float[Tensor, "o 2"], Float[Tensor, "o 3"]]:
     """Projected minus seen positions [pixels], and the points in the camera frames."""
     R, t = scene.R.flatten(0, 1)[problem.tracks.frame], scene.t.flatten(0, 1)[problem.tracks.frame]
     x = torch.einsum("oij,oj->oi", R, scene.X[problem.tracks.point]) + t
-    focal, principal = problem.camera.fx_fy_cx_cy.double().split(2)
+    focal, principal = _focals(problem, scene)[problem.tracks.frame], problem.camera.fx_fy_cx_cy.double()[2:]
     z = x[:, 2:].clamp_min(NEAREST)
     return x[:, :2] / z * focal + principal - problem.tracks.uv, x
+
+
+def _focals(problem: Problem, scene: Scene) -> Float[Tensor, "c 2"]:
+    """Focal lengths of all cameras [pixels]."""
+    g, f = scene.t.shape[:2]
+    focal = problem.camera.fx_fy_cx_cy.double()[:2].expand(g * f, 2)
+    return focal if scene.log_focal is None else focal * scene.log_focal.exp().repeat_interleave(f)[:, None]
+
+
+@dataclass(frozen=True)
+class _Border:
+    """What the logarithm of the focal length adds to the normal equations: one row and column per group."""
+
+    H: Float[Tensor, " g"]
+    g: Float[Tensor, " g"]
+    cam: Float[Tensor, "c 6"]
+    point: Float[Tensor, "n 3"]
 
 
 @dataclass(frozen=True)
@@ -85,6 +114,7 @@ class _System:
     W: Float[Tensor, "o 6 3"]
     g_cam: Float[Tensor, "c 6"]
     g_point: Float[Tensor, "n 3"]
+    border: _Border | None
 
 
 @dataclass(frozen=True)
@@ -118,8 +148,7 @@ def adjust(
     system = _linearise(problem, scene, scale)
     done = torch.zeros_like(damping, dtype=torch.bool)
     for _ in range(steps):
-        d_cam, d_point = _solve(problem, scene, system, damping, layout)
-        moved = _moved(scene, d_cam, d_point)
+        moved = _moved(scene, *_solve(problem, scene, system, damping, layout))
         fresh = _linearise(problem, moved, scale)
         better = fresh.cost < system.cost
         done |= better & (system.cost - fresh.cost < tolerance * system.cost)
@@ -154,14 +183,14 @@ def _jacobians(
     problem: Problem, scene: Scene, x: Float[Tensor, "o 3"]
 ) -> tuple[Float[Tensor, "o 2 6"], Float[Tensor, "o 2 3"]]:
     """Derivatives of the projections by poses (turn, shift) and by points."""
-    focal = problem.camera.fx_fy_cx_cy.double()[:2]
+    focal = _focals(problem, scene)[problem.tracks.frame]
     R = scene.R.flatten(0, 1)[problem.tracks.frame]
     z = x[:, 2].clamp_min(NEAREST)
     zero = torch.zeros_like(z)
     J_x = torch.stack(
         [
-            torch.stack([focal[0] / z, zero, -focal[0] * x[:, 0] / z**2], -1),
-            torch.stack([zero, focal[1] / z, -focal[1] * x[:, 1] / z**2], -1),
+            torch.stack([focal[:, 0] / z, zero, -focal[:, 0] * x[:, 0] / z**2], -1),
+            torch.stack([zero, focal[:, 1] / z, -focal[:, 1] * x[:, 1] / z**2], -1),
         ],
         -2,
     )
@@ -190,16 +219,55 @@ def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
     cost = torch.zeros(g, dtype=torch.float64).index_add_(0, problem.group[problem.tracks.point], loss)
     cost = cost + _camera_priors(problem, scene, U, g_cam)
     # A point that few pixels hold stays within the object.
-    hold = (NOISE / problem.reach) ** 2
-    V = V + hold * torch.eye(3, dtype=torch.float64)
+    hold = _hold(problem, scene)
+    V = V + hold[..., None] * torch.eye(3, dtype=torch.float64)
     g_point = g_point + hold * scene.X
-    cost = cost.index_add(0, problem.group, hold * scene.X.square().sum(-1))
-    return _System(cost, U, V, wJ_cam.mT @ J_point, g_cam, g_point)
+    cost = cost.index_add(0, problem.group, hold[:, 0] * scene.X.square().sum(-1))
+    known = scene.log_focal is None
+    price, border = (0, None) if known else _border(problem, scene, x, residual, wJ_cam, wJ_point, w)
+    return _System(cost + price, U, V, wJ_cam.mT @ J_point, g_cam, g_point, border)
+
+
+def _hold(problem: Problem, scene: Scene) -> Float[Tensor, "#n 1"]:
+    """Weight of the points' distance from the origin: through a longer lens the object is as much smaller."""
+    hold = torch.full((1, 1), (NOISE / problem.reach) ** 2, dtype=torch.float64)
+    return hold if scene.log_focal is None else hold * (2 * scene.log_focal).exp()[problem.group, None]
+
+
+def _border(
+    problem: Problem, scene: Scene, x: Tensor, residual: Tensor, wJ_cam: Tensor, wJ_point: Tensor, w: Tensor
+) -> tuple[Float[Tensor, " g"], _Border]:
+    """The cost of leaving the guessed focal length, and all derivatives by its logarithm."""
+    assert scene.log_focal is not None, "a focal length to find"
+    g, f = scene.t.shape[:2]
+    track, focal = problem.tracks, _focals(problem, scene)
+    group = problem.group[track.point]
+    J = x[:, :2] / x[:, 2:].clamp_min(NEAREST) * focal[track.frame]
+    cam = torch.zeros(g * f, 6, dtype=torch.float64).index_add_(0, track.frame, (wJ_cam * J[..., None]).sum(1))
+    held = _hold(problem, scene) * scene.X
+    point = held.index_add(0, track.point, (wJ_point * J[..., None]).sum(1))
+    none, off = torch.zeros(g, dtype=torch.float64), scene.log_focal - problem.guess
+    pull = (GUESS_NOISE / GUESS) ** 2 * none.index_add(0, group, problem.weight)
+    shrinks = none.index_add(0, problem.group, (held * scene.X).sum(-1))
+    H = (pull + shrinks).index_add(0, group, w * J.square().sum(-1))
+    gradient = (pull * off + shrinks).index_add(0, group, w * (J * residual).sum(-1))
+    rows, r, J = _origin(problem, scene)
+    cam[:, 3:] += torch.einsum("cki,ck->ci", rows[:, :2], J)
+    H, gradient = H + J.square().reshape(g, -1).sum(1), gradient + (J * r[:, :2]).reshape(g, -1).sum(1)
+    return pull * off.square(), _Border(H, gradient, cam, point)
 
 
 def _camera_priors(problem: Problem, scene: Scene, U: Tensor, g_cam: Tensor) -> Float[Tensor, " g"]:
     """Add the priors of the origin's place to the normal equations in place; their cost."""
-    focal, principal = problem.camera.fx_fy_cx_cy.double().split(2)
+    rows, r, _ = _origin(problem, scene)
+    U[:, 3:, 3:] += rows.mT @ rows
+    g_cam[:, 3:] += torch.einsum("cki,ck->ci", rows, r)
+    return r.square().sum(-1).reshape(scene.t.shape[:2]).sum(1)
+
+
+def _origin(problem: Problem, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the origin's place: derivatives of the residuals by it, residuals, derivatives by the logarithmic focal."""
+    focal, principal = _focals(problem, scene), problem.camera.fx_fy_cx_cy.double()[2:]
     t = scene.t.flatten(0, 1)
     z = t[:, 2:].clamp_min(NEAREST)
     off = (t[:, :2] / z * focal + principal - problem.centre.flatten(0, 1)) / problem.centre_sigma.flatten()[:, None]
@@ -209,15 +277,12 @@ def _camera_priors(problem: Problem, scene: Scene, U: Tensor, g_cam: Tensor) -> 
     rows[:, 0, 0], rows[:, 1, 1] = scaled[:, 0], scaled[:, 1]
     rows[:, :2, 2] = -scaled * t[:, :2] / z
     rows[:, 2, 2] = 1 / (z[:, 0] * problem.depth_sigma)
-    rows, r = NOISE * rows, NOISE * torch.cat([off, far], -1)
-    U[:, 3:, 3:] += rows.mT @ rows
-    g_cam[:, 3:] += torch.einsum("cki,ck->ci", rows, r)
-    return r.square().sum(-1).reshape(scene.t.shape[:2]).sum(1)
+    return NOISE * rows, NOISE * torch.cat([off, far], -1), NOISE * scaled * t[:, :2]
 
 
 def _solve(
     problem: Problem, scene: Scene, system: _System, damping: Float[Tensor, " g"], layout: _Layout
-) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"]]:
+) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"], Float[Tensor, " g"] | None]:
     g, f = scene.t.shape[:2]
     lam_cam, lam_point = damping.repeat_interleave(f)[:, None], damping[problem.group][:, None]
     U, V = (
@@ -241,17 +306,29 @@ def _solve(
     right = -system.g_cam
     right = right.index_add(0, problem.tracks.frame, (Y @ system.g_point[problem.tracks.point][..., None])[..., 0])
     d_cam = torch.linalg.solve(S, right.reshape(g, 6 * f, 1)).reshape(g * f, 6)
-    back = system.g_point.index_add(
-        0, problem.tracks.point, (system.W.mT @ d_cam[problem.tracks.frame][..., None])[..., 0]
-    )
-    return d_cam, -(V_inv @ back[..., None])[..., 0]
+    g_point, d_focal = system.g_point, None
+    if (border := system.border) is not None:
+        V_point = (V_inv @ border.point[..., None])[..., 0]
+        side = border.cam.index_add(0, frame, -(Y @ border.point[problem.tracks.point][..., None])[..., 0])
+        slope = torch.linalg.solve(S, side.reshape(g, 6 * f, 1)).reshape(g * f, 6)
+
+        def among(cameras: Tensor, points: Tensor) -> Float[Tensor, " g"]:
+            return cameras.reshape(g, -1).sum(1).index_add(0, problem.group, points.sum(-1))
+
+        H = (1 + damping) * border.H - among(side * slope, border.point * V_point)
+        d_focal = (-border.g - among(side * d_cam, -V_point * g_point)) / H
+        d_cam = d_cam - d_focal.repeat_interleave(f)[:, None] * slope
+        g_point = g_point + d_focal[problem.group][:, None] * border.point
+    back = g_point.index_add(0, problem.tracks.point, (system.W.mT @ d_cam[problem.tracks.frame][..., None])[..., 0])
+    return d_cam, -(V_inv @ back[..., None])[..., 0], d_focal
 
 
-def _moved(scene: Scene, d_cam: Tensor, d_point: Tensor) -> Scene:
+def _moved(scene: Scene, d_cam: Tensor, d_point: Tensor, d_focal: Tensor | None = None) -> Scene:
     g, f = scene.t.shape[:2]
     turn = SO3.exp(d_cam[:, :3].clamp(-0.5, 0.5)).matrix().reshape(g, f, 3, 3)
     shift = d_cam[:, 3:].clamp(-0.2, 0.2).reshape(g, f, 3)
-    return Scene(turn @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2))
+    log_focal = None if d_focal is None or scene.log_focal is None else scene.log_focal + d_focal.clamp(-0.1, 0.1)
+    return Scene(turn @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2), log_focal)
 
 
 def _choose(
@@ -260,19 +337,16 @@ def _choose(
     """Per group, the new where it is better."""
     if bool(better.all()):
         return new
-    f = old[0].t.shape[1]
-    camera, point = better.repeat_interleave(f), better[problem.group]
-    observation = point[problem.tracks.point]
+    camera, point = better.repeat_interleave(old[0].t.shape[1]), better[problem.group]
+    masks: dict[str, Tensor] = {"U": camera, "g_cam": camera, "cam": camera, "X": point, "V": point, "g_point": point}
+    masks |= {"point": point, "W": point[problem.tracks.point]}
 
-    def pick(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    def pick(name: str, a: Any, b: Any) -> Any:
+        if not isinstance(a, Tensor):
+            return None if a is None else type(a)(**{k: pick(k, x, getattr(b, k)) for k, x in vars(a).items()})
+        return torch.where(masks.get(name, better).reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
-    scene = Scene(
-        *(pick(m, getattr(new[0], k), getattr(old[0], k)) for m, k in ((better, "R"), (better, "t"), (point, "X")))
-    )
-    masks = {"cost": better, "U": camera, "V": point, "W": observation, "g_cam": camera, "g_point": point}
-    system = _System(**{k: pick(m, getattr(new[1], k), getattr(old[1], k)) for k, m in masks.items()})
-    return scene, system
+    return pick("scene", new[0], old[0]), pick("system", new[1], old[1])
 
 
 def information(problem: Problem, scene: Scene, precision: Float[Tensor, "o 2 2"]) -> Float[Tensor, "c 6 6"]:

@@ -4,7 +4,7 @@ A *pixel position* `uv` counts from the top left corner of the image; `uv[0]` ru
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -64,6 +64,10 @@ class Camera:
         """The same view sampled by another grid of pixels."""
         x, y = width / self.width, height / self.height
         return Camera(self.fx_fy_cx_cy * self.fx_fy_cx_cy.new_tensor([x, y, x, y]), height, width)
+
+    def zoomed(self, factor: float) -> "Camera":
+        """The camera with focal lengths times a factor."""
+        return replace(self, fx_fy_cx_cy=self.fx_fy_cx_cy * self.fx_fy_cx_cy.new_tensor([factor, factor, 1, 1]))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
         """The part of the view that a window of pixels shows."""

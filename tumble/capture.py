@@ -5,7 +5,7 @@ metric counts. *Evaluation views* are never trained on; their *region* is "share
 what they show, else "sphere" (format.md).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import torch
@@ -37,6 +37,8 @@ class Capture:
     """What the light stands still with."""
     trajectory: Trajectory | None = None
     """Object poses where they are known, one per frame."""
+    focal_guessed: bool = False
+    """Whether nobody stated the camera's focal length: estimated poses bring a better one."""
 
     def __post_init__(self) -> None:
         t, h, w, _ = self.images.shape
@@ -53,7 +55,8 @@ class Capture:
         """Some of the frames, in the order given."""
         names = tuple(self.names[i] for i in frames)
         trajectory = self.trajectory.select(frames) if self.trajectory else None
-        return Capture(self.images[frames], self.masks[frames], self.camera, names, self.light, trajectory)
+        images, masks = self.images[frames], self.masks[frames]
+        return replace(self, images=images, masks=masks, names=names, trajectory=trajectory)
 
 
 @dataclass(frozen=True)

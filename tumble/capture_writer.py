@@ -69,10 +69,8 @@ def save(path: Path, capture: Capture, truth: Truth | None = None, *, setting: s
     if truth is not None:
         frames += _save_truth(path, capture, truth)
     with_light = truth is not None and truth.light is not None
-    files.write_json(
-        path / "transforms.json",
-        document(capture.camera, capture.light, frames, setting=setting, with_light=with_light),
-    )
+    fields = document(capture.camera, capture.light, frames, setting=setting, with_light=with_light)
+    files.write_json(path / "transforms.json", fields | ({"focal_source": "guess"} if capture.focal_guessed else {}))
 
 
 def _save_photograph(path: Path, name: str, image: Tensor, mask: Tensor) -> None:

@@ -108,6 +108,7 @@ def _hint(found: Survey) -> Finding:
         state += f"; object guessed at {left} {top} {width} {height} on frame {found.numbers[found.seed.index]}"
     guesses = found.guessed or found.lens.source == "guess"
     advice = "look at the mask preview, and draw a box with --pick if it is wrong; give --focal or --fov if known"
+    advice += ": else the run estimates it" if found.lens.source == "guess" else ""
     return _finding("hints", "warn" if guesses else "good", state, advice)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble import bundle, hull, relocate, symmetry, texture
+from tumble.camera import Camera
 from tumble.capture import BACKGROUND, UNKNOWN, Capture
 from tumble.frontier import Outlines, touch
 from tumble.health import UNSEEN, Health, Observability
@@ -58,6 +59,8 @@ class Tracked:
     colours: Float[Tensor, "n 3"]
     """Linear RGB, median over the frames that show the point: shading included."""
     health: Health
+    camera: Camera
+    """The capture's; where its focal length is a guess, with the one that was found."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solu
     observability = _observability(capture, outline, solution, problem, scene, residual < AGREES)
     drift, turn = solution.drift.float(), angle_between(T.rotation[:, None], T.rotation).max().float()
     health = Health(median.float(), inliers.float(), gap.float(), overlap, drift, lost, turn, observability)
-    return Tracked(trajectory, points.float(), colours, health)
+    return Tracked(trajectory, points.float(), colours, health, camera)
 
 
 def _frontier(

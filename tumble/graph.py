@@ -7,12 +7,12 @@ Necker's reversal is met where it arises: every window also starts from its mirr
 
 A capture whose outlines and tracks still contradict each other begins anew in other ways; the best is kept.
 
+A focal length that is a guess is found along, whenever all frames are adjusted together.
+
 Unit of length until `finish`: the object's mean distance from the camera.
 """
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int64
@@ -21,22 +21,18 @@ from torch import Tensor
 from tumble import bundle, frontier, pairwise
 from tumble.averaging import average
 from tumble.bundle import Problem, Scene
-from tumble.capture import Capture
 from tumble.comeback import comebacks
-from tumble.frontier import Outlines
+from tumble.evidence import Inputs, focal_length, on_axis, through
+from tumble.evidence import gather as gather
 from tumble.gauge import Solution, Tracked, finished
 from tumble.loop import State
-from tumble.match import Match
-from tumble.pairwise import Silhouettes
 from tumble.relocate import FEW, LEAP, Judge, cost, hypotheses, relocate, unbroken
 from tumble.se3 import SE3, SO3, angle_between, mean_rotation
 from tumble.symmetry import mirrors
-from tumble.tracks import NONE, Tracks, followed, joined, of_match
+from tumble.tracks import NONE, Tracks, joined, of_match
 from tumble.trajectory import Trajectory
 
-VERSION = 7
-POINTS = 150
-"""Tracks that pass through a frame."""
+VERSION = 8
 CONTRADICTS = 1.5
 """Loss of a frame's outline over the median from which the frame is given a second look: alone, with outlines only, a
 good pose gets worse."""
@@ -50,8 +46,6 @@ ROOM = 1.3
 """Radius of the ball about the origin in which the object surely lies, over the object's."""
 STILL = 0.01
 """Weight of the belief that the object does not turn from one frame to the next, of a match 1."""
-FULL = 1.1
-"""The object's radius over that of the ball about its middling silhouette."""
 
 
 @dataclass(frozen=True)
@@ -102,19 +96,6 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """A capture whose poses nobody knows, and all that its frames say; `gather` makes it."""
-
-    capture: Capture
-    matches: Sequence[Match] = field(repr=False)
-    shapes: Silhouettes
-    outline: Outlines
-    tracks: Tracks
-    radius: float
-    """Of the object [its mean distance]."""
-
-
-@dataclass(frozen=True)
 class Poses:
     """What this stage finds."""
 
@@ -122,30 +103,8 @@ class Poses:
     """`R_cam_obj`"""
     t: Float[Tensor, "t 3"]
     """The object's origin, camera frame [its mean distance]."""
-
-
-def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
-    """Silhouettes, outlines and tracks of a capture and its matches; its masks without the bands along silhouettes.
-
-    Raises:
-        ValueError: No frame shows the object.
-    """
-    capture = replace(capture, masks=frontier.divided(capture.masks))
-    shapes = pairwise.silhouettes(capture)
-    if not bool(shapes.visible.any()):
-        raise ValueError("no mask has an object pixel: there is nothing to find poses of")
-    area = math.pi * (shapes.radius * _focal(capture) / pairwise.ROUNDNESS).square()
-    outline = frontier.outlines(capture)
-    odd = pairwise.odd(shapes)
-    outline = replace(outline, sure=outline.sure & ~odd[:, None])
-    shapes = pairwise.mended(shapes, odd)
-    tracks = followed(matches, (area / POINTS).sqrt().clamp_min(2.0))
-    radius = FULL * float(shapes.radius[shapes.visible].median())
-    return Inputs(capture, matches, shapes, outline, tracks, radius)
-
-
-def _focal(capture: Capture) -> float:
-    return float(capture.camera.fx_fy_cx_cy[:2].double().prod().sqrt())
+    log_focal: Float[Tensor, ""]
+    """Logarithm of the focal length over the capture's: 0 where that is no guess."""
 
 
 def plan(cfg: Config) -> list[tuple[str, float, int]]:
@@ -166,15 +125,10 @@ def length(cfg: Config, inputs: Inputs) -> int:
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     """Every frame as the camera would see an object that does not turn, in the middle of its silhouette."""
     R = torch.eye(3, dtype=torch.float64).repeat(len(inputs.capture), 1, 1)
-    t = _on_axis(inputs.capture, inputs.shapes)
-    kept = {"R": R, "t": t, "loss": torch.tensor(torch.inf, dtype=torch.float64)}
-    return State(0, Poses(R, t), None, rng, kept | {f"loop_{name}": x for name, x in vars(NONE).items()})
-
-
-def _on_axis(capture: Capture, shapes: Silhouettes) -> Float[Tensor, "t 3"]:
-    """Points at depth 1 in the middle of the silhouettes."""
-    focal, principal = capture.camera.fx_fy_cx_cy.double().split(2)
-    return torch.nn.functional.pad((shapes.centre - principal) / focal, (0, 1), value=1.0)
+    t = on_axis(inputs.capture, inputs.shapes)
+    log_focal = torch.zeros((), dtype=torch.float64)
+    kept = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
+    return State(0, Poses(R, t, log_focal), None, rng, kept | {f"loop_{name}": x for name, x in vars(NONE).items()})
 
 
 @torch.no_grad()
@@ -186,7 +140,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         cfg = replace(cfg, frontier=cfg.others[start - 1].frontier) if phase != "keep" else cfg
     phases = {"pairs": _pairs, "windows": _windows, "whole": _whole, "keep": _keep, "loops": _loops}
     phases |= {"relocate": _relocate}
-    state.params, scalars = phases[phase](cfg, inputs, state, number)
+    state.params, scalars = phases[phase](cfg, through(inputs, state.params.log_focal), state, number)
     return scalars
 
 
@@ -209,7 +163,8 @@ def _pairs(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
     i, j = torch.cat([fits.i, before]), torch.cat([fits.j, before + 1])
     weight = torch.cat([weight, torch.full((n - 1,), STILL, dtype=weight.dtype)])
     found = average(i, j, torch.cat([fits.R_j_i, still]), weight, n_frames=n)
-    return Poses(found.R_cam_obj, _on_axis(inputs.capture, inputs.shapes)), {"pairs": float(len(fits))}
+    poses = replace(state.params, R=found.R_cam_obj, t=on_axis(inputs.capture, inputs.shapes))
+    return poses, {"pairs": float(len(fits))}
 
 
 def _windows(cfg: Config, inputs: Inputs, state: State, number: float) -> Outcome:
@@ -223,7 +178,7 @@ def _windows(cfg: Config, inputs: Inputs, state: State, number: float) -> Outcom
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
     best, least = R, torch.full((len(frames),), torch.inf, dtype=R.dtype)
     for start in (R, flip @ R @ middle.mT @ flip @ middle):
-        scene = Scene(start, _on_axis(inputs.capture, inputs.shapes)[frames], torch.zeros(0, 3, dtype=R.dtype))
+        scene = Scene(start, on_axis(inputs.capture, inputs.shapes)[frames], torch.zeros(0, 3, dtype=R.dtype))
         for scale in cfg.schedule:
             scene, price = _round(cfg, inputs, scene, tracks, group, frames, scale)
         best = torch.where((price < least)[:, None, None, None], scene.R, best)
@@ -255,13 +210,17 @@ def _whole(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
     """One round of adjusting all frames together."""
     poses = state.params
     frames = torch.arange(len(inputs.capture))[None]
-    scene = Scene(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype))
+    free = torch.zeros(1, dtype=poses.R.dtype) if inputs.capture.focal_guessed else None
+    scene = Scene(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype), free)
     tracks = inputs.tracks
     if len(state.memory.get("loop_point", ())):
         tracks = joined(tracks, Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv"))))
     group = torch.zeros(tracks.n, dtype=torch.long)
-    scene, price = _round(cfg, inputs, scene, tracks, group, frames, scale, state.rng)
-    return Poses(scene.R[0], scene.t[0]), {"loss": price.mean()}
+    guess = -float(poses.log_focal)
+    scene, price = _round(cfg, inputs, scene, tracks, group, frames, scale, state.rng, guess)
+    log_focal = poses.log_focal if scene.log_focal is None else poses.log_focal + scene.log_focal[0]
+    said = {} if scene.log_focal is None else {"focal": focal_length(inputs.capture) * scene.log_focal[0].exp()}
+    return Poses(scene.R[0], scene.t[0], log_focal), {"loss": price.mean(), **said}
 
 
 def _keep(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
@@ -269,8 +228,8 @@ def _keep(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
     alone = State(0, state.params, None, torch.Generator().manual_seed(0))
     loss, memory = torch.as_tensor(_whole(cfg, inputs, alone, scale)[1]["loss"]), state.memory
     if float(loss) < float(memory["loss"]):
-        memory |= {"R": state.params.R, "t": state.params.t, "loss": loss}
-    return Poses(memory["R"], memory["t"]), {"loss": memory["loss"]}
+        memory |= {**vars(state.params), "loss": loss}
+    return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
 
 
 def _loops(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
@@ -294,6 +253,7 @@ def _round(
     frames: Int64[Tensor, "g f"],
     scale: float,
     rng: torch.Generator | None = None,
+    guess: float = 0.0,
 ) -> tuple[Scene, Float[Tensor, " g"]]:
     """Find the frontier, triangulate, adjust; also the loss per observation of every group [pixels^2]."""
     g, f = frames.shape
@@ -309,10 +269,11 @@ def _round(
     both = joined(tracks, touching)
     weight = torch.cat([torch.ones(len(tracks)), torch.full((len(touching),), cfg.frontier)]).double()
     group = torch.cat([group, touching.frame[::2] // f])
-    sigma = cfg.centre * inputs.shapes.radius[frames] * _focal(inputs.capture)
-    problem = Problem(camera, both, group, weight, inputs.shapes.centre[frames], sigma, cfg.depth, 1.5 * inputs.radius)
+    sigma = cfg.centre * inputs.shapes.radius[frames] * focal_length(inputs.capture)
+    centre, reach = inputs.shapes.centre[frames], 1.5 * inputs.radius
+    problem = Problem(camera, both, group, weight, centre, sigma, cfg.depth, reach, guess)
     X = bundle.triangulate(both, R, t, camera, inputs.shapes.radius[flat])
-    moved, price = bundle.adjust(problem, Scene(scene.R, scene.t, X), steps=cfg.iterations, scale=scale)
+    moved, price = bundle.adjust(problem, replace(scene, X=X), steps=cfg.iterations, scale=scale)
     total = torch.zeros(g, dtype=torch.float64).index_add_(0, group[both.point], weight)
     return moved, price / total.clamp_min(1)
 
@@ -337,7 +298,7 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
     limit = max(CONTRADICTS * float(before.median()), FORGIVEN)
     # Frames that went astray together agree with each other: only those beyond doubt may judge.
     trusted = (before <= limit) & stretch
-    turns, middle = hypotheses(), _on_axis(inputs.capture, inputs.shapes)
+    turns, middle = hypotheses(), on_axis(inputs.capture, inputs.shapes)
     changed = 0
     for k in [*range(seed, n), *range(seed - 1, -1, -1)]:
         if trusted[k] or int(trusted.sum()) < FEW:
@@ -356,21 +317,22 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
             R[k], t[k] = R_new, t_new
             changed += 1
         trusted[k] = after <= limit
-    return Poses(R, t), {"relocated": float(changed)}
+    return replace(state.params, R=R, t=t), {"relocated": float(changed)}
 
 
 def judged(inputs: Inputs, trajectory: Trajectory) -> Tracked:
     """Poses of another route as if this one had found them."""
     T_cam_obj = trajectory.T_cam_obj
     t = T_cam_obj.xyz.double()
-    poses = Poses(T_cam_obj.rotation.matrix().double(), t / t[:, 2].mean())
+    poses = Poses(T_cam_obj.rotation.matrix().double(), t / t[:, 2].mean(), torch.zeros((), dtype=torch.float64))
     return finish(Config(), inputs, State(0, poses, None, torch.Generator().manual_seed(0)))
 
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Tracked:
     """Poses in the object's own unit and frame, its points, and how far to trust them."""
-    solution = Solution(state.params.R, state.params.t, inputs.radius, _drift(cfg, inputs, state))
+    drift, inputs = _drift(cfg, inputs, state), through(inputs, state.params.log_focal)
+    solution = Solution(state.params.R, state.params.t, inputs.radius, drift)
     return finished(inputs.capture, inputs.tracks, inputs.outline, solution)
 
 
@@ -380,7 +342,8 @@ def _drift(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
     for weight in (cfg.frontier / PREFERENCE, cfg.frontier * PREFERENCE):
         alone = State(0, state.params, None, torch.Generator().manual_seed(0), state.memory)
         for scale in cfg.preferring:
-            alone.params, _ = _whole(replace(cfg, frontier=weight), inputs, alone, scale)
+            seen = through(inputs, alone.params.log_focal)
+            alone.params, _ = _whole(replace(cfg, frontier=weight), seen, alone, scale)
         preferred.append(SO3.from_matrix(alone.params.R).inverse())
     a, b = preferred
     return angle_between(b, mean_rotation(b @ a.inverse()) @ a)

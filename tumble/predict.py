@@ -70,7 +70,7 @@ def predict(
 
 
 def aligned(
-    estimated: Trajectory, names: tuple[str, ...], capture: Capture, truth: Truth, *, given: bool
+    estimated: Trajectory, names: tuple[str, ...], capture: Capture, truth: Truth, *, given: bool, lens: float = 1.0
 ) -> tuple[Similarity | None, str]:
     """How the true object frame relates to the asset's, from training frames alone, and that in words.
 
@@ -78,6 +78,8 @@ def aligned(
         estimated: The asset's trajectory.
         names: Its frames.
         given: Whether the run took the capture's poses: nothing is aligned then.
+        lens: The capture's focal length over the run's. Views are seen through the capture's camera: distances along
+            its axis change by as much, so that the object is seen as large as the run saw it.
     """
     if given:
         xyz = estimated.T_cam_obj.xyz
@@ -89,15 +91,23 @@ def aligned(
         return None, "views: not rendered, for without true poses of training frames the object frame is unknown"
     true = truth.poses.select([places[names[i]] for i in shared])
     try:
-        found = metrics.register(estimated.select(shared), true)
+        found = metrics.register(_through(lens, estimated.select(shared)), true)
     except ValueError as reason:
         return None, f"views: not rendered; {reason}"
     angle = math.degrees(float(found.R_true_pred.angle()))
+    seen = "" if lens == 1 else f"depths times {lens:.4g}, the true focal length over the run's; "
     return found, (
         f"views: rendered at the true poses, brought into the run's object frame by what aligns its {len(shared)} "
         f"training poses: rotation alone ({angle:.1f} degrees), then scale ({float(found.scale):.4g}) and shift; "
-        "normals and light turned back by it"
+        f"{seen}normals and light turned back by it"
     )
+
+
+def _through(lens: float, trajectory: Trajectory) -> Trajectory:
+    """The poses at which a lens of another focal length sees the object in the same place, as large."""
+    T_cam_obj = trajectory.T_cam_obj
+    xyz = T_cam_obj.xyz * T_cam_obj.xyz.new_tensor([1.0, 1.0, lens])
+    return trajectory if lens == 1 else replace(trajectory, T_cam_obj=replace(T_cam_obj, xyz=xyz))
 
 
 def _relit(

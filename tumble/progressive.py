@@ -16,7 +16,7 @@ from tumble.loop import State
 from tumble.match import Match
 from tumble.track import Config
 
-VERSION = 2
+VERSION = 3
 AIM = 128
 """Size of the virtual frames [pixels]."""
 

@@ -103,7 +103,8 @@ def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe
     if trajectory is None:
         tracked, key = _track(opened, capture, capture_path, content)
         kept = torch.where(~tracked.health.lost)[0].tolist()
-        capture, trajectory, keys = capture.select(kept), tracked.trajectory.select(kept), [key]
+        trajectory, keys = tracked.trajectory.select(kept), [key]
+        capture = replace(capture.select(kept), camera=tracked.camera)
     else:
         cfg = replace(cfg, rates=replace(cfg.rates, poses=0.0), realignments=0)
     refined = run.stage(opened, 2, "refine", refine, cfg, refine.Inputs(capture, trajectory), keys)
@@ -132,6 +133,10 @@ def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) 
     lost = int(health.lost.sum())
     about = {"lost": lost, "verdict": health.verdict, "axis": health.observability.sentence}
     run.log(opened, {"name": "track", "event": "health", **about, "degrees": math.degrees(health.uncertainty)})
+    focal, guess = (float(camera.fx_fy_cx_cy[0]) for camera in (tracked.camera, capture.camera))
+    if focal != guess:
+        said = f"focal length {focal:.0f} pixels (estimated; the guess was {guess:.0f})"
+        run.log(opened, {"name": "track", "event": "focal", "pixels": focal, "guess": guess, "said": said})
     if len(capture) - lost < LEAST_TRACKED:
         rule = f"could not be tracked: {lost} of {len(capture)} frames contradict the others"
         raise BadFile(capture_path, rule, "film an object with more texture or shape, in smaller turns")
@@ -184,11 +189,26 @@ def _predict(out: Path, known: evaluate.Subject) -> str:
     asset, names = finished(out), source_names(out, known.capture)
     own_frame = any(out.glob("1-*")) or (out / run.CAPTURE / ingest.PROVENANCE).is_file()
     given = known.capture.trajectory is not None and not own_frame
-    alignment, words = predict.aligned(asset.trajectory, names, known.capture, known.truth, given=given)
+    lens = _lens(out, asset, known.capture)
+    alignment, words = predict.aligned(asset.trajectory, names, known.capture, known.truth, given=given, lens=lens)
     cfg = _relighting(out)
     prediction = predict.predict(cfg, asset, known.capture, known.truth, alignment, names=names)
     prediction.write(out / PREDICTION)
     return words
+
+
+def _lens(out: Path, asset: Asset, capture: Capture) -> float:
+    """The capture's focal length over the run's, in the same pixels; 1 of a film whose focal length is no guess."""
+    focal, _, cx, _ = asset.camera.fx_fy_cx_cy.tolist()
+    whole, note = asset.camera.width, out / run.CAPTURE / ingest.PROVENANCE
+    if note.is_file():
+        said = files.read_json(note)
+        if said.get("focal_source") != "guess":
+            return 1.0
+        # The lens of a film looks through its middle, of which the run's pictures are a window.
+        _, left, _, width = said["window_top_left_height_width"]
+        whole = 2 * (cx + left * asset.camera.width / width)
+    return float(capture.camera.fx_fy_cx_cy[0]) / (focal * capture.camera.width / whole)
 
 
 def source_names(out: Path, capture: Capture) -> tuple[str, ...]:

@@ -60,8 +60,8 @@ class Story:
     """Lines of the run's log."""
     recipe: dict[str, Any]
     """Settings by stage."""
-    focal_source: str = ""
-    """Where the capture's focal length is from, as docs/format.md has it; empty where nobody said."""
+    guess: float | None = None
+    """The capture's focal length where it is a guess [pixels]."""
 
 
 def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Health | None = None) -> Path:
@@ -78,11 +78,11 @@ def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Healt
     path = capture or Path(known["capture"]["path"])
     if not path.exists():
         raise BadFile(path, "is the run's capture and is gone", "say where it is: --capture")
-    taken = of_run(which(path).load(path), asset, list(files.read_json(out / "poses.json")), path)
+    whole = which(path).load(path)
+    taken = of_run(whole, asset, list(files.read_json(out / "poses.json")), path)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
-    document = path / "transforms.json"
-    said = files.read_json(document).get("focal_source", "") if document.is_file() else ""
-    story = Story(name, run.records(out), known["recipe"], said)
+    guess = float(whole.camera.fx_fy_cx_cy[0]) if whole.focal_guessed else None
+    story = Story(name, run.records(out), known["recipe"], guess)
     with tempfile.TemporaryDirectory() as folder:
         glb = model(asset, Path(folder))
         build(asset, taken, glb, story, health, out / REPORT)
@@ -180,11 +180,13 @@ def _fill(template: str, parts: dict[str, str]) -> str:
 def _facts(asset: Asset, capture: Capture, story: Story) -> str:
     seconds = sum(_seconds(story.records).values())
     camera = asset.camera
-    focal = f"{float(camera.fx_fy_cx_cy[0]):.0f} pixels"
+    focal = float(camera.fx_fy_cx_cy[0])
+    said = "" if story.guess is None else ", a guess"
+    said = f" (estimated; the guess was {story.guess:.0f})" if story.guess not in (None, focal) else said
     facts = {
         "Frames": f"{len(capture)}",
         "Size": f"{camera.width} x {camera.height}",
-        "Focal length": f"{focal}, a guess" if story.focal_source == "guess" else focal,
+        "Focal length": f"{focal:.0f} pixels{said}",
         "Light stands still with": {"camera": "the camera", "object": "the object"}[asset.trajectory.light],
         "Gaussians": f"{len(asset.gaussians):,}".replace(",", " "),
         "Time": _duration(seconds) if seconds else "-",

@@ -186,9 +186,11 @@ def key(stage_name: str, version: int, cfg: Any, input_keys: Sequence[str]) -> s
 
 
 def capture_key(capture: Capture) -> str:
-    """A hash of what a capture shows: images, masks, camera, poses, names of the frames, and who carries the light."""
+    """A hash of what a capture shows: images, masks, camera, poses, names of the frames, and who carries the light; and
+    of whether its focal length is a guess."""
     digest = hashlib.sha256()
     facts = {"names": capture.names, "light": capture.light, "size": (capture.camera.height, capture.camera.width)}
+    facts |= {"focal": "guess"} if capture.focal_guessed else {}
     digest.update(json.dumps(facts, sort_keys=True).encode())
     for name, x in tree.named_tensors(capture).items():
         digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())

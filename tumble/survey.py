@@ -57,7 +57,8 @@ class Options:
     weights: Path | None = None
     """Checkpoint of sam2 or sam3."""
     focal: float | None = None
-    """Focal length in pixels of the film. Left out: from `fov`, else the metadata, else a guess (a phone's 28 mm)."""
+    """Focal length in pixels of the film. Left out: from `fov`, else the metadata, else found with the poses, from a
+    guess (a phone's 28 mm)."""
     fov: float | None = None
     """Horizontal field of view [degrees]."""
     fisheye: tuple[float, float, float, float] | None = None

@@ -182,6 +182,8 @@ class Window:
             self.capture = _capture(self.out)
         if (stamp, self.capture is None) != self.stamp:
             self.stamp = stamp, self.capture is None
+            if self.capture is not None and (self.out / "1-track" / run.OUT).is_file():
+                self.capture = replace(self.capture, camera=tree.load(Tracked, self.out / "1-track" / run.OUT).camera)
             self.look = look(self.out, self.capture)
             self._cameras()
             self.map.options = tuple(self.look.colours) or ("as photographed",)

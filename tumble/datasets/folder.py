@@ -64,7 +64,8 @@ def load(path: Path | str) -> Capture:
     lens = _lens(document, frames[0])
     images, masks = _photographs(document, frames, lens)
     names = tuple(_name(frame) for frame in frames)
-    return Capture(images, masks, lens.camera, names, document.light, _poses(document, frames))
+    guessed = document.fields.get("focal_source") == "guess"
+    return Capture(images, masks, lens.camera, names, document.light, _poses(document, frames), guessed)
 
 
 def load_truth(path: Path | str) -> Truth | None:
