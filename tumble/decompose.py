@@ -1,8 +1,8 @@
 """Stage 3: albedo, roughness and light, by physically based deferred shading of the refined Gaussians (section 4.3).
 
 Every step shades some pixels of one frame: the light of that frame is the environment seen through `R_env_obj`, and
-so is the light that other parts of the object send on (deviation from the paper's frame-averaged radiance: a point's
-radiance changes with the pose). Visibility is cached per Gaussian over several turned sets of shared directions.
+so is the light that other parts of the object send on (the paper averages that over frames; it changes with the pose).
+Visibility is cached per Gaussian over several turned sets of shared directions.
 """
 
 import math
@@ -42,7 +42,7 @@ FAINT = 0.2
 """Share of a dielectric's highlight below which it hardly counts as one."""
 ALBEDO = (0.003, 0.98)
 """At the start. Printed red has a green of 0.004: a start well above it costs 0.6 dB, for the logit has far to go."""
-FITTED = 32  # frames from which the strength of the highlight is found at the start
+FITTED = 32  # frames from which the highlight is found at the start
 MOVED = 0.3
 """Of `trace.moved`, beyond which visibility is traced anew."""
 
@@ -56,9 +56,8 @@ class Weights:
     material: float = 0.25
     """Edge-aware smoothness of albedo and roughness."""
     highlight: float = 0.01
-    """Price of a highlight, whatever its strength. A third of one lowers the photometric term of a Lambertian bottle by
-    3 %, for it stands in for a sun that the map blurs, and costs 2 dB of albedo; a real one lowers that term by half.
-    """
+    """Price of a highlight, whatever its strength. On a Lambertian bottle a third of one stands in for a sun that the
+    map blurs: it lowers the photometric term by 3 % and costs 2 dB of albedo. A real one lowers that term by half."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ class Config:
     roughness: float = 0.4
     """At the start. The data hardly say: a light too blurred under a lobe too narrow fits as well."""
     fitted: bool = False
-    """Whether the highlight's strength is found in closed form at the start: better only where roughness is known."""
+    """Whether the highlight's width and strength are found at the start by trying them (`highlight.fit`)."""
     brightness: float = 0.8
     """Brightest albedo at the start (95 %); the light takes up the rest. Their product is all that stage 2 knows."""
     visibility: bool = True
@@ -124,11 +123,8 @@ class Params:
     environment: Environment
     poses: Float[Tensor, "t 6"]
     log_tint: Float[Tensor, "3"]
-    """How much brighter the highlight is than light and f0 as they stand make it.
-
-    The diffuse lobe shows the product of albedo and light. How it is shared out only the highlight says, which has the
-    colour of the light alone; a descent texel by texel hardly moves along that valley.
-    """
+    """How much brighter the highlight is than light and f0 as they stand make it: what says how the product of albedo
+    and light, which the diffuse lobe shows, is shared out. A descent texel by texel hardly moves along that valley."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +167,9 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 @torch.no_grad()
 def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Bring the highlight to the strength that fits best under the light as it is, and the albedos with it."""
+    """Bring the highlight to the width and strength that fit best under the light as it is, and the albedos with it."""
     params, capture, parts = state.params, inputs.capture, []
+    widths = sorted({cfg.roughness, *highlight.ROUGHNESS})
     for number in range(0, len(capture), -(-len(capture) // FITTED)):
         T_cam_obj = pose(params, inputs, number)
         view = buffers_of(params, T_cam_obj, capture.camera)
@@ -180,16 +177,21 @@ def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # the outermost pixels mix in the background
         points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, inner, state.rng))
         R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
-        share = (0.0, white), (DIELECTRIC, 0 * white)
-        diffuse, specular = (_shaded(cfg, state, params, view, points, R_env_obj, x, f0) for f0, x in share)
-        parts.append((_shown(view, points), diffuse, specular, linear_from_srgb(points.sample(truth.image))))
-    found = highlight.fit(highlight.Samples(*map(torch.cat, zip(*parts, strict=True))), len(params.gaussians.means))
-    if found is None:
+        shades = [(view, white, 0.0)]
+        for width in widths:
+            rough = {"roughness": torch.full_like(view.features["roughness"], width)}
+            shades.append((replace(view, features=view.features | rough), 0 * white, DIELECTRIC))
+        diffuse, *specular = (_shaded(cfg, state, params, v, points, R_env_obj, a, f0) for v, a, f0 in shades)
+        parts.append((_shown(view, points), diffuse, torch.stack(specular), points.sample(truth.image)))
+    gaussian, diffuse, specular, photograph = zip(*parts, strict=True)
+    samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photograph)))
+    if (found := highlight.fit(highlight.Samples(*samples), len(params.gaussians.means))) is None:
         return
-    shift = (params.log_tint.exp() - found.strength) * found.slope
-    logits = torch.logit((params.material.albedo + shift[:, None]).clamp(*ALBEDO))
-    params.material.albedo_logits.copy_(TEMPERATURE * logits)
-    params.log_tint.copy_(found.strength.log())
+    before, after = params.log_tint.exp() * found.slope[widths.index(cfg.roughness)], found.slope[found.which]
+    albedo = params.material.albedo + (before - found.strength * after)[:, None]
+    params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*ALBEDO)))
+    params.material.roughness_logits.fill_(TEMPERATURE * torch.logit(torch.tensor(widths[found.which])))
+    params.log_tint.fill_(math.log(found.strength))
 
 
 def _rates(cfg: Config) -> dict[str, float]:
@@ -298,8 +300,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     }
     slow = 0.1 ** (state.step / cfg.steps)
     joined = slow * (state.step >= cfg.warmup)
-    rates = {"material": slow, "environment": slow, "log_tint": slow, "gaussians": joined, "poses": joined}
-    optim.anneal(state.optimizer, rates)
+    optim.anneal(state.optimizer, {"": slow, "gaussians": joined, "poses": joined})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
 
@@ -307,9 +308,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 def _draw(cfg: Config, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
     """Some pixels that show the object for sure."""
     solid = torch.where(((view.alpha > 0.5) & (mask > 0.5)).flatten())[0]
-    if not len(solid):
-        return solid
-    return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
+    n = cfg.pixels if len(solid) else 0
+    return solid[torch.randint(max(1, len(solid)), (n,), generator=rng).to(solid.device)]
 
 
 def _shaded(

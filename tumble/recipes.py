@@ -166,10 +166,9 @@ def averaging(recipe: Recipe) -> Recipe:
 
 
 def fitted_highlight(recipe: Recipe) -> Recipe:
-    """Variant: all starts at roughness 0.5, and the highlight's strength is found in closed form."""
+    """Variant: the highlight's width and strength are found by trying them at the start; its tint then hardly moves."""
     assert isinstance(recipe.decompose, Decompose), "a variant of the method, not of a baseline"
-    rates = replace(recipe.decompose.rates, tint=0.02)
-    return _decomposing(recipe, fitted=True, roughness=0.5, rates=rates)
+    return _decomposing(recipe, fitted=True, rates=replace(recipe.decompose.rates, tint=0.01))
 
 
 def progressive_poses(recipe: Recipe) -> Recipe:
