@@ -65,9 +65,7 @@ def write_clip(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, qual
                     codec = stream.codec_context
                     codec.colorspace, codec.color_primaries, codec.color_trc = BT709, BT709, BT709
                     codec.color_range = LIMITED_RANGE
-                # The conversion reads beyond the last row: what lies there would show in its corner.
-                room = np.concatenate([values, np.zeros_like(values[:1])])
-                frame = VideoFrame.from_numpy_buffer(room[: len(values)], "rgb24")
+                frame = VideoFrame.from_ndarray(np.ascontiguousarray(values), "rgb24")
                 film.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)))
             if stream is not None:
                 film.mux(stream.encode())
