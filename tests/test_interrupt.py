@@ -47,8 +47,8 @@ def finished_run(out: Path) -> dict[str, str]:
 
 
 def content(path: Path) -> bytes:
-    """What a file says; safetensors writes the facts of its header in any order, x264 the same frames in other bits, and
-    now and then the last sample of a corner one level off: of films the means of their frames count."""
+    """What a file says; safetensors writes the facts of its header in any order, x264 the same frames in other bits,
+    and now and then the last sample of a corner one level off: of films the means of their frames count."""
     if path.suffix == ".mp4":
         return str([(frame.shape, round(float(frame.mean()), 1)) for frame in video.read_clip(path)]).encode()
     if path.suffix != ".safetensors":
