@@ -72,7 +72,8 @@ def test_chosen_pixels_are_those_of_the_whole() -> None:
     whole = shade.surface(view, T_cam_obj, CAMERA)
     some = shade.surface(view, T_cam_obj, CAMERA, pixels=whole.pixels[10:20])
     for one, two in zip(vars(some).values(), vars(whole).values(), strict=True):
-        assert torch.equal(one, two[10:20])
+        # Where the vectors of a product end depends on how many there are: the last digit is not the same everywhere.
+        torch.testing.assert_close(one, two[10:20], atol=1e-6, rtol=0)
 
 
 # Closed forms ---------------------------------------------------------------------------------------------------------
