@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from tests.surfaces import GAMMA, look_at, sphere, torus
-from tests.test_shade import CAMERA, F0, ball, grey, lamp, rms, uniform
+from tests.test_shade import CAMERA, F0, ball, grey, lamp, rms, seen_by_all, uniform
 from tumble import importance, shade
 from tumble.directions import fibonacci_sphere, random_rotation, texel_solid_angles
 from tumble.environment import Environment
 from tumble.gaussians import Gaussians
 from tumble.prefilter import prefilter
 from tumble.rasterize import rasterize
+from tumble.shade import Bounce
 from tumble.trace import build, open_sky
 
 NOBODY = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
@@ -103,7 +104,8 @@ def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_ba
     light, tracer = importance.light_sampler(uniform()), build(gaussians, GAMMA)
     # Specular light on top of white would be more than the furnace holds: no f0.
     rough = torch.ones(1000, 1)
-    bounce = importance.GlossyBounce(torch.ones(1000, 3), rough, prefilter(uniform()))
+    diffuse = Bounce(torch.ones(1000, 3), seen_by_all(gaussians))
+    bounce = importance.GlossyBounce(diffuse, rough, prefilter(uniform()))
     found = [
         importance.relight_surface(
             seen,

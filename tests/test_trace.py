@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.surfaces import GAMMA, MAJOR, MINOR, look_at, sphere, torus
+from tumble import harmonics
 from tumble import trace as tracing
 from tumble.camera import Camera
 from tumble.directions import fibonacci_sphere
@@ -152,8 +153,7 @@ def test_surface_points_lie_on_the_surface_that_is_seen(buried: float) -> None:
     """A second shell under the sphere dominates no pixel; its points come up to the seen surface."""
     outer, inner = sphere(1000), sphere(300, radius=1 - buried)
     gaussians = Gaussians(*(torch.cat(pair) for pair in zip(vars(outer).values(), vars(inner).values(), strict=True)))
-    views = [(rasterize(gaussians, GAMMA, look_at(eye), CAMERA, {}), look_at(eye), CAMERA) for eye in EYES]
-    points = tracing.surface_points(gaussians, views, alpha_min=0.5)
+    points = tracing.surface_points(gaussians, GAMMA, map(look_at, EYES), CAMERA)
     # The mean depth stands 0.01 above the sphere where discs overlap, a tangent plane another 0.01 beside its point.
     assert (points.norm(dim=-1) - 1).abs().max() < 0.025
     # The point is the Gaussian's own, no further along the surface than its width.
@@ -161,6 +161,25 @@ def test_surface_points_lie_on_the_surface_that_is_seen(buried: float) -> None:
     tracer = tracing.build(gaussians, GAMMA)
     fraction = tracing.visibility(tracer, points, gaussians.normals, DIRECTIONS).fraction(gaussians.normals)
     assert fraction.mean() > 0.985
+
+
+def test_transfer_is_the_irradiance_of_what_is_seen() -> None:
+    """Under a light of degree 2, with all of the sky and with the half that is brighter."""
+    normals, directions = fibonacci_sphere(9), fibonacci_sphere(4096)
+    coefficients = torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
+    light = harmonics.basis(directions, 2) @ coefficients
+    cosine = (normals @ directions.T).clamp(min=0)
+    bright = directions[:, 0] > 0.2
+    closed = torch.tensor(
+        [sum((1 << j) - (1 << 32) * (j == 31) for j in range(32) if word[j]) for word in bright.unflatten(0, (-1, 32))]
+    )
+    half = tracing.Visibility(directions, closed.int().expand(9, -1), None)
+    for sky, seen in ((tracing.open_sky(directions, 9), torch.ones(4096)), (half, bright.float())):
+        truth = 4 * math.pi / 4096 * (cosine * seen) @ light
+        torch.testing.assert_close(tracing.transfer([sky], normals) @ coefficients, truth, atol=1e-3, rtol=0)
+    opened = tracing.transfer([tracing.open_sky(directions, 9)], normals) @ coefficients
+    series = harmonics.series(harmonics.irradiance_coefficients(coefficients), normals)
+    torch.testing.assert_close(opened, series, atol=0.01, rtol=0)
 
 
 def test_no_gaussians_block_nothing() -> None:

@@ -31,11 +31,11 @@ from tumble.rasterize import rasterize
 from tumble.refine import Refined, frame
 from tumble.se3 import SE3
 from tumble.shade import AveragedBounce, Bounce, Surface, shade_split, surface
-from tumble.trace import Visibility, build, moved, open_sky, surface_points, visibility
+from tumble.trace import Visibility, build, moved, open_sky, surface_points, transfer, visibility
 from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 
-VERSION = 7
+VERSION = 8
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 FAINT = 0.2
@@ -218,13 +218,9 @@ def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace what every Gaussian sees, from the surface that it stands for."""
     if not cfg.visibility:
         return
-    params, camera = state.params, inputs.capture.camera
-    gaussians = params.gaussians
-    views = []
-    for number in range(len(inputs.capture)):
-        T_cam_obj = pose(params, inputs, number)
-        views.append((rasterize(gaussians, params.gamma, T_cam_obj, camera, {}), T_cam_obj, camera))
-    points = surface_points(gaussians, views, alpha_min=0.5)
+    params, gaussians = state.params, state.params.gaussians
+    poses = [pose(params, inputs, number) for number in range(len(inputs.capture))]
+    points = surface_points(gaussians, params.gamma, poses, inputs.capture.camera)
     tracer = build(gaussians, params.gamma)
     seen = [
         visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce != "none")
@@ -233,6 +229,7 @@ def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
     state.memory["bits"] = torch.stack([v.bits for v in seen])
     state.memory |= {f"traced.{name}": x.detach().clone() for name, x in named_tensors(gaussians).items()}
     if cfg.bounce != "none":
+        state.memory["transfer"] = transfer(seen, gaussians.normals)
         state.memory["blocker"] = torch.stack([v.blocker for v in seen if v.blocker is not None])
 
 
@@ -330,7 +327,7 @@ def _shaded(
         R_env_obj,
         _seen(cfg, state, _shown(view, points)),
         f0=f0,
-        bounce=_bounce(cfg, params),
+        bounce=_bounce(cfg, state, params),
     )
 
 
@@ -339,12 +336,12 @@ def _shown(view: Buffers, points: Surface) -> Tensor:
     return view.dominant.flatten()[points.pixels].clamp_min(0).long()
 
 
-def _bounce(cfg: Config, params: Params) -> Bounce | AveragedBounce | None:
+def _bounce(cfg: Config, state: State, params: Params) -> Bounce | AveragedBounce | None:
     if cfg.bounce == "none":
         return None
     if cfg.bounce == "average":
         return AveragedBounce(params.gaussians.sh[:, 0] / math.sqrt(4 * math.pi))
-    return Bounce(params.material.albedo.mean(1), params.gaussians.normals)
+    return Bounce(params.material.albedo.mean(1), state.memory["transfer"])
 
 
 def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:

@@ -12,16 +12,18 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from tumble import brdf
-from tumble.directions import equirect_from_direction, texel_directions, texel_solid_angles
+from tumble.directions import equirect_from_direction, fibonacci_sphere, texel_directions, texel_solid_angles
 from tumble.environment import Environment
 from tumble.prefilter import Prefiltered
-from tumble.shade import Surface, specular
+from tumble.shade import Bounce, Surface, specular
 from tumble.trace import Tracer, trace
 
 RAYS = 1 << 18
 """Rays at once: bounds memory to some 300 MB, changes nothing else."""
 CELL_ROWS = 512
 """Rows of cells aimed at: a million cells in all."""
+BOUNCE_DIRECTIONS = 256
+"""Of the light of what stands in the way, in harmonics to degree 2."""
 HARMONIOUS = 1.2207440846057596
 """Root of x^4 = x + 1: the fractions of its powers fill the unit cube evenly."""
 
@@ -88,10 +90,9 @@ def light_sampler(environment: Environment) -> LightSampler:
 
 @dataclass(frozen=True)
 class GlossyBounce:
-    """What Gaussians in the way send on: both lobes, by the split sum, themselves lit from everywhere."""
+    """What Gaussians in the way send on: the diffuse lobe in their own shade, the other by the split sum."""
 
-    albedo: Float[Tensor, "n 3"]
-    """Linear base colour of every Gaussian."""
+    diffuse: Bounce
     roughness: Float[Tensor, "n 1"]
     prefiltered: Prefiltered
 
@@ -121,7 +122,7 @@ def relight_surface(
         bounce: What stands in the way; black when None.
     """
     shift = torch.rand(len(surface.points), 1, 3, generator=generator, dtype=albedo.dtype, device=generator.device)
-    diffuse = None if bounce is None else _diffuse(bounce, tracer, R_env_obj)
+    diffuse = None if bounce is None else _diffuse(bounce, R_env_obj)
     chunk = max(1, RAYS // (n_brdf + n_light))
     parts = [albedo.new_zeros(0, 3)]
     for at in torch.arange(len(surface.points), device=albedo.device).split(chunk):
@@ -167,10 +168,10 @@ def _arriving(
     return arriving.index_add(0, met, (1 - hits.transmittance[met])[:, None] * shine)
 
 
-def _diffuse(bounce: GlossyBounce, tracer: Tracer, R_env_obj: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3"]:
-    """Diffuse radiance of every Gaussian. The lobe of roughness 1 is the cosine: irradiance / pi."""
-    n_env = tracer.gaussians.normals @ R_env_obj.mT
-    return bounce.albedo * bounce.prefiltered.lookup(n_env, torch.ones_like(n_env[:, :1]))
+def _diffuse(bounce: GlossyBounce, R_env_obj: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3"]:
+    """Diffuse radiance of every Gaussian."""
+    directions = fibonacci_sphere(BOUNCE_DIRECTIONS).to(R_env_obj)
+    return bounce.diffuse.radiance(directions, bounce.prefiltered.cells(directions @ R_env_obj.mT))
 
 
 def _lattice(n: int) -> Float64[Tensor, "n 3"]:

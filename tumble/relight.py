@@ -21,9 +21,14 @@ from tumble.importance import GlossyBounce, light_sampler, relight_surface
 from tumble.material import TEMPERATURE
 from tumble.prefilter import prefilter
 from tumble.se3 import SE3, SO3
-from tumble.shade import Surface, shade_split, surface
-from tumble.trace import build, open_sky
+from tumble.shade import Bounce, Surface, shade_split, surface
+from tumble.trace import Tracer, build, open_sky, surface_points, transfer, visibility
 from tumble.trajectory import Trajectory, opengl_from_opencv
+
+SEEN_FROM = 64
+"""Most frames from which the points are found that Gaussians stand for."""
+SKY_DIRECTIONS = 512
+"""In which what a Gaussian sees is traced."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,8 @@ def relight(
     assert material is not None, "an asset with material"
     tracer = build(asset.gaussians, asset.gamma)
     sampler = light_sampler(environment)
-    bounce = GlossyBounce(material.albedo.mean(1), material.roughness.mean(1, keepdim=True), prefilter(environment))
+    diffuse = Bounce(material.albedo.mean(1), _transfer(asset, tracer))
+    bounce = GlossyBounce(diffuse, material.roughness.mean(1, keepdim=True), prefilter(environment))
     generator = torch.Generator().manual_seed(seed)
     for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
         shaded = relight_surface(
@@ -126,6 +132,15 @@ def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
     albedo = (material.albedo * albedo_scale).clamp(1e-4, 0.999)
     logits = TEMPERATURE * torch.logit(albedo)
     return replace(asset, material=replace(material, albedo_logits=logits))
+
+
+def _transfer(asset: Asset, tracer: Tracer) -> Float[Tensor, "n 9"]:
+    """What every Gaussian sees of the light, from the surface that it stands for in frames of the capture."""
+    frames = range(0, len(asset.trajectory), -(-len(asset.trajectory) // SEEN_FROM))
+    poses = [asset.trajectory.T_cam_obj[i] for i in frames]
+    points = surface_points(asset.gaussians, asset.gamma, poses, asset.camera)
+    directions = fibonacci_sphere(SKY_DIRECTIONS).to(points)
+    return transfer([visibility(tracer, points, asset.gaussians.normals, directions)], asset.gaussians.normals)
 
 
 def _surfaces(

@@ -85,24 +85,25 @@ def surface(
 
 @dataclass(frozen=True)
 class Bounce:
-    """Diffuse light from whatever stands in the way, one bounce, itself lit from everywhere."""
+    """Diffuse light from whatever stands in the way, itself in its own shade."""
 
     albedo: Float[Tensor, "n 3"]
     """Linear base colour of every Gaussian."""
-    normals: Float[Tensor, "n 3"]
-    """Unit normals, object frame."""
+    transfer: Float[Tensor, "n 9"]
+    """What every Gaussian sees of the light: `trace.transfer`."""
 
     def radiance(self, directions: Float[Tensor, "D 3"], light: Float[Tensor, "D 3"]) -> Float[Tensor, "n 3"]:
         """Radiance of every Gaussian under light from directions of equal area.
 
-        Nothing shades a Gaussian itself. Its irradiance is that of harmonics to degree 2, within 1 % of the
-        integral for most lights (Ramamoorthi and Hanrahan 2001).
+        Irradiance is that of harmonics to degree 2, within 1 % of the integral for most lights (Ramamoorthi and
+        Hanrahan 2001). What a Gaussian does not see of the sky is taken to be as bright as itself, which sums all
+        bounces (Jimenez et al. 2016): in grooves one bounce alone is too dark, and an open sky too bright.
         """
-        Y = harmonics.basis(directions, 2)
-        coefficients = 4 * math.pi / len(directions) * (Y.mT @ light)
-        irradiance = harmonics.series(harmonics.irradiance_coefficients(coefficients), self.normals)
+        coefficients = 4 * math.pi / len(directions) * (harmonics.basis(directions, 2).mT @ light)
         # Under a single lamp the truncated series dips below zero on the far side.
-        return self.albedo / math.pi * irradiance.clamp(min=0)
+        irradiance = (self.transfer @ coefficients).clamp(min=0)
+        sky = (self.transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+        return self.albedo / math.pi * irradiance / (1 - self.albedo * (1 - sky)).clamp(min=1e-3)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ Rays start from the surface that a camera sees, lifted along its normal. They ne
 some centres lie under the surface, and what they see is the Gaussians above them.
 """
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,11 +17,11 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
-from tumble import backends
+from tumble import backends, harmonics
 from tumble.backends import Backend, Hits
-from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.gaussians import Gaussians, opacity
+from tumble.rasterize import rasterize
 from tumble.se3 import SE3
 
 OFFSET = 1.5
@@ -159,8 +160,24 @@ def visibility(
 
 
 @torch.no_grad()
+def transfer(skies: Sequence[Visibility], normals: Float[Tensor, "p 3"]) -> Float[Tensor, "p 9"]:
+    """What points make of light that is given in harmonics to degree 2: `transfer @ coefficients` is their irradiance,
+    in their own shade (precomputed radiance transfer, Sloan et al. 2002).
+
+    Args:
+        skies: What they see under several sets of directions, of which the mean is taken.
+        normals: Outward unit normals, object frame.
+    """
+    total = normals.new_zeros(len(normals), 9)
+    for sky in skies:
+        seen = (normals @ sky.directions.T).clamp(min=0) * sky.unpacked()
+        total += 4 * math.pi / len(sky.directions) * (seen @ harmonics.basis(sky.directions, 2))
+    return total / len(skies)
+
+
+@torch.no_grad()
 def surface_points(
-    gaussians: Gaussians, views: Iterable[tuple[Buffers, SE3, Camera]], *, alpha_min: float
+    gaussians: Gaussians, gamma: Float[Tensor, ""], poses: Iterable[SE3], camera: Camera, *, alpha_min: float = 0.5
 ) -> Float[Tensor, "n 3"]:
     """The point of the visible surface that each Gaussian stands for, object frame [object radius].
 
@@ -168,12 +185,14 @@ def surface_points(
     dominates none is lifted along the normal of its nearest neighbour that does, up to that one's tangent plane.
 
     Args:
-        views: Rendered views that together show all sides.
+        gamma: Sharpness of the opacity [1 / object radius].
+        poses: `T_cam_obj` of views that together show all sides.
         alpha_min: Least coverage of a pixel that counts.
     """
     means, normals = gaussians.means, gaussians.normals
     total, count = torch.zeros_like(means), means.new_zeros(len(gaussians))
-    for buffers, T_cam_obj, camera in views:
+    for T_cam_obj in poses:
+        buffers = rasterize(gaussians, gamma, T_cam_obj, camera, {})
         at = torch.where((buffers.alpha >= alpha_min) & (buffers.dominant >= 0))
         x_cam = camera.unproject(camera.pixel_centers()[at].to(means), buffers.depth[at])
         index = buffers.dominant[at].long()
