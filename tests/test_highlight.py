@@ -55,11 +55,16 @@ def test_a_highlight_like_the_diffuse_light_tells_nothing() -> None:
     assert highlight.fit(even, 200) is None
 
 
+def test_a_strength_beyond_all_that_are_tried_is_not_believed() -> None:
+    assert highlight.fit(made(3.0), 200) is None
+
+
 def test_the_slope_keeps_what_the_pixels_show() -> None:
     """Where highlight and diffuse light are nearly proportional, taking one for the other changes pixels little."""
     samples = made(1.0)
     specular = 0.2 * samples.diffuse * (1 + 0.3 * (torch.arange(len(samples.gaussian)) % 2 - 0.5))[:, None]
-    both = Samples(samples.gaussian, samples.diffuse, torch.stack([specular, 2 * specular]), samples.photograph)
+    seen = 0.4 * samples.diffuse + specular
+    both = Samples(samples.gaussian, samples.diffuse, torch.stack([specular, 2 * specular]), seen)
     found = fit(both, 201).slope
     torch.testing.assert_close(found[0, :200].mean(0), torch.full((3,), 0.2), atol=0.02, rtol=0)
     torch.testing.assert_close(found[1], 2 * found[0])

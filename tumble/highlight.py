@@ -71,7 +71,10 @@ def fit(samples: Samples, n: int) -> Fit | None:
         for bound in (0.0, -math.inf)
     )
     which = int(bounded.amin(1).argmin())
-    strength = STRENGTHS[int(free[which].argmin())]
+    at = int(free[which].argmin())
+    if at in (0, len(STRENGTHS) - 1):
+        return None  # errors of the light look like a highlight that grows and grows
+    strength = STRENGTHS[at]
     x, s = samples.diffuse, samples.specular[which]
     _, weight = _left(samples, s, strength, n, -math.inf)
     slope = torch.stack([_albedos(samples, weight, y, n) for y in samples.specular])

@@ -57,6 +57,7 @@ STANDARD = replace(
         steps=10_000,
         warmup=2_000,
         doublings=3,
+        fitted=True,
         weights=DecomposeWeights(light=0.02, material=0.02),
         rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
     ),
@@ -85,6 +86,7 @@ DRAFT = replace(
         warmup=1_000,
         directions=256,
         doublings=1,
+        fitted=True,
         weights=DecomposeWeights(light=0.002, material=0.01),
         rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
     ),
@@ -165,10 +167,9 @@ def averaging(recipe: Recipe) -> Recipe:
     return replace(recipe, decompose=average.Config())
 
 
-def fitted_highlight(recipe: Recipe) -> Recipe:
-    """Variant: the highlight's width and strength are found by trying them at the start; its tint then hardly moves."""
-    assert isinstance(recipe.decompose, Decompose), "a variant of the method, not of a baseline"
-    return _decomposing(recipe, fitted=True, rates=replace(recipe.decompose.rates, tint=0.01))
+def descended_highlight(recipe: Recipe) -> Recipe:
+    """Ablation: the highlight starts as it does in the paper, at one width, and is left to the descent."""
+    return _decomposing(recipe, fitted=False)
 
 
 def progressive_poses(recipe: Recipe) -> Recipe:
@@ -191,5 +192,5 @@ ABLATIONS = {
     "no-sdf": no_sdf,
     "full-light": full_light,
     "averaging": averaging,
-    "fitted-highlight": fitted_highlight,
+    "descended-highlight": descended_highlight,
 }
