@@ -62,7 +62,7 @@ def measure(capture: Path, run: Path, recipe: Recipe, about: dict[str, Any]) -> 
     """One row: reconstruct if need be, predict, score."""
     reconstruct(capture, run, recipe)
     # Of a run that went on, all sittings count.
-    seconds = sum(record["seconds"] for record in records(run) if record.get("event") == "done")
+    seconds = sum({r["name"]: r["seconds"] for r in records(run) if r.get("event") == "done"}.values())
     begun = time.perf_counter()
     report = evaluate_run(run, capture, run)
     note = files.read_json(capture / NOTE)
