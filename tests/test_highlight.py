@@ -59,6 +59,14 @@ def test_a_strength_beyond_all_that_are_tried_is_not_believed() -> None:
     assert highlight.fit(made(3.0), 200) is None
 
 
+def test_print_that_would_be_darker_than_black_is_a_contradiction() -> None:
+    """As where normals are wrong: what is bright in the highlight is too bright, and the rest too dark."""
+    samples = made(1.4, dark=0.7)
+    haze = (samples.photograph - 0.03 * samples.diffuse).clamp(min=0)
+    wrong = Samples(samples.gaussian, samples.diffuse, samples.specular[1:2], haze)
+    assert highlight.fit(wrong, 200) is None
+
+
 def test_the_slope_keeps_what_the_pixels_show() -> None:
     """Where highlight and diffuse light are nearly proportional, taking one for the other changes pixels little."""
     samples = made(1.0)
