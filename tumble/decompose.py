@@ -35,7 +35,7 @@ from tumble.trace import Visibility, build, moved, open_sky, surface_points, tra
 from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 
-VERSION = 8
+VERSION = 9
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 FAINT = 0.2
@@ -185,9 +185,10 @@ def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
         parts.append((_shown(view, points), diffuse, torch.stack(specular), points.sample(truth.image)))
     gaussian, diffuse, specular, photograph = zip(*parts, strict=True)
     samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photograph)))
-    if (found := highlight.fit(highlight.Samples(*samples), len(params.gaussians.means))) is None:
+    tint, start, n = params.log_tint.exp(), widths.index(cfg.roughness), len(params.gaussians.means)
+    if (found := highlight.fit(highlight.Samples(*samples), n, start, float(tint.mean()))) is None:
         return
-    before, after = params.log_tint.exp() * found.slope[widths.index(cfg.roughness)], found.slope[found.which]
+    before, after = tint * found.slope[start], found.slope[found.which]
     albedo = params.material.albedo + (before - found.strength * after)[:, None]
     params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*ALBEDO)))
     params.material.roughness_logits.fill_(TEMPERATURE * torch.logit(torch.tensor(widths[found.which])))
