@@ -73,10 +73,10 @@ def fit(samples: Samples, n: int, which: int, strength: float) -> Fit | None:
     pulls it down by a tenth.
     """
     bounded, free = (
-        torch.stack([torch.stack([_left(samples, s, k, n, bound)[0] for k in STRENGTHS]) for s in samples.specular])
+        torch.stack([torch.stack([left_over(samples, s, k, n, bound)[0] for k in STRENGTHS]) for s in samples.specular])
         for bound in (0.0, -math.inf)
     )
-    if bounded.min() > (1 - GAIN) * _left(samples, samples.specular[which], strength, n, 0.0)[0]:
+    if bounded.min() > (1 - GAIN) * left_over(samples, samples.specular[which], strength, n, 0.0)[0]:
         return None
     which = int(bounded.amin(1).argmin())
     at = int(free[which].argmin())
@@ -84,14 +84,14 @@ def fit(samples: Samples, n: int, which: int, strength: float) -> Fit | None:
         return None  # blurred light and filled grooves look like a highlight that grows and grows
     strength = STRENGTHS[at]
     x, s = samples.diffuse, samples.specular[which]
-    _, weight = _left(samples, s, strength, n, -math.inf)
+    _, weight = left_over(samples, s, strength, n, -math.inf)
     slope = torch.stack([_albedos(samples, weight, y, n) for y in samples.specular])
     rest = s - slope[which][samples.gaussian] * x
     told = ((weight * rest.square()).sum(0) / (weight * s.square()).sum(0).clamp_min(1e-12)).mean()
     return Fit(which, strength, slope) if told > TOLD else None
 
 
-def _left(
+def left_over(
     samples: Samples, specular: Float[Tensor, "p 3"], strength: float, n: int, bound: float
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "p 3"]]:
     """What a highlight leaves over when every Gaussian has the albedo that suits it best, no lower than a bound: mean

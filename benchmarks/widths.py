@@ -1,0 +1,61 @@
+"""How well the frames tell the width of the highlight: what each width that stage 3 tries leaves over.
+
+`python -m benchmarks.widths CAPTURE... --runs FOLDER` takes stage 2 from runs of `benchmarks.decomposition`. A row per
+capture: the least mean absolute error [thousandths of sRGB] at each roughness, over all strengths, and that of the
+highlight as stage 2 left it (`highlight.fit`).
+"""
+
+import argparse
+from pathlib import Path
+from unittest.mock import patch
+
+import torch
+
+from benchmarks.kernels import machine
+from tumble import decompose, files, highlight, refine, tree
+from tumble.datasets import folder
+from tumble.highlight import ROUGHNESS, STRENGTHS, Samples
+from tumble.recipes import DRAFT
+
+
+class Found(Exception):
+    """Ends stage 3 once its samples are there."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--runs", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    arguments = parser.parse_args()
+    rows = []
+    for capture in arguments.captures:
+        rows.append({"capture": capture.name, **errors(capture, arguments.runs / f"{capture.name}-draft-0")})
+        print(rows[-1], flush=True)
+        command = "python -m benchmarks.widths CAPTURE... --runs FOLDER"
+        files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
+
+
+def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
+    """What is left over at each width, and as stage 2 left it."""
+
+    def compare(samples: Samples, n: int, which: int, strength: float) -> None:
+        def left(width: int, strength: float) -> float:
+            return round(1000 * float(highlight.left_over(samples, samples.specular[width], strength, n, 0.0)[0]), 3)
+
+        widths = {str(r): min(left(i, s) for s in STRENGTHS) for i, r in enumerate(ROUGHNESS)}
+        raise Found({"as_stage_2": left(which, strength), "by_roughness": widths})
+
+    refined = tree.load(refine.Refined, run / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(folder.load(capture), refined)
+    assert isinstance(DRAFT.decompose, decompose.Config), "DRAFT is the method, not a baseline"
+    with patch.object(highlight, "fit", compare):
+        try:
+            decompose.init(DRAFT.decompose, inputs, torch.Generator().manual_seed(0))
+        except Found as found:
+            return found.args[0]
+    return {}
+
+
+if __name__ == "__main__":
+    main()
