@@ -2,7 +2,7 @@
 
 Both kinds of samples are weighted by the balance heuristic, so that a mirror under a cloudy sky and chalk under the
 sun converge alike. Every sample is a ray through the Gaussians; light that is blocked is replaced by what the blocking
-Gaussians send on, one bounce, by the split sum. Not differentiable.
+Gaussians send on (`GlossyBounce`). Not differentiable.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Pictures of a decomposed object under any light (paper section 4.4): BRDF and light importance sampling, one bounce.
+"""Pictures of a decomposed object under any light (paper section 4.4): BRDF and light importance sampling.
 
 Two grades of the same: `relight` draws 512 + 512 rays per pixel; `preview` takes the split sum, without rays.
 """
