@@ -306,8 +306,9 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 def _draw(cfg: Config, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
     """Some pixels that show the object for sure."""
     solid = torch.where(((view.alpha > 0.5) & (mask > 0.5)).flatten())[0]
-    n = cfg.pixels if len(solid) else 0
-    return solid[torch.randint(max(1, len(solid)), (n,), generator=rng).to(solid.device)]
+    if not len(solid):
+        return solid
+    return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
 
 
 def _shaded(

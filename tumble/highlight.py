@@ -72,14 +72,15 @@ def fit(samples: Samples, n: int, which: int, strength: float) -> Fit | None:
     wide would like them to be; the strength is then taken without that bound, for dark print that may only err upwards
     pulls it down by a tenth.
     """
-    bounded, free = (
-        torch.stack([torch.stack([left_over(samples, s, k, n, bound)[0] for k in STRENGTHS]) for s in samples.specular])
-        for bound in (0.0, -math.inf)
-    )
+
+    def left(specular: Tensor, bound: float) -> Tensor:
+        return torch.stack([left_over(samples, specular, k, n, bound)[0] for k in STRENGTHS])
+
+    bounded = torch.stack([left(specular, 0.0) for specular in samples.specular])
     if bounded.min() > (1 - GAIN) * left_over(samples, samples.specular[which], strength, n, 0.0)[0]:
         return None
     which = int(bounded.amin(1).argmin())
-    at = int(free[which].argmin())
+    at = int(left(samples.specular[which], -math.inf).argmin())
     if at in (0, len(STRENGTHS) - 1):
         return None  # blurred light and filled grooves look like a highlight that grows and grows
     strength = STRENGTHS[at]
