@@ -20,10 +20,10 @@ from tumble.asset import Asset
 from tumble.capture import OBJECT, Truth
 from tumble.confidence import confidence
 from tumble.datasets import which
-from tumble.decompose import buffers_of
 from tumble.images import srgb_from_linear
 from tumble.rasterize import rasterize
 from tumble.run import RECIPE
+from tumble.views import buffers_of
 
 COUNTS = ("views", "lights", "halves")
 """Fields of `Confidence`."""

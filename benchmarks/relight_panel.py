@@ -24,13 +24,13 @@ from tests import devtools
 from tumble import files, metrics, reconstruct, relight
 from tumble.asset import Asset
 from tumble.camera import Camera
-from tumble.decompose import buffers_of
 from tumble.directions import texel_directions
 from tumble.environment import Environment
 from tumble.images import srgb_from_linear
 from tumble.run import RECIPE
 from tumble.se3 import SE3, SO3
 from tumble.trajectory import Trajectory, opengl_from_opencv
+from tumble.views import buffers_of
 
 SPOT = (0.8, 0.5, 0.4)
 """Camera axes: x right, y up, z to the viewer."""

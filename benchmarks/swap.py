@@ -31,12 +31,12 @@ from tumble.asset import Asset
 from tumble.buffers import Buffers
 from tumble.capture import Capture
 from tumble.datasets import folder
-from tumble.decompose import buffers_of
 from tumble.environment import Environment
 from tumble.images import srgb_from_linear
 from tumble.loop import State
 from tumble.material import TEMPERATURE
 from tumble.recipes import DRAFT
+from tumble.views import antialiased
 
 GIVEN = ("nothing", "roughness", "light", "both", "geometry", "all")
 ROWS = 32
@@ -120,7 +120,7 @@ def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
 def score(asset: Asset, truth: Any, capture: Capture) -> dict[str, Any]:
     """Of the shared evaluation views."""
     numbers = truth.views("shared")
-    views = [buffers_of(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
+    views = [antialiased(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
     normals = torch.stack([normalize(view.normal, dim=-1) for view in views])
     psnr, scale = albedo_psnr(views, truth)
     angles = metrics.normal_angles(normals, truth.normals[numbers])[truth.foreground[numbers]]

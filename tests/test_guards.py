@@ -19,7 +19,7 @@ LAYERS = [
     {"capture", "asset", "match"},
     {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"}
     | {"texture", "symmetry"},
-    {"prefilter", "shade", "importance", "mesh", "hull"},
+    {"prefilter", "shade", "importance", "mesh", "hull", "views"},
     {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching", "comeback"}
     | {"pairwise", "averaging", "evidence", "bundle", "relocate", "gauge", "realign"},
     {"loop"},

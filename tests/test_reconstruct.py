@@ -23,6 +23,7 @@ from tumble import (
     reconstruct,
     refine,
     tree,
+    views,
 )
 from tumble import run as runs
 from tumble.asset import Asset
@@ -267,7 +268,7 @@ def test_averaging_finds_the_colour_that_every_frame_shows(finished: tuple[Path,
     flat = dataclasses.replace(taken, images=grey)
     refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
     asset = loop.drive(average, average.Config(), decompose.Inputs(flat, refined), seed=0)
-    found = decompose.buffers_of(asset, refined.trajectory.T_cam_obj[0], taken.camera)
+    found = views.buffers_of(asset, refined.trajectory.T_cam_obj[0], taken.camera)
     # The linear value of code 128; an eighth of a frame's colour may come from its soft edge.
     inside = found.alpha > 0.99
     assert inside.sum() > 20

@@ -16,10 +16,10 @@ from torch.nn.functional import grid_sample, normalize
 from tumble.asset import Asset
 from tumble.buffers import Buffers
 from tumble.camera import Camera
-from tumble.decompose import buffers_of
 from tumble.images import srgb_from_linear
 from tumble.mesh import Unwrapped, around
 from tumble.se3 import SE3
+from tumble.views import buffers_of
 
 GRAZING = 0.2
 """Least cosine between normal and view that counts."""

@@ -18,7 +18,6 @@ from tumble import coarse_light, highlight, losses, optim
 from tumble.asset import Asset
 from tumble.backends import threads_for_kernels
 from tumble.buffers import Buffers
-from tumble.camera import Camera
 from tumble.capture import Capture
 from tumble.directions import fibonacci_sphere, random_rotation
 from tumble.environment import Environment
@@ -27,13 +26,13 @@ from tumble.images import linear_from_srgb
 from tumble.loop import State
 from tumble.material import DIELECTRIC, TEMPERATURE, Material
 from tumble.prefilter import prefilter
-from tumble.rasterize import rasterize
 from tumble.refine import Refined, frame
 from tumble.se3 import SE3
 from tumble.shade import AveragedBounce, Bounce, Surface, shade_split, surface
 from tumble.trace import Visibility, build, moved, open_sky, surface_points, transfer, visibility
 from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
+from tumble.views import buffers_of
 
 VERSION = 9
 LOOK_EVERY = 100
@@ -247,19 +246,6 @@ def pose(params: Params, inputs: Inputs, number: int) -> SE3:
     """`T_cam_obj` of one frame."""
     base = inputs.refined.trajectory.T_cam_obj[number]
     return SE3.exp(params.poses[number]) @ base if params.poses.requires_grad else base
-
-
-def buffers_of(asset: Asset | Params, T_cam_obj: SE3, camera: Camera) -> Buffers:
-    """One view's albedo, roughness and normal, with the detail of the normal added."""
-    material = asset.material
-    assert material is not None, "an asset with material"
-    features = {
-        "albedo": material.albedo,
-        "roughness": material.roughness[..., None],
-        "offset": material.normal_offset,
-    }
-    view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, features)
-    return replace(view, normal=view.normal + view.features["offset"])
 
 
 def uncornered(params: Params) -> Params:

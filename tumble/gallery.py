@@ -22,13 +22,13 @@ from tumble import rerender
 from tumble.asset import Asset
 from tumble.camera import Camera
 from tumble.confidence import Confidence
-from tumble.decompose import buffers_of
 from tumble.directions import texel_directions
 from tumble.environment import Environment
 from tumble.images import srgb_from_linear
 from tumble.rasterize import rasterize
 from tumble.rerender import Frame
 from tumble.trajectory import opengl_from_opencv
+from tumble.views import buffers_of
 
 SHOWN, HERO = 320, 448
 """Sides of rendered maps and of the picture at the top [pixels]."""

@@ -11,13 +11,13 @@ from torch.nn.functional import normalize
 from tumble import metrics, relight
 from tumble.asset import Asset
 from tumble.capture import Capture, Truth
-from tumble.decompose import buffers_of
 from tumble.environment import Environment
 from tumble.images import photograph
 from tumble.metrics import Similarity
 from tumble.prediction import Prediction
 from tumble.se3 import SO3
 from tumble.trajectory import Trajectory
+from tumble.views import antialiased
 
 SILHOUETTE = 0.5
 """Coverage from which a pixel counts as object."""
@@ -52,7 +52,7 @@ def predict(
     if alignment is None or truth.trajectory is None or not len(truth):
         return posed
     views = alignment.to_prediction(truth.trajectory)
-    buffers = [buffers_of(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
+    buffers = [antialiased(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
     coverage = torch.stack([view.alpha for view in buffers])
     # Maps reach as far as anything is known; where the object ends, the masks say.
     known = coverage >= cfg.alpha_min

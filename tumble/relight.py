@@ -14,7 +14,6 @@ from torch import Tensor
 from tumble.asset import Asset
 from tumble.buffers import Buffers
 from tumble.camera import Camera
-from tumble.decompose import buffers_of
 from tumble.directions import fibonacci_sphere
 from tumble.environment import Environment
 from tumble.importance import GlossyBounce, light_sampler, relight_surface
@@ -24,6 +23,7 @@ from tumble.se3 import SE3, SO3
 from tumble.shade import Bounce, Surface, shade_split, surface
 from tumble.trace import Tracer, build, open_sky, surface_points, transfer, visibility
 from tumble.trajectory import Trajectory, opengl_from_opencv
+from tumble.views import antialiased
 
 SEEN_FROM = 64
 """Most frames from which the points are found that Gaussians stand for."""
@@ -149,5 +149,5 @@ def _surfaces(
     """What each frame shows, and how its light is turned."""
     for i, R_env_obj in enumerate(trajectory.R_env_obj):
         T_cam_obj = trajectory.T_cam_obj[i]
-        view = buffers_of(asset, T_cam_obj, camera)
+        view = antialiased(asset, T_cam_obj, camera)
         yield view, surface(view, T_cam_obj, camera, alpha_min=cfg.alpha_min), R_env_obj

@@ -15,13 +15,13 @@ from tumble.asset import Asset
 from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.capture import OBJECT, UNKNOWN, Capture
-from tumble.decompose import buffers_of
 from tumble.directions import fibonacci_sphere
 from tumble.images import Box, crop, crop_box, linear_from_srgb, resize_area, srgb_from_linear
 from tumble.prefilter import Prefiltered, prefilter
 from tumble.shade import shade_split, surface
 from tumble.trace import Tracer, build, visibility
 from tumble.trajectory import env_from_obj
+from tumble.views import antialiased
 
 SIDE = 256
 """Longer side of a window, at most [pixels]: enough for a page, and for numbers of a whole frame."""
@@ -111,7 +111,7 @@ def render(scene: Scene, number: int, camera: Camera) -> tuple[Float[Tensor, "h 
     material, trajectory = scene.asset.material, scene.asset.trajectory
     assert material is not None, "an asset with material"
     T_cam_obj = trajectory.T_cam_obj[number]
-    view = buffers_of(scene.asset, T_cam_obj, camera)
+    view = antialiased(scene.asset, T_cam_obj, camera)
     points = surface(view, T_cam_obj, camera, alpha_min=0.1)
     directions = fibonacci_sphere(DIRECTIONS).to(view.alpha)
     shaded = shade_split(
