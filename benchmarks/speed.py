@@ -26,6 +26,7 @@ from tumble import decompose, files, metrics, optim, refine
 from tumble.capture import Capture, Truth
 from tumble.datasets import folder
 from tumble.images import srgb_from_linear
+from tumble.loop import State
 from tumble.rasterize import rasterize
 from tumble.recipes import DRAFT
 
@@ -36,6 +37,7 @@ PARTS = {
         "rendering": (refine, "render"),
         "losses": (refine, "_terms"),
         "densifying": (refine, "_densify"),
+        "visibility": (refine, "_look_around"),
         "backward pass and Adam": (optim, "descend"),
     },
     "decompose": {
@@ -99,7 +101,7 @@ def measure(path: Path) -> dict[str, Any]:
     assert truth is not None, "a capture with truth"
     assert capture.trajectory is not None, "a capture with known poses"
     inputs, clock, curve = refine.Inputs(capture, capture.trajectory), Clock(), []
-    refined, seconds = _staged(refine, DRAFT.refine, inputs, clock, curve, lambda p: _of_refine(p, capture, truth))
+    refined, seconds = _staged(refine, DRAFT.refine, inputs, clock, curve, lambda s: _of_refine(s, capture, truth))
     parts = {"refine": _shares(clock, seconds)}
     inputs = decompose.Inputs(capture, refined)
     _, last = _staged(
@@ -108,7 +110,7 @@ def measure(path: Path) -> dict[str, Any]:
         inputs,
         clock,
         curve,
-        lambda p: _of_decompose(decompose.shared_out(p), capture, truth),
+        lambda s: _of_decompose(decompose.shared_out(s.params), capture, truth),
     )
     parts["decompose"] = _shares(clock, last - seconds)
     return {
@@ -131,7 +133,7 @@ def _staged(
 
     def look(state: Any) -> None:
         with clock.stopped(), torch.no_grad():
-            curve.append({"stage": name, "seconds": round(clock.now(), 1), "step": state.step, **scored(state.params)})
+            curve.append({"stage": name, "seconds": round(clock.now(), 1), "step": state.step, **scored(state)})
 
     clock.parts.clear()
     with ExitStack() as patches:
@@ -155,12 +157,13 @@ def _shares(clock: Clock, seconds: float) -> dict[str, float]:
     return {**parts, "the rest": round(seconds - sum(clock.parts.values()), 1)}
 
 
-def _of_refine(params: refine.Params, capture: Capture, truth: Truth) -> dict[str, float]:
+def _of_refine(state: State, capture: Capture, truth: Truth) -> dict[str, float]:
     assert truth.trajectory is not None
-    albedo, image = torch.sigmoid(params.points.albedo_logits), []
+    params, sky, image = state.params, refine.sky(state), []
+    albedo = torch.sigmoid(params.points.albedo_logits)
     for number in truth.views("shared"):
         arguments = (truth.trajectory.T_cam_obj[number], truth.trajectory, capture.camera)
-        view = refine.render(params.points, params.gamma, params.light, *arguments)
+        view = refine.render(params.points, params.gamma, params.light, *arguments, sky=sky)
         rendered, photograph = srgb_from_linear(view.rgb).clamp(0, 1), truth.images[number] / 255
         image.append(metrics.psnr(rendered, photograph, truth.foreground[number]))
     gaussians = params.points.gaussians

@@ -16,10 +16,10 @@ LAYERS = [
     {"se3", "directions", "harmonics", "images", "video", "backends"},
     {"brdf", "camera", "trajectory"},
     {"gaussians", "material", "environment", "buffers", "coarse_light", "highlight"},
-    {"capture", "asset", "match"},
+    {"capture", "asset", "match", "photograph"},
     {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"}
     | {"texture", "symmetry"},
-    {"prefilter", "shade", "importance", "mesh", "hull", "views"},
+    {"prefilter", "shade", "importance", "mesh", "hull", "views", "shadow"},
     {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching", "comeback"}
     | {"pairwise", "averaging", "evidence", "bundle", "relocate", "gauge", "realign"},
     {"loop"},

@@ -10,10 +10,11 @@ from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.capture import BACKGROUND, OBJECT, Capture
 from tumble.coarse_light import CoarseLight
-from tumble.gaussians import Gaussians, constant_sh
+from tumble.gaussians import Gaussians, constant_sh, facing
 from tumble.images import srgb_from_linear
 from tumble.loop import State
-from tumble.refine import Config, Frame, Params, Points
+from tumble.photograph import Frame
+from tumble.refine import Config, Params, Points
 from tumble.se3 import SE3, SO3, angle_between
 from tumble.trajectory import Trajectory
 
@@ -63,7 +64,7 @@ def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
     rng = torch.Generator().manual_seed(1)
     means = torch.nn.functional.normalize(torch.randn(600, 3, generator=rng), dim=-1)
     flat = torch.tensor([-2.4, -2.4, -4.6]).expand(600, 3)
-    gaussians = Gaussians(means, refine._facing(means), flat, torch.full((600,), -0.1), constant_sh(means * 0))
+    gaussians = Gaussians(means, facing(means), flat, torch.full((600,), -0.1), constant_sh(means * 0))
     points = Points(gaussians, 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]])))
     gamma, light, camera = torch.tensor(30.0), CoarseLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
     axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])

@@ -15,8 +15,8 @@ from tumble.environment import Environment
 from tumble.images import linear_from_srgb
 from tumble.loop import State
 from tumble.material import TEMPERATURE, Material
+from tumble.photograph import frame
 from tumble.rasterize import rasterize
-from tumble.refine import frame
 
 VERSION = 1
 

@@ -25,8 +25,9 @@ from tumble.gaussians import Gaussians
 from tumble.images import linear_from_srgb
 from tumble.loop import State
 from tumble.material import DIELECTRIC, TEMPERATURE, Material
+from tumble.photograph import frame
 from tumble.prefilter import prefilter
-from tumble.refine import Refined, frame
+from tumble.refine import Refined
 from tumble.se3 import SE3
 from tumble.shade import AveragedBounce, Bounce, Surface, shade_split, surface
 from tumble.trace import Visibility, build, moved, open_sky, surface_points, transfer, visibility

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from tumble.se3 import SO3
 
@@ -95,3 +96,13 @@ def constant_sh(radiance: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     What a rasterizer reads back is `max(0, radiance)`.
     """
     return radiance[:, None] * math.sqrt(4 * math.pi)
+
+
+def facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Shortest rotations that take the third axis to given normals, wxyz."""
+    z = normals[:, 2:]
+    w = 1 + z
+    axis = torch.stack([-normals[:, 1], normals[:, 0], torch.zeros_like(normals[:, 0])], -1)
+    quats = torch.cat([w, axis], -1)
+    opposite = (w < 1e-4).expand_as(quats)
+    return normalize(torch.where(opposite, quats.new_tensor([0.0, 1.0, 0.0, 0.0]), quats), dim=-1)

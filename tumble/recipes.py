@@ -129,7 +129,8 @@ def static_colour(recipe: Recipe) -> Recipe:
 
 
 def no_visibility(recipe: Recipe) -> Recipe:
-    """Ablation: nothing shadows anything."""
+    """Ablation: nothing shadows anything, in either stage."""
+    recipe = replace(recipe, refine=replace(recipe.refine, shaded=1.0))
     return _decomposing(recipe, visibility=False, bounce="none")
 
 

@@ -17,17 +17,20 @@ from tumble import coarse_light, densify, hull, losses, optim
 from tumble.backends import threads_for_kernels
 from tumble.buffers import Buffers
 from tumble.camera import Camera
-from tumble.capture import OBJECT, UNKNOWN, Capture
+from tumble.capture import Capture
 from tumble.coarse_light import CoarseLight
-from tumble.gaussians import Gaussians, constant_sh, opacity, sdf_from_opacity
+from tumble.gaussians import Gaussians, constant_sh, facing, opacity, sdf_from_opacity
 from tumble.images import crop, crop_box, planes
 from tumble.loop import State
+from tumble.photograph import Frame, frame
 from tumble.rasterize import rasterize
 from tumble.realign import realign
 from tumble.se3 import SE3
+from tumble.shadow import Sky, look_around
 from tumble.trajectory import Trajectory, env_from_obj
 
-VERSION = 6
+VERSION = 7
+SEEN_FROM = 16  # frames, in tracing what Gaussians see
 OUTLINE = 0.3
 """Weight of coverage against colours where poses are realigned."""
 
@@ -114,6 +117,8 @@ class Config:
     """Gaussians below it are dropped."""
     least_weight: float = 0.05
     """Gaussians whose weight in no scored view reaches this are dropped [pixels]."""
+    shaded: float = 0.2
+    """Share of the run from which the object stands in its own shade (`shadow`); before, it is too coarse."""
     realignments: int = 0
     """How often, at even intervals, each pose is brought in line with its own frame (`realign`)."""
 
@@ -157,23 +162,6 @@ class Inputs:
     trajectory: Trajectory
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One photograph as the losses want it."""
-
-    image: Float[Tensor, "h w 3"]
-    """sRGB in [0, 1]."""
-    mask: Float[Tensor, "h w"]
-    valid: Float[Tensor, "h w 1"]
-
-
-def frame(capture: Capture, number: int, like: Tensor) -> Frame:
-    """Photograph `number` of a capture in the dtype and on the device of `like`."""
-    mask = capture.masks[number].to(like.device)
-    image = capture.images[number].to(like) / 255
-    return Frame(image, (mask == OBJECT).to(like), (mask != UNKNOWN).to(like)[..., None])
-
-
 def length(cfg: Config, inputs: Inputs) -> int:
     return cfg.steps
 
@@ -191,7 +179,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     k = 1 if cfg.colour == "light" else 16
     gaussians = Gaussians(
         means=start.positions,
-        quats=_facing(start.normals),
+        quats=facing(start.normals),
         log_scales=torch.stack([scale, scale, 0.1 * scale], -1).log(),
         sdf=sdf,
         sh=torch.cat([constant_sh(torch.full_like(start.positions, 0.2)), start.positions.new_zeros(n, k - 1, 3)], 1),
@@ -222,16 +210,6 @@ def _rates(cfg: Config) -> dict[str, float]:
     }
 
 
-def _facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Shortest rotations that take the third axis to given normals, wxyz."""
-    z = normals[:, 2:]
-    w = 1 + z
-    axis = torch.stack([-normals[:, 1], normals[:, 0], torch.zeros_like(normals[:, 0])], -1)
-    quats = torch.cat([w, axis], -1)
-    opposite = (w < 1e-4).expand_as(quats)
-    return normalize(torch.where(opposite, quats.new_tensor([0.0, 1.0, 0.0, 0.0]), quats), dim=-1)
-
-
 def pose(params: Params, inputs: Inputs, number: int) -> SE3:
     """`T_cam_obj` of one frame."""
     base = inputs.trajectory.T_cam_obj[number]
@@ -248,13 +226,17 @@ def render(
     trajectory: Trajectory,
     camera: Camera,
     mask: Tensor | None = None,
+    *,
+    sky: Sky | None = None,
 ) -> Buffers:
-    """One view with stage 2's colour, linear radiance."""
+    """One view with stage 2's colour, linear radiance; without a sky nothing shadows anything."""
     gaussians = points.gaussians
     if gaussians.sh.shape[1] == 1:
         R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
         view = normalize(T_cam_obj.inverse().xyz - gaussians.means, dim=-1)
         albedo = torch.sigmoid(points.albedo_logits)
+        if sky is not None:
+            albedo = albedo * sky.share(light, albedo, R_env_obj)
         colour = coarse_light.radiance(light, albedo, gaussians.normals, view, R_env_obj)
         gaussians = replace(gaussians, sh=constant_sh(colour))
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
@@ -266,18 +248,33 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     progress = state.step / cfg.steps
     if state.step and state.step % cfg.every == 0 and progress < cfg.until:
         _densify(cfg, inputs, state)
+    if state.step % cfg.every == 0 and progress >= cfg.shaded and cfg.colour == "light":
+        _look_around(inputs, state)
     if state.step in _realignments(cfg):
         _realign(inputs, state)
     params, camera = state.params, inputs.capture.camera
     number = _draw(state, len(inputs.capture))
     T_cam_obj = pose(params, inputs, number)
-    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera, sky=sky(state))
     terms = _terms(cfg, params, view, frame(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
     optim.anneal(state.optimizer, _annealed(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()} | {
         "gaussians": float(len(params.points.albedo_logits))
     }
+
+
+@torch.no_grad()
+def _look_around(inputs: Inputs, state: State) -> None:
+    params, n = state.params, len(inputs.capture)
+    poses = [pose(params, inputs, number) for number in range(0, n, -(-n // SEEN_FROM))]
+    found = look_around(params.points.gaussians, params.gamma, poses, inputs.capture.camera)
+    state.memory |= {"sky.seen": found.seen, "sky.whole": found.whole}
+
+
+def sky(state: State) -> Sky | None:
+    """What Gaussians saw when it was last traced."""
+    return Sky(state.memory["sky.seen"], state.memory["sky.whole"]) if "sky.seen" in state.memory else None
 
 
 def _draw(state: State, n: int) -> int:
@@ -342,11 +339,11 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     for number in numbers:
         T_cam_obj = pose(params, inputs, number)
         arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
-        first = render(*arguments)
+        first = render(*arguments, sky=sky(state))
         truth = frame(inputs.capture, number, first.alpha)
         error = (losses.developed(first.rgb, truth.image) - truth.image).abs().mean(-1)
         where = densify.bad_pixels(error, truth.mask, relative=cfg.bad, absolute=cfg.bad_floor)
-        bad += render(*arguments, mask=where).touched / len(numbers)
+        bad += render(*arguments, mask=where, sky=sky(state)).touched / len(numbers)
         weight = torch.maximum(weight, first.weight)
     drop = opacity(params.points.gaussians.sdf, params.gamma) < cfg.least_opacity
     # Ten views show about everything of a tumbling object; what none of them shows lies inside.
@@ -366,14 +363,17 @@ def _realignments(cfg: Config) -> list[int]:
 def _realign(inputs: Inputs, state: State) -> None:
     params, base = state.params, inputs.trajectory.T_cam_obj
     for number in range(len(inputs.capture)):
-        unexplained = partial(_unexplained, params, inputs, frame(inputs.capture, number, params.gamma))
+        unexplained = partial(_unexplained, params, inputs, frame(inputs.capture, number, params.gamma), sky(state))
         T_cam_obj = realign(unexplained, pose(params, inputs, number))
         params.poses[number] = (T_cam_obj @ base[number].inverse()).log()
 
 
-def _unexplained(params: Params, inputs: Inputs, truth: Frame, T_cam_obj: SE3) -> Float[Tensor, " r"]:
+def _unexplained(
+    params: Params, inputs: Inputs, truth: Frame, shade: Sky | None, T_cam_obj: SE3
+) -> Float[Tensor, " r"]:
     """Colours and, with less weight, coverage that a pose leaves over of a photograph, sRGB."""
-    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)
+    arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)
+    view = render(*arguments, sky=shade)
     colour = losses.developed(view.rgb, truth.image) - truth.image
     outline = OUTLINE * (view.alpha - truth.mask)[..., None]
     return (torch.cat([colour, outline], -1) * truth.valid).flatten()

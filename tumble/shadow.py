@@ -1,0 +1,62 @@
+"""How much of a coarse light reaches Gaussians that stand in the object's own shade: shadows for stage 2.
+
+Without them grooves and folds are dark to no purpose: stage 2 bends their normals away from the light, or paints them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tumble.camera import Camera
+from tumble.coarse_light import CoarseLight
+from tumble.directions import fibonacci_sphere
+from tumble.gaussians import Gaussians
+from tumble.se3 import SE3
+from tumble.shade import Bounce
+from tumble.trace import build, open_sky, surface_points, transfer, visibility
+
+DIRECTIONS = 256
+"""In which the sky is looked for, and from which the light is summed."""
+FLOOR = 0.03
+"""Of the mean irradiance, added above and below: where hardly any light falls a ratio says nothing."""
+BRIGHTEST = 2.0
+"""What light between parts may add at most, as a multiple of the light of an open sky."""
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What every Gaussian sees of the sky, and what it would see if nothing stood in the way: `trace.transfer`."""
+
+    seen: Float[Tensor, "n 9"]
+    whole: Float[Tensor, "n 9"]
+
+    @torch.no_grad()
+    def share(
+        self, light: CoarseLight, albedo: Float[Tensor, "n 3"], R_env_obj: Float[Tensor, "3 3"]
+    ) -> Float[Tensor, "n 3"]:
+        """Diffuse light in its own shade, with all bounces, over that of the open sky; not differentiable.
+
+        As a ratio it leaves the dependence on the normal to `coarse_light.radiance`, which is differentiable.
+        """
+        directions = fibonacci_sphere(DIRECTIONS).to(albedo)
+        radiance = light.glossy(directions @ R_env_obj.T)
+        shaded, whole = (Bounce(albedo, t).radiance(directions, radiance) for t in (self.seen, self.whole))
+        floor = FLOOR * albedo * radiance.mean(0)
+        return ((shaded + floor) / (whole + floor).clamp_min(1e-12)).clamp(max=BRIGHTEST)
+
+
+@torch.no_grad()
+def look_around(gaussians: Gaussians, gamma: Float[Tensor, ""], poses: Sequence[SE3], camera: Camera) -> Sky:
+    """Trace what every Gaussian sees, from the surface that it stands for.
+
+    Args:
+        gamma: Sharpness of the opacity [1 / object radius].
+        poses: `T_cam_obj` of views that together show all sides.
+    """
+    points, normals = surface_points(gaussians, gamma, poses, camera), gaussians.normals
+    directions = fibonacci_sphere(DIRECTIONS).to(points)
+    seen = visibility(build(gaussians, gamma), points, normals, directions)
+    return Sky(transfer([seen], normals), transfer([open_sky(directions, len(points))], normals))
