@@ -83,3 +83,27 @@ def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
     errors = np.degrees(angle_between(SO3(found), true.rotation).numpy())
     # A tenth of a pixel: the pictures are quantized, the masks hard.
     assert errors.max() < 0.25, errors
+
+
+def test_colours_turn_normals_by_a_share_of_their_gradient(monkeypatch) -> None:
+    """A Gaussian seen face to face under a light from the side: only its colour tells its normal."""
+    means = torch.zeros(1, 3)
+    gaussians = Gaussians(
+        means, torch.tensor([[1.0, 0.2, 0.1, 0.0]]), torch.full((1, 3), -1.5), torch.zeros(1), constant_sh(means)
+    )
+    light = CoarseLight.constant(0.4, means)
+    light.coefficients[3] = -0.8
+    T_cam_obj = SE3(torch.tensor([0.0, 1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
+    trajectory = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), "camera")
+    camera = Camera.from_fov(0.6, 24, 24)
+
+    def turned(share: float) -> torch.Tensor:
+        monkeypatch.setattr(refine, "HINT", share)
+        quats = gaussians.quats.clone().requires_grad_()
+        points = Points(Gaussians(means, quats, gaussians.log_scales, gaussians.sdf, gaussians.sh), means)
+        view = refine.render(points, torch.tensor(30.0), light, T_cam_obj, trajectory, camera)
+        return torch.autograd.grad(view.rgb.sum(), quats)[0]
+
+    none, some, all_of_it = (turned(share) for share in (0.0, 0.3, 1.0))
+    assert (all_of_it - none).norm() > 1e-3
+    torch.testing.assert_close(some, none + 0.3 * (all_of_it - none), atol=1e-5, rtol=1e-3)
