@@ -3,19 +3,21 @@
 Without them grooves and folds are dark to no purpose: stage 2 bends their normals away from the light, or paints them.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tumble import harmonics
 from tumble.camera import Camera
 from tumble.coarse_light import CoarseLight
 from tumble.directions import fibonacci_sphere
 from tumble.gaussians import Gaussians
 from tumble.se3 import SE3
-from tumble.shade import Bounce
 from tumble.trace import build, open_sky, surface_points, transfer, visibility
 
 DIRECTIONS = 256
@@ -41,11 +43,25 @@ class Sky:
 
         As a ratio it leaves the dependence on the normal to `coarse_light.radiance`, which is differentiable.
         """
-        directions = fibonacci_sphere(DIRECTIONS).to(albedo)
-        radiance = light.glossy(directions @ R_env_obj.T)
-        shaded, whole = (Bounce(albedo, t).radiance(directions, radiance) for t in (self.seen, self.whole))
-        floor = FLOOR * albedo * radiance.mean(0)
-        return ((shaded + floor) / (whole + floor).clamp_min(1e-12)).clamp(max=BRIGHTEST)
+        directions, projection = _grid(albedo.dtype, albedo.device)
+        radiance = light.glossy(directions @ R_env_obj.mT)
+        coefficients = projection @ radiance
+        floor = FLOOR * math.pi * radiance.mean(0)
+        shaded, whole = (self._lit(t, coefficients, albedo) + floor for t in (self.seen, self.whole))
+        return (shaded / whole.clamp_min(1e-12)).clamp_max(BRIGHTEST)
+
+    @staticmethod
+    def _lit(transfer: Tensor, coefficients: Tensor, albedo: Tensor) -> Tensor:
+        """As `shade.Bounce` over albedo / pi, with the sum over directions done once: it is asked for every step."""
+        sky = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+        return (transfer @ coefficients).clamp_min(0) / (1 - albedo * (1 - sky)).clamp_min(1e-3)
+
+
+@cache
+def _grid(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "D 3"], Float[Tensor, "9 D"]]:
+    """Directions, and what takes radiance from there to coefficients of harmonics."""
+    directions = fibonacci_sphere(DIRECTIONS).to(device, dtype)
+    return directions, 4 * math.pi / DIRECTIONS * harmonics.basis(directions, 2).mT
 
 
 @torch.no_grad()
