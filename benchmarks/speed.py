@@ -28,7 +28,7 @@ from tumble.datasets import folder
 from tumble.images import srgb_from_linear
 from tumble.loop import State
 from tumble.rasterize import rasterize
-from tumble.recipes import DRAFT
+from tumble.recipes import DRAFT, known_poses
 
 EVERY = 10.0
 """Seconds of work between two looks."""
@@ -101,7 +101,8 @@ def measure(path: Path) -> dict[str, Any]:
     assert truth is not None, "a capture with truth"
     assert capture.trajectory is not None, "a capture with known poses"
     inputs, clock, curve = refine.Inputs(capture, capture.trajectory), Clock(), []
-    refined, seconds = _staged(refine, DRAFT.refine, inputs, clock, curve, lambda s: _of_refine(s, capture, truth))
+    cfg = known_poses(DRAFT.refine)
+    refined, seconds = _staged(refine, cfg, inputs, clock, curve, lambda s: _of_refine(s, capture, truth))
     parts = {"refine": _shares(clock, seconds)}
     inputs = decompose.Inputs(capture, refined)
     _, last = _staged(

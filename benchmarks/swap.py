@@ -35,7 +35,7 @@ from tumble.environment import Environment
 from tumble.images import srgb_from_linear
 from tumble.loop import State
 from tumble.material import TEMPERATURE
-from tumble.recipes import DRAFT
+from tumble.recipes import DRAFT, known_poses
 from tumble.views import antialiased
 
 GIVEN = ("nothing", "roughness", "light", "both", "geometry", "all")
@@ -52,7 +52,7 @@ def main() -> None:
     rows = []
     for path in arguments.captures:
         capture, truth = folder.load(path), folder.load_truth(path)
-        refined = loop.drive(refine, DRAFT.refine, refine.Inputs(capture, _known(capture)), seed=0)
+        refined = loop.drive(refine, known_poses(DRAFT.refine), refine.Inputs(capture, _known(capture)), seed=0)
         true_surface = on_the_surface(path, capture) if {"geometry", "all"} & set(arguments.given) else refined
         for given in arguments.given:
             surface = true_surface if given in ("geometry", "all") else refined
@@ -109,7 +109,7 @@ def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
         points = torch.tensor(positions, dtype=torch.float32)
         return hull.OrientedPoints(points, normalize(torch.tensor(normals).float(), dim=-1), hull.spacing(points))
 
-    cfg = DRAFT.refine
+    cfg = known_poses(DRAFT.refine)
     rates = replace(cfg.rates, means=0.0, quats=0.0, sdf=0.0)
     cfg = replace(cfg, points=cfg.limit, limit=cfg.limit, every=cfg.steps, rates=rates)
     with patch.object(hull, "surface", surface):

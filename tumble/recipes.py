@@ -123,6 +123,11 @@ a heavier match term: the cracker box is 8 degrees off after 99 degrees of turn,
 QUALITIES = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 
 
+def known_poses(cfg: Refine) -> Refine:
+    """Stage 2 of captures whose poses are given: they stay as they are."""
+    return replace(cfg, rates=replace(cfg.rates, poses=0.0), realignments=0)
+
+
 def static_colour(recipe: Recipe) -> Recipe:
     """Ablation: the paper's radiance per Gaussian that does not know that the light stands still."""
     return replace(recipe, refine=replace(recipe.refine, colour="sh"))

@@ -39,7 +39,7 @@ from tumble.gauge import Tracked
 from tumble.health import Health
 from tumble.images import photograph
 from tumble.pairs import neighbours
-from tumble.recipes import Recipe
+from tumble.recipes import Recipe, known_poses
 from tumble.survey import Options
 from tumble.trajectory import Trajectory
 
@@ -106,7 +106,7 @@ def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe
         trajectory, keys = tracked.trajectory.select(kept), [key]
         capture = replace(capture.select(kept), camera=tracked.camera)
     else:
-        cfg = replace(cfg, rates=replace(cfg.rates, poses=0.0), realignments=0)
+        cfg = known_poses(cfg)
     refined = run.stage(opened, 2, "refine", refine, cfg, refine.Inputs(capture, trajectory), keys)
     keys = [run.key("refine", refine.VERSION, cfg, keys)]
     last = average if isinstance(recipe.decompose, average.Config) else decompose
