@@ -12,7 +12,6 @@ Of channels darker than 0.02 (linear), in the shared evaluation views, two pixel
 Nothing shadows anything here: meant for convex objects.
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from benchmarks.kernels import machine
-from tumble import files, metrics, tree
+from benchmarks import of_runs
+from tumble import metrics, tree
 from tumble.asset import Asset
 from tumble.datasets import folder
 from tumble.directions import fibonacci_sphere
 from tumble.images import linear_from_srgb, srgb_from_linear
+from tumble.material import DIELECTRIC
 from tumble.prefilter import prefilter
 from tumble.shade import shade_split, surface
 from tumble.trace import open_sky
@@ -35,31 +35,16 @@ from tumble.views import antialiased
 
 DARK, GRAZING = 0.02, 0.5
 DIRECTIONS = 1024
-F0 = 0.04
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("captures", type=Path, nargs="+")
-    parser.add_argument("--runs", type=Path, required=True)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    arguments = parser.parse_args()
-    rows = []
-    for path in arguments.captures:
-        asset = tree.load(Asset, arguments.runs / f"{path.name}-draft-0" / "3-decompose" / "out.safetensors")
-        rows.append({"capture": path.name} | dark_print(asset, path))
-        print(rows[-1], flush=True)
-    command = "python -m benchmarks.dark CAPTURE... --runs FOLDER"
-    files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
 
 
 @torch.no_grad()
-def dark_print(asset: Any, path: Path) -> dict[str, Any]:
-    """The row of one capture."""
-    capture = folder.load(path)
+def dark_print(path: Path, run: Path) -> dict[str, Any]:
+    """The row of one capture and its run."""
+    capture, asset = folder.load(path), tree.load(Asset, run / "3-decompose" / "out.safetensors")
     truth: Any = folder.load_truth(path)
-    for part in (truth.trajectory, truth.albedo, truth.light, truth.normals, truth.roughness, asset.environment):
-        assert part is not None, "a capture with all truth, a run with light"
+    assert asset.environment is not None, "a run with light"
+    for part in (truth.trajectory, truth.albedo, truth.light, truth.normals, truth.roughness):
+        assert part is not None, "a capture with all truth"
     numbers = truth.views("shared")
     lights = [prefilter(truth.light.resampled(64, 128)), prefilter(asset.environment)]
     parts = []
@@ -76,7 +61,7 @@ def dark_print(asset: Any, path: Path) -> dict[str, Any]:
         for view, light in zip((exact, mine), lights, strict=True):
             points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
             rough, white = points.sample(view.features["roughness"]), torch.ones_like(points.normals)
-            for albedo, f0 in ((white, 0.0), (0 * white, F0)):
+            for albedo, f0 in ((white, 0.0), (0 * white, DIELECTRIC)):
                 lobes.append(shade_split(points, albedo, rough, light, R_env_obj, sky, f0=f0))
         points = surface(exact, T_cam_obj, capture.camera, pixels=pixels)
         cosine = (points.normals * points.views).sum(-1, keepdim=True).expand(-1, 3)
@@ -113,4 +98,4 @@ def _row(
 
 
 if __name__ == "__main__":
-    main()
+    of_runs.main(__file__, __doc__, dark_print)

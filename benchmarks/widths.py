@@ -5,14 +5,13 @@ capture: the least mean absolute error [thousandths of sRGB] at each roughness, 
 highlight as stage 2 left it (`highlight.fit`).
 """
 
-import argparse
 from pathlib import Path
 from unittest.mock import patch
 
 import torch
 
-from benchmarks.kernels import machine
-from tumble import decompose, files, highlight, refine, tree
+from benchmarks import of_runs
+from tumble import decompose, highlight, refine, tree
 from tumble.datasets import folder
 from tumble.highlight import ROUGHNESS, STRENGTHS, Samples
 from tumble.recipes import DRAFT
@@ -20,20 +19,6 @@ from tumble.recipes import DRAFT
 
 class Found(Exception):
     """Ends stage 3 once its samples are there."""
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("captures", type=Path, nargs="+")
-    parser.add_argument("--runs", type=Path, required=True)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    arguments = parser.parse_args()
-    rows = []
-    for capture in arguments.captures:
-        rows.append({"capture": capture.name, **errors(capture, arguments.runs / f"{capture.name}-draft-0")})
-        print(rows[-1], flush=True)
-        command = "python -m benchmarks.widths CAPTURE... --runs FOLDER"
-        files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
 
 
 def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
@@ -58,4 +43,4 @@ def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
 
 
 if __name__ == "__main__":
-    main()
+    of_runs.main(__file__, __doc__, errors)

@@ -100,10 +100,17 @@ class Bounce:
         bounces (Jimenez et al. 2016): in grooves one bounce alone is too dark, and an open sky too bright.
         """
         coefficients = 4 * math.pi / len(directions) * (harmonics.basis(directions, 2).mT @ light)
-        # Under a single lamp the truncated series dips below zero on the far side.
-        irradiance = (self.transfer @ coefficients).clamp(min=0)
-        sky = (self.transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
-        return self.albedo / math.pi * irradiance / (1 - self.albedo * (1 - sky)).clamp(min=1e-3)
+        return self.albedo / math.pi * in_own_shade(self.transfer, coefficients, self.albedo)
+
+
+def in_own_shade(
+    transfer: Float[Tensor, "n 9"], coefficients: Float[Tensor, "9 3"], albedo: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Irradiance of surfaces under light in harmonics to degree 2, with all bounces between them: `Bounce.radiance`."""
+    # Under a single lamp the truncated series dips below zero on the far side.
+    irradiance = (transfer @ coefficients).clamp(min=0)
+    sky = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+    return irradiance / (1 - albedo * (1 - sky)).clamp(min=1e-3)
 
 
 @dataclass(frozen=True)

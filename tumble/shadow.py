@@ -18,6 +18,7 @@ from tumble.coarse_light import CoarseLight
 from tumble.directions import fibonacci_sphere
 from tumble.gaussians import Gaussians
 from tumble.se3 import SE3
+from tumble.shade import in_own_shade
 from tumble.trace import build, open_sky, surface_points, transfer, visibility
 
 DIRECTIONS = 256
@@ -47,14 +48,8 @@ class Sky:
         radiance = light.glossy(directions @ R_env_obj.mT)
         coefficients = projection @ radiance
         floor = FLOOR * math.pi * radiance.mean(0)
-        shaded, whole = (self._lit(t, coefficients, albedo) + floor for t in (self.seen, self.whole))
+        shaded, whole = (in_own_shade(t, coefficients, albedo) + floor for t in (self.seen, self.whole))
         return (shaded / whole.clamp_min(1e-12)).clamp_max(BRIGHTEST)
-
-    @staticmethod
-    def _lit(transfer: Tensor, coefficients: Tensor, albedo: Tensor) -> Tensor:
-        """As `shade.Bounce` over albedo / pi, with the sum over directions done once: it is asked for every step."""
-        sky = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
-        return (transfer @ coefficients).clamp_min(0) / (1 - albedo * (1 - sky)).clamp_min(1e-3)
 
 
 @cache
