@@ -78,3 +78,13 @@ def test_contradicting_silhouettes_are_named() -> None:
     empty = Capture(capture.images, nothing, capture.camera, capture.names, "camera", trajectory)
     with pytest.raises(ValueError, match="leave nothing standing"):
         hull.surface(hull.carve(empty, trajectory, resolution=16), 100, torch.Generator().manual_seed(0))
+
+
+def test_a_speck_of_one_cell_does_no_harm() -> None:
+    """It gets emptier on all sides alike, so its middle has no normal."""
+    inside = torch.zeros(40, 40, 40)
+    inside[5:13, 5:13, 5:13] = 1.0
+    inside[30, 30, 30] = 1.0
+    points = hull.surface(inside, 100, torch.Generator().manual_seed(0))
+    assert len(points.positions) == 100
+    torch.testing.assert_close(points.normals.norm(dim=-1), torch.ones(100))

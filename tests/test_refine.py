@@ -1,6 +1,8 @@
 """Stage 2: what one step computes."""
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -14,9 +16,12 @@ from tumble.gaussians import Gaussians, constant_sh, facing
 from tumble.images import srgb_from_linear
 from tumble.loop import State
 from tumble.photograph import Frame
+from tumble.recipes import SMOKE
 from tumble.refine import Config, Params, Points
 from tumble.se3 import SE3, SO3, angle_between
 from tumble.trajectory import Trajectory
+
+GAMMA = torch.tensor(30.0)
 
 
 def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkeypatch) -> None:
@@ -59,30 +64,55 @@ def test_a_picture_with_nothing_in_it_has_losses_too() -> None:
     assert refine._window(view, truth, camera) == (view, truth, camera, 1.0)
 
 
-def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
-    """Two of four photographs were taken half a degree and two degrees from where the run believes."""
+def ball() -> tuple[Points, SE3, Capture]:
+    """A ball with a pattern, four poses and what was photographed in them."""
     rng = torch.Generator().manual_seed(1)
     means = torch.nn.functional.normalize(torch.randn(600, 3, generator=rng), dim=-1)
     flat = torch.tensor([-2.4, -2.4, -4.6]).expand(600, 3)
-    gaussians = Gaussians(means, facing(means), flat, torch.full((600,), -0.1), constant_sh(means * 0))
+    gaussians = Gaussians(means, facing(means), flat, torch.zeros(600), constant_sh(means * 0))
     points = Points(gaussians, 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]])))
-    gamma, light, camera = torch.tensor(30.0), CoarseLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
     axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])
     true = SE3.from_rotation(SO3.exp(axes), torch.tensor([0.02, 0.05, 4.0]).expand(4, 3).contiguous())
-    turns = torch.tensor([[0.0, 0, 0], [0.0087, 0, 0], [0.0, 0, 0], [0.02, -0.02, 0.02]])
-    base = Trajectory(SE3.from_rotation(SO3.exp(turns) @ true.rotation, true.xyz), "camera")
-    views = [refine.render(points, gamma, light, true[k], base, camera) for k in range(4)]
+    light, camera = CoarseLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
+    views = [refine.render(points, GAMMA, light, true[k], Trajectory(true, "camera"), camera) for k in range(4)]
     images = torch.stack([(srgb_from_linear(v.rgb).clamp(0, 1) * 255).round().to(torch.uint8) for v in views])
     masks = torch.stack([torch.where(v.alpha > 0.5, OBJECT, BACKGROUND) for v in views]).to(torch.uint8)
-    capture = Capture(images, masks, camera, tuple("abcd"), "camera")
-    params = Params(points, gamma, light, torch.zeros(4, 6))
+    return points, true, Capture(images, masks, camera, tuple("abcd"), "camera")
+
+
+def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
+    """Two of four photographs were taken half a degree and two degrees from where the run believes."""
+    points, true, capture = ball()
+    turns = torch.tensor([[0.0, 0, 0], [0.0087, 0, 0], [0.0, 0, 0], [0.02, -0.02, 0.02]])
+    base = Trajectory(SE3.from_rotation(SO3.exp(turns) @ true.rotation, true.xyz), "camera")
+    params = Params(points, GAMMA, CoarseLight.constant(0.4, turns), torch.zeros(4, 6))
     inputs = refine.Inputs(capture, base)
     for _ in range(4):
-        refine._realign(inputs, State(0, params, None, rng, {}))
+        refine._realign(inputs, State(0, params, None, torch.Generator(), {}))
     found = torch.stack([refine.pose(params, inputs, k).rotation.wxyz for k in range(4)])
     errors = np.degrees(angle_between(SO3(found), true.rotation).numpy())
     # A tenth of a pixel: the pictures are quantized, the masks hard.
     assert errors.max() < 0.25, errors
+
+
+def test_what_no_frame_has_shown_since_the_last_densification_is_dropped() -> None:
+    _, true, capture = ball()
+    cfg = replace(SMOKE.refine, points=600, limit=600, importance=math.inf, every=1000)
+    inputs = refine.Inputs(capture, Trajectory(true, "camera"))
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+    shown = []
+    for state.step in range(1, 5):
+        refine.step(cfg, inputs, state)
+        shown.append(state.memory["shown"] > cfg.least_weight)
+    # What any frame shows stays shown, and every frame hides the ball's other side.
+    assert all((before <= after).all() for before, after in pairwise(shown))
+    assert 0.2 < shown[0].float().mean() < 0.8 * shown[3].float().mean()
+    state.memory["shown"][::3] = 0.9 * cfg.least_weight
+    # One view is scored; what it hides stays all the same.
+    refine._densify(replace(cfg, views=1), inputs, state)
+    left = len(state.params.points.albedo_logits)
+    assert left == (shown[3] & (torch.arange(600) % 3 > 0)).sum()
+    assert torch.equal(state.memory["shown"], torch.zeros(left))
 
 
 def test_colours_turn_normals_by_a_share_of_their_gradient(monkeypatch) -> None:
@@ -101,7 +131,7 @@ def test_colours_turn_normals_by_a_share_of_their_gradient(monkeypatch) -> None:
         monkeypatch.setattr(refine, "HINT", share)
         quats = gaussians.quats.clone().requires_grad_()
         points = Points(Gaussians(means, quats, gaussians.log_scales, gaussians.sdf, gaussians.sh), means)
-        view = refine.render(points, torch.tensor(30.0), light, T_cam_obj, trajectory, camera)
+        view = refine.render(points, GAMMA, light, T_cam_obj, trajectory, camera)
         return torch.autograd.grad(view.rgb.sum(), quats)[0]
 
     none, some, all_of_it = (turned(share) for share in (0.0, 0.3, 1.0))

@@ -78,7 +78,8 @@ def _crossings(inside: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "m 3"], Fl
         at[:, axis] += (0.5 - a) / (b - a)
         positions.append((at + 0.5) / resolution * 2 - 1)
         normals.append(outwards[tuple(index.T)])
-    return torch.cat(positions), normalize(torch.cat(normals), dim=-1)
+    known = torch.cat(normals).any(-1)  # a speck of one cell gets emptier on all sides alike
+    return torch.cat(positions)[known], normalize(torch.cat(normals)[known], dim=-1)
 
 
 def outward(inside: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z 3"]:

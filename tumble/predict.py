@@ -19,8 +19,10 @@ from tumble.se3 import SO3
 from tumble.trajectory import Trajectory
 from tumble.views import antialiased
 
-SILHOUETTE = 0.5
-"""Coverage from which a pixel counts as object."""
+SILHOUETTE = 0.55
+"""Coverage from which a pixel counts as object. Edges fade more slowly inwards than outwards, so half is too little: of
+ten thousand pixels of the chess knight it misses 17 and claims 57 too many, 0.55 32 and 38; mustard bottle 5 and 53,
+13 and 31."""
 
 
 @torch.no_grad()

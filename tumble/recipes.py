@@ -39,6 +39,14 @@ class Recipe:
 CREASE = 25.0
 """Normals that are 16 degrees apart count half."""
 
+PROJ = 0.1
+"""The paper's weight of the projection term (1) draws Gaussians to the depth of their neighbourhood, and fills grooves:
+albedo and normals at 1, 0.1 and 0 (sunny): chess knight 26.6, 27.1, 27.1 dB and 7.4, 6.8, 6.7 degrees; mustard bottle
+31.9, 32.4, 32.5 dB and 3.9, 3.5, 3.4 degrees; cracker box 25.9 and 25.9 dB at 1 and 0."""
+
+MASK = 3.0
+"""Of stage 3: at 0, 1, 3 and 10 the chess knight's silhouette has an IoU of 0.989, 0.992, 0.993 and 0.994."""
+
 PAPER = Recipe()
 
 STANDARD = replace(
@@ -46,7 +54,7 @@ STANDARD = replace(
     refine=replace(
         PAPER.refine,
         steps=20_000,
-        weights=replace(PAPER.refine.weights, normal=2.0, highlight=0.002),
+        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, highlight=0.002),
         crease=CREASE,
         rates=replace(PAPER.refine.rates, highlight=0.005),
         points=20_000,
@@ -55,10 +63,10 @@ STANDARD = replace(
     ),
     decompose=Decompose(
         steps=10_000,
-        warmup=2_000,
+        warmup=1_000,
         doublings=3,
         fitted=True,
-        weights=DecomposeWeights(light=0.02, material=0.02),
+        weights=DecomposeWeights(light=0.02, material=0.02, mask=MASK),
         rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
     ),
 )
@@ -75,7 +83,7 @@ DRAFT = replace(
         limit=16_000,
         hull=96,
         every=300,
-        weights=replace(PAPER.refine.weights, normal=2.0, highlight=0.002),
+        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, highlight=0.002),
         crease=CREASE,
         rates=replace(PAPER.refine.rates, highlight=0.02),
         ramp=0.5,
@@ -83,11 +91,11 @@ DRAFT = replace(
     ),
     decompose=Decompose(
         steps=1_000,
-        warmup=1_000,
+        warmup=100,
         directions=256,
         doublings=1,
         fitted=True,
-        weights=DecomposeWeights(light=0.002, material=0.01),
+        weights=DecomposeWeights(light=0.002, material=0.01, mask=MASK),
         rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),

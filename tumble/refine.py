@@ -29,7 +29,7 @@ from tumble.se3 import SE3
 from tumble.shadow import Sky, look_around
 from tumble.trajectory import Trajectory, env_from_obj
 
-VERSION = 8
+VERSION = 9
 SEEN_FROM = 16  # frames, in tracing what Gaussians see
 HINT = 0.3
 """Share of the gradient of colours that turns normals: the light is too coarse to be trusted. Hand-held, all of it
@@ -119,7 +119,7 @@ class Config:
     least_opacity: float = 0.05
     """Gaussians below it are dropped."""
     least_weight: float = 0.05
-    """Gaussians whose weight in no scored view reaches this are dropped [pixels]."""
+    """Gaussians whose weight in no view since the last densification reaches this lie inside: dropped [pixels]."""
     shaded: float = 0.2
     """Share of the run from which the object stands in its own shade (`shadow`); before, it is too coarse."""
     realignments: int = 0
@@ -194,7 +194,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         poses=like.new_zeros(len(inputs.trajectory), 6),
     )
     params = optim.leaves(params)
-    return State(0, params, optim.adam(params, _rates(cfg)), rng, {"order": torch.zeros(0, dtype=torch.long)})
+    memory = {"order": torch.zeros(0, dtype=torch.long), "shown": torch.zeros_like(scale)}
+    return State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
 
 
 def _rates(cfg: Config) -> dict[str, float]:
@@ -260,6 +261,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     number = _draw(state, len(inputs.capture))
     T_cam_obj = pose(params, inputs, number)
     view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera, sky=sky(state))
+    state.memory["shown"] = torch.maximum(state.memory["shown"], view.weight.detach())
     terms = _terms(cfg, params, view, frame(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
     optim.anneal(state.optimizer, _annealed(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
@@ -336,9 +338,8 @@ def _window(view: Buffers, truth: Frame, camera: Camera) -> tuple[Buffers, Frame
 @torch.no_grad()
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     params, camera = state.params, inputs.capture.camera
-    n = len(params.points.albedo_logits)
     assert state.optimizer is not None, "init makes one"
-    bad, weight = (params.gamma.new_zeros(n) for _ in range(2))
+    bad = params.gamma.new_zeros(len(params.points.albedo_logits))
     numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: cfg.views].tolist()
     for number in numbers:
         T_cam_obj = pose(params, inputs, number)
@@ -348,14 +349,13 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
         error = (losses.developed(first.rgb, truth.image) - truth.image).abs().mean(-1)
         where = densify.bad_pixels(error, truth.mask, relative=cfg.bad, absolute=cfg.bad_floor)
         bad += render(*arguments, mask=where, sky=sky(state)).touched / len(numbers)
-        weight = torch.maximum(weight, first.weight)
     drop = opacity(params.points.gaussians.sdf, params.gamma) < cfg.least_opacity
-    # Ten views show about everything of a tumbling object; what none of them shows lies inside.
-    drop |= weight < cfg.least_weight
+    drop |= state.memory["shown"] < cfg.least_weight
     plan = densify.plan(bad, drop, threshold=cfg.importance, fraction=cfg.fraction, limit=cfg.limit)
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
     densify.place_children(points.gaussians, plan)
     state.params = replace(params, points=points)
+    state.memory["shown"] = torch.zeros_like(points.albedo_logits[:, 0])
 
 
 def _realignments(cfg: Config) -> list[int]:
