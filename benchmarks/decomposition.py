@@ -2,7 +2,8 @@
 
 `python -m benchmarks.decomposition CAPTURE... --runs FOLDER` reconstructs and scores each capture (`tumble run`,
 `tumble evaluate`) and adds a row to `benchmarks/decomposition.json`; finished runs are only scored. Each capture is
-made by `tumble synth`; what made it stands in the row.
+made by `tumble synth`; what made it stands in the row. What a number of a recipe is worth: `--change NAME=VALUE`, as
+`--change refine.weights.proj=1`.
 """
 
 import argparse
@@ -39,7 +40,9 @@ def main() -> None:
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--runs", type=Path, required=True)
     parser.add_argument("--quality", choices=QUALITIES, default="draft")
-    parser.add_argument("--ablation", choices=ABLATIONS)
+    altered = parser.add_mutually_exclusive_group()
+    altered.add_argument("--ablation", choices=ABLATIONS)
+    altered.add_argument("--change", metavar="NAME=VALUE")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     arguments = parser.parse_args()
@@ -49,13 +52,22 @@ def main() -> None:
         about = {"quality": arguments.quality, "seed": arguments.seed}
         if arguments.ablation:
             recipe, about = ABLATIONS[arguments.ablation](recipe), about | {"ablation": arguments.ablation}
+        if arguments.change:
+            name, _, value = arguments.change.partition("=")
+            recipe, about = changed(recipe, name, json.loads(value)), about | {"ablation": arguments.change}
         row = measure(capture, arguments.runs / "-".join([capture.name, *map(str, about.values())]), recipe, about)
         rows = [old for old in rows if old["made_by"] != row["made_by"] or old["recipe"] != row["recipe"]] + [row]
-        command = "python -m benchmarks.decomposition CAPTURE... --runs FOLDER [--quality, --ablation, --seed]"
+        command = "python -m benchmarks.decomposition CAPTURE... --runs FOLDER [--ablation, --change, --seed]"
         files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
         shared = row["shared"]
         scores = f"albedo {shared[KEPT[0]]:6.2f}  relit {shared[KEPT[3]]:6.2f}"
         print(f"{capture.name:60} {scores}  {row['run_seconds']:.0f} s", flush=True)
+
+
+def changed(recipe: Any, name: str, value: object) -> Any:
+    """The recipe with another value of the field that a dotted name leads to."""
+    first, _, rest = name.partition(".")
+    return replace(recipe, **{first: changed(getattr(recipe, first), rest, value) if rest else value})
 
 
 def measure(capture: Path, run: Path, recipe: Recipe, about: dict[str, Any]) -> dict[str, Any]:
