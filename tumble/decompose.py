@@ -35,7 +35,7 @@ from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 from tumble.views import buffers_of
 
-VERSION = 10
+VERSION = 11
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 FAINT = 0.2
