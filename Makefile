@@ -47,4 +47,4 @@ docs: install
 	$(BIN)/pdoc -o build/docs tumble
 
 clean:
-	rm -rf $(VENV) runs .pytest_cache .ruff_cache
+	rm -rf $(VENV) runs/demo .pytest_cache .ruff_cache

@@ -77,6 +77,8 @@ def material(capture: Capture, truth: Any, refined: refine.Refined, given: str) 
         cfg, rates = replace(cfg, roughness=rough), replace(rates, roughness=0.0)
     if given in ("light", "both", "all"):
         cfg, rates = replace(cfg, rows=ROWS, doublings=0), replace(rates, light=0.0)
+    if given in ("geometry", "all"):
+        cfg = replace(cfg, warmup=cfg.steps)
     light: Environment = truth.light.resampled(ROWS, 2 * ROWS)
 
     def init(cfg: decompose.Config, inputs: decompose.Inputs, rng: torch.Generator) -> State:

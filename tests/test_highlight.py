@@ -27,7 +27,7 @@ def made(strength: float, *, true: int = 1, dark: float = 0.0, n: int = 200, per
 
 
 def test_width_and_strength_of_a_made_highlight_are_found() -> None:
-    for true, strength in ((0, 0.6), (1, 1.0), (1, 1.4), (2, 0.7)):
+    for true, strength in ((0, 0.6), (1, 1.0), (1, 1.2), (2, 0.7)):
         found = fit(made(strength, true=true), 200)
         assert (found.which, found.strength) == (true, strength)
 

@@ -27,7 +27,7 @@ from tumble import (
 )
 from tumble import run as runs
 from tumble.asset import Asset
-from tumble.capture import OBJECT, Capture, Truth, no_views
+from tumble.capture import OBJECT, UNKNOWN, Capture, Truth, no_views
 from tumble.datasets import folder
 from tumble.environment import Environment
 from tumble.files import BadFile
@@ -215,10 +215,9 @@ def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Pat
 
 def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path) -> None:
     taken = folder.load(capture)
-    # Of a plain ellipsoid that is lit from its own side, too few frames for a verdict.
     few = taken.select([0, 1, 2])
     capture_writer.save(tmp_path / "few", few)
-    with pytest.raises(BadFile, match="could not be tracked"):
+    with pytest.raises(BadFile, match="has 3 frames: too few"):
         reconstruct.reconstruct(tmp_path / "few", tmp_path / "run", RECIPE, poses="estimate")
     with pytest.raises(BadFile, match="finish the run first"):
         reconstruct.predict_run(tmp_path / "nowhere", capture)
@@ -282,3 +281,27 @@ def test_without_corners_a_gaussian_has_one_material(finished: tuple[Path, Asset
     albedo = asset.material.albedo
     assert torch.equal(albedo, albedo[:, :1].expand_as(albedo))
     assert finished[1].material.albedo.std(1).max() > 1e-3
+
+
+def test_a_frame_that_hides_the_object_does_not_end_a_run(finished: tuple[Path, Asset], capture: Path) -> None:
+    """All that its mask says for sure is one pixel, beside the object."""
+    taken = folder.load(capture).select([0])
+    masks = torch.full_like(taken.masks, UNKNOWN)
+    masks[0, 0, 0] = OBJECT
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    refined = dataclasses.replace(refined, trajectory=refined.trajectory.select([0]))
+    inputs = decompose.Inputs(dataclasses.replace(taken, masks=masks), refined)
+    cfg = dataclasses.replace(RECIPE.decompose, warmup=0)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    for state.step in range(3):
+        terms = decompose.step(cfg, inputs, state)
+        assert terms["render"] == 0
+    assert all(x.isfinite().all() for x in tree.named_tensors(state.params).values())
+
+
+def test_without_visibility_nothing_is_lit_by_another_part(finished: tuple[Path, Asset], capture: Path) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(folder.load(capture), refined)
+    cfg = dataclasses.replace(RECIPE.decompose, visibility=False)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    assert math.isfinite(float(decompose.step(cfg, inputs, state)["render"]))

@@ -135,6 +135,7 @@ def _check():
 
 
 def _run():
+    from tumble.recipes import Recipe
     from tumble.survey import Options
 
     def run(
@@ -144,7 +145,9 @@ def _run():
         out: Folder,
         quality: Literal["draft", "standard", "paper"] = "draft",
         poses: Literal["given", "estimate"] = "given",
+        matcher: str = Recipe.matcher,
         pick: bool = False,
+        device: Literal["cpu", "cuda"] = "cpu",
         seed: int = 0,
     ) -> None:
         """Reconstruct an object: its motion, geometry, albedo, roughness and the light.
@@ -155,12 +158,18 @@ def _run():
                 truth is never read).
             options: How a film, or pictures, become a capture; no matter where it is one already.
             out: The run directory; the same command goes on where an interrupted one stopped.
-            quality: draft: two CPU cores, minutes; standard: one GPU, minutes; paper: the published numbers, hours.
+            quality: draft: minutes on two CPU cores; standard: meant for a GPU; paper: the published numbers, days.
             poses: given: the capture's own, where it has any; estimate: find them from the frames all the same.
+            matcher: Of pixels between frames, where poses are estimated: mixed (RootSIFT and dense flow), or one that
+                `tumble weights list` names.
             pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
+            device: Of stages 2 and 3. The kernels for cuda compile and are right on the CPU, but have not yet run on a
+                GPU.
             seed: Of every random draw.
         """
         from dataclasses import replace
+
+        import torch
 
         from tumble.pick import picked
         from tumble.recipes import QUALITIES
@@ -168,9 +177,12 @@ def _run():
         from tumble.report import write
         from tumble.run import CAPTURE
 
+        if device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("--device cuda: torch sees no NVIDIA GPU here; tumble doctor says what it sees")
         options = picked(capture, options, out / CAPTURE) if pick else options
         folder = ingested(capture, out, options)
-        asset = reconstruct(folder, out, replace(QUALITIES[quality], seed=seed), poses=poses)
+        recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
+        asset = reconstruct(folder, out, recipe, poses=poses, device=device)
         print(write(out, asset, capture=folder, health=health(out)))
 
     return run

@@ -35,14 +35,16 @@ from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 from tumble.views import buffers_of
 
-VERSION = 11
+VERSION = 12
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 FAINT = 0.2
 """Share of a dielectric's highlight below which it hardly counts as one."""
 ALBEDO = (0.003, 0.98)
 """At the start. Printed red has a green of 0.004: a start well above it costs 0.6 dB, for the logit has far to go."""
-FITTED = 32  # frames from which the highlight is found at the start
+FITTED, FITTED_PIXELS = 64, 2
+"""Frames from which the highlight is found at the start, and pixels of each, in those of a step. With a quarter of them
+chance decides between the two best widths of the cracker box indoors, a question of 4 dB of albedo."""
 MOVED = 0.3
 """Of `trace.moved`, beyond which visibility is traced anew."""
 
@@ -74,7 +76,7 @@ class Rates:
     """Of the highlight against the diffuse light; the paper fixes it."""
     light: float = 0.01
     means: float = 1.6e-5
-    """Geometry joins after the warm-up, about ten times slower than in stage 2. The paper: "from SVG-IR"."""
+    """Geometry joins after the warm-up, slower than in stage 2 but for `sdf`. The paper: "from SVG-IR"."""
     quats: float = 1e-4
     log_scales: float = 5e-4
     sdf: float = 5e-3
@@ -178,7 +180,8 @@ def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
         view = buffers_of(params, T_cam_obj, capture.camera)
         truth = frame(capture, number, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # the outermost pixels mix in the background
-        points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, inner, state.rng))
+        pixels = _draw(FITTED_PIXELS * cfg.pixels, view, inner, state.rng)
+        points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
         R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
         shades = [(view, white, 0.0)]
         for width in widths:
@@ -276,12 +279,13 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     T_cam_obj = pose(params, inputs, number)
     view = buffers_of(params if cfg.corners else uncornered(params), T_cam_obj, capture.camera)
     truth = frame(capture, number, view.alpha)
-    points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg, view, truth.mask, state.rng))
+    points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg.pixels, view, truth.mask, state.rng))
     R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_tint.exp()
     shaded = _shaded(cfg, state, params, view, points, R_env_obj, points.sample(view.features["albedo"]), f0)
     rendered, photograph = (shaded * points.sample(view.alpha[..., None]))[None], points.sample(truth.image)[None]
     terms = {
-        "render": (losses.developed(rendered, photograph) - photograph).abs().mean(),
+        # A frame may show no pixel of the object for sure.
+        "render": (losses.developed(rendered, photograph) - photograph).abs().sum() / (3 * max(1, len(points.pixels))),
         "light": cfg.weights.light * losses.unevenness(params.environment.radiance),
         "mask": cfg.weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
         "material": cfg.weights.material * losses.material(view, truth.mask, truth.image),
@@ -294,12 +298,12 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     return {name: value.detach() for name, value in terms.items()}
 
 
-def _draw(cfg: Config, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
+def _draw(n: int, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
     """Some pixels that show the object for sure."""
     solid = torch.where(((view.alpha > 0.5) & (mask > 0.5)).flatten())[0]
     if not len(solid):
         return solid
-    return solid[torch.randint(len(solid), (cfg.pixels,), generator=rng).to(solid.device)]
+    return solid[torch.randint(len(solid), (n,), generator=rng).to(solid.device)]
 
 
 def _shaded(
@@ -330,7 +334,7 @@ def _shown(view: Buffers, points: Surface) -> Tensor:
 
 
 def _bounce(cfg: Config, state: State, params: Params) -> Bounce | AveragedBounce | None:
-    if cfg.bounce == "none":
+    if cfg.bounce == "none" or not cfg.visibility:
         return None
     if cfg.bounce == "average":
         return AveragedBounce(params.gaussians.sh[:, 0] / math.sqrt(4 * math.pi))

@@ -123,7 +123,7 @@ def _lost(health: Health | None) -> Row:
     verdict = _high(sum(lost) / max(1, len(lost)), limits)
     sentence = {
         "good": "Every frame was located.",
-        "warn": "A few frames could not be located; their poses are guesses from their neighbours.",
+        "warn": "A few frames could not be located; they are left out.",
         "bad": "Many frames could not be located. Turn the object more slowly, and keep fingers off its texture.",
         "none": "No frames.",
     }[verdict]

@@ -39,7 +39,7 @@ def _machine() -> Iterator[Finding]:
         name = torch.cuda.get_device_name()
         yield Finding("device", f"{name}, {free / 2**30:.0f} of {total / 2**30:.0f} GiB free")
     else:
-        yield Finding("device", "CPU: all works, slower than on an NVIDIA GPU")
+        yield Finding("device", "CPU")
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
         yield Finding(
@@ -79,8 +79,7 @@ def _codec() -> Finding:
 
 
 def _extras() -> Iterator[Finding]:
-    for extra, package in (("view", "viser"), ("cluster", "ray")):
-        if importlib.util.find_spec(package) is None:
-            yield Finding(f"extra {extra}", "not installed", f"optional: pip install 'tumble[{extra}]'")
-        else:
-            yield Finding(f"extra {extra}", f"{package} {importlib.metadata.version(package)}")
+    if importlib.util.find_spec("viser") is None:
+        yield Finding("extra view", "not installed", "optional: pip install 'tumble[view]'")
+    else:
+        yield Finding("extra view", f"viser {importlib.metadata.version('viser')}")

@@ -75,7 +75,12 @@ def ingested(path: Path, out: Path, options: Options) -> Path:
 
 
 def reconstruct(
-    capture_path: Path, out: Path, recipe: Recipe, *, poses: Literal["given", "estimate"] = "given"
+    capture_path: Path,
+    out: Path,
+    recipe: Recipe,
+    *,
+    poses: Literal["given", "estimate"] = "given",
+    device: torch.device | str = "cpu",
 ) -> Asset:
     """Run all stages on a capture; finished ones are taken from `out`. Truth is never read.
 
@@ -84,6 +89,7 @@ def reconstruct(
 
     Args:
         poses: given: those of the capture, which stay as they are, where it has any; estimate: never those.
+        device: Of stages 2 and 3. The asset that is returned is on the CPU.
 
     Raises:
         BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
@@ -93,10 +99,10 @@ def reconstruct(
     if poses == "estimate":
         capture = replace(capture, trajectory=None)
     with run.alone(out):
-        return _reconstruct(capture, capture_path, out, recipe)
+        return _reconstruct(capture, capture_path, out, recipe, device)
 
 
-def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe) -> Asset:
+def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe, device: torch.device | str) -> Asset:
     content = run.capture_key(capture)
     opened = run.open(out, capture_path, recipe, content=content)
     trajectory, keys, cfg = capture.trajectory, [content], recipe.refine
@@ -107,16 +113,21 @@ def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe
         capture = replace(capture.select(kept), camera=tracked.camera)
     else:
         cfg = known_poses(cfg)
+    capture, trajectory = tree.to(capture, device), tree.to(trajectory, device)
     refined = run.stage(opened, 2, "refine", refine, cfg, refine.Inputs(capture, trajectory), keys)
     keys = [run.key("refine", refine.VERSION, cfg, keys)]
     last = average if isinstance(recipe.decompose, average.Config) else decompose
     asset = run.stage(opened, 3, "decompose", last, recipe.decompose, decompose.Inputs(capture, refined), keys)
+    asset = tree.to(asset, "cpu")
     _keep(asset, capture, out)
     return asset
 
 
 def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) -> tuple[Tracked, str]:
     """Stage 1: match, then find all poses; also the key of the result."""
+    if len(capture) < LEAST_TRACKED:
+        rule = f"has {len(capture)} frames: too few to find how the object moved"
+        raise BadFile(capture_path, rule, f"film more of it: at least {LEAST_TRACKED} frames, better 40 to 100")
     recipe = opened.recipe
     route = graph if isinstance(recipe.track, graph.Config) else progressive
     near = neighbours(len(capture))

@@ -1,7 +1,7 @@
 """A run directory: the recipe, the log, and one folder per stage with what it made.
 
     runs/mug/  recipe.json  log.jsonl  1-track/  2-refine/  3-decompose/       while a process works in it: .lock
-    2-refine/  out.safetensors  stage.json  preview.png         while it trains: state.safetensors
+    2-refine/  out.safetensors  stage.json                      while it trains: state.safetensors
 
 A *key* is a hash of all that decides a result: the stage and its version, its settings, the seed, and the keys of what
 it reads. A stage whose result is there under its key is not run again. Truth never enters a key.
