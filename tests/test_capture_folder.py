@@ -163,6 +163,19 @@ def test_straight_alpha_becomes_colour_over_black_and_a_mask(tmp_path: Path) -> 
     assert abs(int(capture.images[0, 0, 1, 0]) - 147) <= 1
 
 
+def test_a_background_that_is_not_black_is_cut_out() -> None:
+    """A photograph over black keeps what is faint beyond its mask; before a wall that belongs to the wall."""
+    mask = np.full((20, 30), BACKGROUND, np.uint8)
+    mask[5:15, 5:15] = OBJECT
+    picture = np.zeros((20, 30, 3), np.uint8)
+    picture[5:15, 4:16] = 90
+    assert folder.cut_out(picture, mask) is picture
+    picture[:, 25:] = 60
+    cut = folder.cut_out(picture, mask)
+    assert (cut[mask == OBJECT] == 90).all()
+    assert not cut[mask == BACKGROUND].any()
+
+
 def test_a_distorted_photograph_is_straightened(tmp_path: Path) -> None:
     camera = Camera(torch.tensor([60.0, 60.0, 32.0, 24.0]), 48, 64)
     k1 = 0.3

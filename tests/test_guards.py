@@ -31,7 +31,7 @@ LAYERS = [
     {"recipes", "run", "report", "reconstruct", "demo", "viewer"},
     {"cli", "__main__"},
 ]
-"""Each row may import only rows above it and itself (design, section 3)."""
+"""Each row may import only rows above it and itself."""
 
 LONG_FILES: dict[str, int] = {}
 """Files over 400 lines, each with the reason beside it."""

@@ -42,7 +42,7 @@ def test_all_start_near_no_change_and_learn_any_pose(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["vectors", "frame_mlps"])
 def test_frames_that_a_loss_does_not_reach_stay_where_they_are(kind: str) -> None:
-    """Also after they have gathered momentum: Adam would otherwise move them on (method_poses, pitfall 20)."""
+    """Also after they have gathered momentum: Adam would otherwise move them on."""
     net = optim.leaves(source(kind))
     optimizer = optim.adam(net, rates(kind))
     optim.descend((posenets.raw(net, [0, 1]) - 1).square().sum(), optimizer, step=0)

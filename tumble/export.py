@@ -154,7 +154,8 @@ class _Buffer:
 def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, metres: float) -> None:
     """A glTF 2.0 binary with one mesh and one dielectric metallic-roughness material.
 
-    Reflectance at normal incidence goes into KHR_materials_ior, which says the same; viewers without it show 0.04.
+    Reflectance at normal incidence goes into KHR_materials_ior, below 0.04 into KHR_materials_specular; viewers without
+    them show 0.04.
     Tangents are those that the normal map was baked with.
     """
     buffer = _Buffer()

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 OFFSETS = (1, 2, 4)
-"""Frames between neighbours; method_poses 10.1 has 8 and 16 as well."""
+"""Frames between neighbours; FMOV has 8 and 16 as well."""
 
 Pairs = list[tuple[int, int]]
 """The earlier frame first."""

@@ -85,7 +85,7 @@ def relight(
 def preview(
     cfg: Config, asset: Asset, environment: Environment, trajectory: Trajectory, camera: Camera
 ) -> Iterator[Float[Tensor, "h w 3"]]:
-    """As `relight`, at once: no shadows, no bounce, prefiltered highlights."""
+    """As `relight`, at once: no shadows, no bounce, highlights as in training."""
     material = asset.material
     assert material is not None, "an asset with material"
     prefiltered = prefilter(environment)

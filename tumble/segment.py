@@ -22,7 +22,7 @@ from tumble.backdrop import Backdrop
 from tumble.capture import BACKGROUND, OBJECT, UNKNOWN
 
 SURE_OVERLAP = 0.85
-"""Overlap (IoU) of predicted and found mask below which a frame is flagged (method_poses.md, section 6.4)."""
+"""Overlap (IoU) of predicted and found mask below which a frame is flagged."""
 SURE_AREA = 1.2
 """Change of area from frame to frame above which a frame is flagged (the same)."""
 LOST_OVERLAP = 0.4

@@ -5,10 +5,10 @@ Everything happens in the object frame, under one set of directions for the whol
 *Bounce*: light that Gaussians standing in the way send on, of the same frame, since light and object turn apart.
 
 Two estimators for training. `shade` sums both lobes over the shared directions: unbiased, but a few hundred cannot
-resolve a narrow lobe. `shade_split` sums the diffuse lobe and takes the specular one from a prefiltered light. On a
-sphere under real light, 256 directions, the first errs by 1.6 to 3.9 at roughness 0.1, by 0.4 to 1.5 at 0.2 and by
-0.01 to 0.24 from 0.5 up; the second, which sees the light of whole cells, by 0.01 to 0.11 everywhere (`benchmarks`).
-Take the second wherever roughness may fall below 0.4. `importance.relight_surface` is for final pictures.
+resolve a narrow lobe. `shade_split` sums the diffuse lobe and a wide specular one, and takes a narrow one (`NARROW`)
+from a prefiltered light. On a sphere under real light, 256 directions, the first errs by 1.6 to 3.9 at roughness 0.1,
+by 0.4 to 1.5 at 0.2 and by 0.01 to 0.24 from 0.5 up; the second, which sees the light of whole cells, by 0.01 to 0.11
+everywhere (`benchmarks`). Training takes the second. `importance.relight_surface` is for final pictures.
 """
 
 import math

@@ -1,7 +1,7 @@
 """A camera that turns about its own centre to keep looking at the object, so that two unknowns fall away.
 
 The *aim* frame shares its origin with `cam`; its z axis points at the middle of the silhouette's bounding box. Turning
-a pinhole camera about its centre is an exact homography, `K_aim R_aim_cam K^-1`, whatever the depth (method_poses 2.1):
+a pinhole camera about its centre is an exact homography, `K_aim R_aim_cam K^-1`, whatever the depth:
 nothing is approximated, unlike by a shift of the picture, and the way back is as exact. With poses found in the aim
 frame, those of the camera follow in closed form, translation included: `T_cam_obj = R_cam_aim @ T_aim_obj`.
 

@@ -27,6 +27,8 @@ TRANSFORMS = "transforms.json"
 LAYOUT = f"CAPTURE/{TRANSFORMS} (docs/format.md)"
 RIGID_TOLERANCE = 1e-3
 """Largest deviation of R^T R from the identity: what six printed digits leave, far below a wrong scale or shear."""
+NEARLY_BLACK = 16
+"""Code value that compression leaves of black."""
 
 
 @dataclass(frozen=True)
@@ -222,6 +224,7 @@ def _photograph(document: _Document, frame: dict[str, Any], lens: _Lens) -> tupl
     if "mask_path" in frame:
         mask_path = files.inside(document.root, frame["mask_path"])
         mask = three_valued(_sized(files.read_picture(mask_path), mask_path, lens.camera)[..., 0], mask_path)
+        image = cut_out(image, mask)
     if lens.undistort is not None:
         image, mask = lens.undistort(image, cv2.INTER_LINEAR), lens.undistort(mask, cv2.INTER_NEAREST)
     if not (mask == OBJECT).any():
@@ -241,6 +244,16 @@ def over_black(rgba: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """Straight sRGB colour with alpha, composited over black in linear light, back to sRGB code values."""
     linear = linear_from_srgb(torch.from_numpy(rgba[..., :3] / 255.0)) * torch.from_numpy(rgba[..., 3:] / 255.0)
     return photograph(linear).numpy()
+
+
+def cut_out(image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A photograph before a background that is not black, over black; any other stays as it is.
+
+    What is faint along the outline of an object over black is the object's own: pixels that it covers in part.
+    """
+    background = mask == BACKGROUND
+    far = cv2.erode(background.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    return image if image[far].max(initial=0) <= NEARLY_BLACK else np.where(background[..., None], np.uint8(0), image)
 
 
 def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:

@@ -18,7 +18,7 @@ from tumble.match import View
 
 BORDER = 96
 """Masks lose one pixel of border per so many pixels of the frame's longer side: 2 at 128, 3 at 256. What lies there
-mixes object and background, which does not move (method_poses, pitfall 15)."""
+mixes object and background, which does not move."""
 MARGIN = 0.1
 """What a window shows around the object, in units of the object's longer side."""
 

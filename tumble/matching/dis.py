@@ -2,7 +2,7 @@
 
 Both directions are computed, and a pixel counts where the way there and back ends at its start. Brightness constancy
 is the assumption: shading and highlights stay with the light when the object turns, so far pairs drift towards no
-motion at all (method_poses, pitfall 14). No weights, CPU only; `device` is not used.
+motion at all. No weights, CPU only; `device` is not used.
 """
 
 import cv2
