@@ -1,6 +1,5 @@
 """The visual hull of an ellipsoid that is seen from all around is that ellipsoid, nearly."""
 
-import dataclasses
 import math
 
 import pytest
@@ -62,7 +61,6 @@ def test_points_lie_on_the_surface_with_outward_normals(carved: torch.Tensor) ->
     torch.testing.assert_close(points.spacing, brute, atol=1e-5, rtol=0)
 
 
-@pytest.mark.filterwarnings("ignore:the silhouettes leave an object that reaches")
 def test_unknown_pixels_carve_nothing() -> None:
     capture, trajectory = silhouettes(6)
     unknown = Capture(
@@ -74,7 +72,6 @@ def test_unknown_pixels_carve_nothing() -> None:
     torch.testing.assert_close(carved, ball.float())
 
 
-@pytest.mark.filterwarnings("ignore:the silhouettes leave an object that reaches")
 def test_contradicting_silhouettes_are_named() -> None:
     capture, trajectory = silhouettes(6)
     nothing = torch.full_like(capture.masks, BACKGROUND)
@@ -91,11 +88,3 @@ def test_a_speck_of_one_cell_does_no_harm() -> None:
     points = hull.surface(inside, 100, torch.Generator().manual_seed(0))
     assert len(points.positions) == 100
     torch.testing.assert_close(points.normals.norm(dim=-1), torch.ones(100))
-
-
-def test_an_object_that_nothing_carves_is_warned_of() -> None:
-    """No masks: all of every picture is the object."""
-    capture, trajectory = silhouettes(4, 32)
-    whole = dataclasses.replace(capture, masks=torch.full_like(capture.masks, OBJECT))
-    with pytest.warns(UserWarning, match="beyond the unit ball"):
-        hull.carve(whole, trajectory, resolution=24)

@@ -35,7 +35,7 @@ from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 from tumble.views import buffers_of
 
-VERSION = 12
+VERSION = 13
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 FAINT = 0.2
@@ -61,8 +61,12 @@ class Weights:
     """Squared difference of coverage and mask, as in stage 2. Without it, once geometry joins, what is darker than its
     light lets shine becomes translucent: the grooves of a chess knight do, and 1 % of its silhouette."""
     highlight: float = 0.01
-    """Price of a highlight, whatever its strength. On a Lambertian bottle a third of one stands in for a sun that the
-    map blurs: it lowers the photometric term by 3 % and costs 2 dB of albedo. A real one lowers that term by half."""
+    """Price of a highlight, whatever its strength, unless a trial found one.
+
+    On a Lambertian bottle a third of one stands in for a sun that the map blurs: it lowers the photometric term by 3 %
+    and costs 2 dB of albedo. A real one lowers that term by half; the one that a trial found on the chess knight
+    indoors fell into the price and vanished, which cost 3 dB of relighting.
+    """
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     )
     params = optim.leaves(params)
     turns = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
-    state = State(0, params, optim.adam(params, _rates(cfg)), rng, {"directions": torch.stack(turns)})
+    memory = {"directions": torch.stack(turns), "price": cfg.weights.highlight * torch.ones_like(params.gamma)}
+    state = State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
     _look_around(cfg, inputs, state)
     if cfg.fitted and params.log_tint.exp().mean() > FAINT:
         fit_highlight(cfg, inputs, state)
@@ -199,6 +204,7 @@ def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
     params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*ALBEDO)))
     params.material.roughness_logits.fill_(TEMPERATURE * torch.logit(torch.tensor(widths[found.which])))
     params.log_tint.fill_(math.log(found.strength))
+    state.memory["price"] = torch.zeros_like(params.gamma)
 
 
 def _rates(cfg: Config) -> dict[str, float]:
@@ -289,7 +295,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         "light": cfg.weights.light * losses.unevenness(params.environment.radiance),
         "mask": cfg.weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
         "material": cfg.weights.material * losses.material(view, truth.mask, truth.image),
-        "highlight": cfg.weights.highlight * (1 - (-params.log_tint.exp().mean() / FAINT).exp()),
+        "highlight": state.memory["price"] * (1 - (-params.log_tint.exp().mean() / FAINT).exp()),
     }
     slow = 0.1 ** (state.step / cfg.steps)
     joined = slow * (state.step >= cfg.warmup)

@@ -3,7 +3,6 @@
 Object frame, object radius 1. A pixel whose mask is unknown carves nothing.
 """
 
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -13,9 +12,6 @@ from torch.nn.functional import conv3d, grid_sample, normalize
 
 from tumble.capture import BACKGROUND, Capture
 from tumble.trajectory import Trajectory
-
-BEYOND = 1.2
-"""Distance from the origin at which the hull of an object in the unit ball has ended, even of few views."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,7 @@ def carve(capture: Capture, trajectory: Trajectory, *, resolution: int) -> Float
     ticks = (torch.arange(resolution, **like) + 0.5) / resolution * 2 - 1
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
-    inside, distance = torch.ones_like(x_obj[:, 0]), x_obj.norm(dim=-1)
+    inside = (x_obj.norm(dim=-1) <= 1).to(**like)
     for frame in range(len(trajectory)):
         uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj)
         mask = (capture.masks[frame] != BACKGROUND).to(**like)
@@ -46,10 +42,7 @@ def carve(capture: Capture, trajectory: Trajectory, *, resolution: int) -> Float
         seen = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         within = ((uv > 0) & (uv < size)).all(-1)
         inside = torch.minimum(inside, torch.where(within, seen, 1.0))
-    if (inside[distance > BEYOND] > 0.5).sum() > 0.1 * (inside > 0.5).sum():
-        rule = "the silhouettes leave an object that reaches far beyond the unit ball about the origin"
-        warnings.warn(f"{rule}: are there masks, and do the poses put it inside?", stacklevel=2)
-    return torch.where(distance <= 1, inside, 0.0).reshape(resolution, resolution, resolution)
+    return inside.reshape(resolution, resolution, resolution)
 
 
 def surface(inside: Float[Tensor, "x y z"], n: int, rng: torch.Generator) -> OrientedPoints:
