@@ -59,7 +59,7 @@ class Weights:
     """Edge-aware smoothness of albedo and roughness."""
     mask: float = 0.0
     """Squared difference of coverage and mask, as in stage 2. Without it, once geometry joins, what is darker than its
-    light lets shine becomes translucent: the grooves of a chess knight do, and 1 % of its silhouette."""
+    light lets shine becomes translucent, as do the grooves of a chess knight."""
     highlight: float = 0.01
     """Price of a highlight, whatever its strength, unless a trial found one.
 
