@@ -17,6 +17,7 @@ from tumble import (
     decompose,
     evaluate,
     files,
+    highlight,
     loop,
     matching,
     recipes,
@@ -305,3 +306,21 @@ def test_without_visibility_nothing_is_lit_by_another_part(finished: tuple[Path,
     cfg = dataclasses.replace(RECIPE.decompose, visibility=False)
     state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
     assert math.isfinite(float(decompose.step(cfg, inputs, state)["render"]))
+
+
+def test_a_highlight_that_a_trial_found_has_no_price(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(folder.load(capture), refined)
+    cfg = dataclasses.replace(RECIPE.decompose, fitted=True)
+
+    def price(found: highlight.Fit | None) -> float:
+        monkeypatch.setattr(highlight, "fit", lambda *samples: found)
+        state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+        decompose.fit_highlight(cfg, inputs, state)
+        return float(state.memory["price"])
+
+    n = len(refined.albedo)
+    assert price(None) == pytest.approx(cfg.weights.highlight)
+    assert price(highlight.Fit(1, 0.7, torch.zeros(5, n, 3))) == 0
