@@ -4,6 +4,7 @@ import dataclasses
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -214,12 +215,22 @@ def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Pat
     assert reconstruct.source_names(tmp_path, known) == tuple(kept)
 
 
-def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = folder.load(capture)
     few = taken.select([0, 1, 2])
     capture_writer.save(tmp_path / "few", few)
     with pytest.raises(BadFile, match="has 3 frames: too few"):
         reconstruct.reconstruct(tmp_path / "few", tmp_path / "run", RECIPE, poses="estimate")
+    stage = runs.stage
+
+    def loses_one(*arguments: Any) -> Any:
+        tracked = stage(*arguments)
+        lost = torch.arange(len(tracked.health.lost)) == 5
+        return dataclasses.replace(tracked, health=dataclasses.replace(tracked.health, lost=lost))
+
+    monkeypatch.setattr(runs, "stage", loses_one)
+    with pytest.raises(BadFile, match="could not be tracked: 1 of 8 frames"):
+        reconstruct.reconstruct(capture, tmp_path / "run", RECIPE, poses="estimate")
     with pytest.raises(BadFile, match="finish the run first"):
         reconstruct.predict_run(tmp_path / "nowhere", capture)
 

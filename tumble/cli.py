@@ -135,7 +135,6 @@ def _check():
 
 
 def _run():
-    from tumble.recipes import Recipe
     from tumble.survey import Options
 
     def run(
@@ -145,7 +144,7 @@ def _run():
         out: Folder,
         quality: Literal["draft", "standard", "paper"] = "draft",
         poses: Literal["given", "estimate"] = "given",
-        matcher: str = Recipe.matcher,
+        matcher: str = "mixed",
         pick: bool = False,
         device: Literal["cpu", "cuda"] = "cpu",
         seed: int = 0,

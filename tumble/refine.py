@@ -385,7 +385,7 @@ def _unexplained(
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
-    """Geometry, first albedo and light; their static colour: the mean diffuse one of all frames, unshaded."""
+    """Geometry, first albedo and light; as static colour the mean diffuse one of all frames, unshaded."""
     params = state.params
     T_cam_obj = SE3.exp(params.poses) @ inputs.trajectory.T_cam_obj
     trajectory = Trajectory(T_cam_obj, inputs.trajectory.light)
