@@ -230,7 +230,7 @@ def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(runs, "stage", loses_one)
     with pytest.raises(BadFile, match="could not be tracked: 1 of 8 frames"):
-        reconstruct.reconstruct(capture, tmp_path / "run", RECIPE, poses="estimate")
+        reconstruct.reconstruct(capture, tmp_path / "lost", RECIPE, poses="estimate")
     with pytest.raises(BadFile, match="finish the run first"):
         reconstruct.predict_run(tmp_path / "nowhere", capture)
 
