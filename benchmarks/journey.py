@@ -146,7 +146,9 @@ def report(rows: list[Row]) -> str:
     lines = [
         f"# From a clip to an asset: {first['frames']} frames of {first['side']} x {first['side']} pixels",
         "",
-        f"`{COMMAND}`: from `clip.mp4` and one box. Views of region shared, PSNR of sRGB values.",
+        f"`{COMMAND}`: from `clip.mp4` and one box; films are made from the meshes and light maps in "
+        "`../shared/data` where FOLDER lacks them. The focal length is given (`--fov`). One thread per run, on a "
+        "2-core x86_64 CPU that did other work. Views of region shared, PSNR of sRGB values.",
         "",
         f"| {' | '.join(heads)} |",
         "|" + "---|" * len(heads),

@@ -141,9 +141,10 @@ def report(rows: Sequence[Row]) -> str:
     refined = [row for row in made if "refined_seconds" in row]
     parts = [
         "# Poses from RGB\n",
-        f"`{COMMAND}`; captures of {FRAMES} frames by `tumble synth`, 5 to 12 degrees apart. AUC_ATE at "
-        f"{TOLERANCE:.0%} of the mean distance. Time: matching and stage 1, on one thread of a machine that had other "
-        "work; the graph route finds all six degrees of freedom itself.\n",
+        f"`{COMMAND}`; captures of {FRAMES} frames by `tumble synth`, 5 to 12 degrees apart, "
+        "made from the meshes and light maps in `../shared/data` where FOLDER lacks them. AUC_ATE at "
+        f"{TOLERANCE:.0%} of the mean distance. Time: matching and stage 1, on one thread of a 2-core x86_64 CPU that "
+        "had other work; the graph route finds all six degrees of freedom itself.\n",
         table(["model", "light", "seed", *SCORES], made, TEXTURED, OTHERS),
         "## After stage 2\n",
         "Stage 1 again, and the poses after stage 2 of the draft recipe. The graph route's poses have six degrees of "

@@ -159,8 +159,8 @@ def _run():
             out: The run directory; the same command goes on where an interrupted one stopped.
             quality: draft: minutes on two CPU cores; standard: meant for a GPU; paper: the published numbers, days.
             poses: given: the capture's own, where it has any; estimate: find them from the frames all the same.
-            matcher: Of pixels between frames, where poses are estimated: mixed (RootSIFT and dense flow), or one that
-                `tumble weights list` names.
+            matcher: Of pixels between frames, where poses are estimated: mixed (RootSIFT and dense flow), one that
+                `tumble weights list` names, or roma or mast3r where they are installed.
             pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
             device: Of stages 2 and 3. The kernels for cuda compile and are right on the CPU, but have not yet run on a
                 GPU.

@@ -115,7 +115,7 @@ def drive(
         checkpoint: File to take up from and to save to; a preview goes beside it. None keeps nothing.
         every: Steps between two checkpoints; one is also saved at the end, before `finish`.
         report: Called after the first and the last step and at most every few seconds with a JSON document: name,
-            step, of, seconds (of training, over all sessions), eta [s], metrics.
+            step, of, seconds (of training, over all processes), eta [s], metrics.
         name: Of the stage, for people.
         key: What the inputs are. A checkpoint of another key, version, configuration or seed is started over.
 

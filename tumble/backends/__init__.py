@@ -69,8 +69,8 @@ def threads() -> int:
 def threads_for_kernels() -> Iterator[None]:
     """Leave all threads to the kernels: torch's own operations take one.
 
-    Those of a training step are so small that a second thread costs more than it gives: stages 2 and 3 of a capture of
-    128 pixels took 164 s with two threads for both, 120 s with one for both, and take 104 s so.
+    Those of a training step are so small that a second thread costs more than it gives: when this came in, stages 2
+    and 3 of a capture of 128 pixels took 164 s with two threads for both, 120 s with one for both, and 104 s so.
     """
     before = torch.get_num_threads()
     token = _threads.set(threads())
