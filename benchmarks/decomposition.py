@@ -73,7 +73,6 @@ def changed(recipe: Any, name: str, value: object) -> Any:
 def measure(capture: Path, run: Path, recipe: Recipe, about: dict[str, Any]) -> dict[str, Any]:
     """One row: reconstruct if need be, predict, score."""
     reconstruct(capture, run, recipe)
-    # Of a stage that was interrupted, its last part alone counts.
     seconds = sum({r["name"]: r["seconds"] for r in records(run) if r.get("event") == "done"}.values())
     begun = time.perf_counter()
     report = evaluate_run(run, capture, run)

@@ -232,6 +232,20 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 }
 
 
+@pytest.mark.parametrize("name", ["../../elsewhere", "hdr/sun", "..", "", "a\\b"])
+def test_a_light_that_no_folder_can_be_called_is_refused(written: Path, name: str) -> None:
+    """A prediction is written to a folder per light: one of another name would lie outside."""
+
+    def rename(document: dict[str, Any]) -> None:
+        for frame in document["frames"]:
+            if "relit" in frame:
+                frame["relit"] = {name: frame["relit"]["sun"]}
+
+    edit(written, rename)
+    with pytest.raises(BadFile, match=r'"relit" names a light .* which no folder can be called'):
+        folder.load_truth(written)
+
+
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_broken_document_is_refused_by_file_and_rule(written: Path, name: str) -> None:
     change, message = BROKEN[name]

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -25,6 +26,7 @@ from tumble import (
     reconstruct,
     refine,
     tree,
+    video,
     views,
 )
 from tumble import run as runs
@@ -243,6 +245,24 @@ def test_a_run_can_be_put_under_another_light(
     pictures = [files.read_picture(path) for path in sorted(tmp_path.iterdir())]
     assert len(pictures) == 8
     assert all(0 < picture.mean() < 255 for picture in pictures)
+
+
+def test_a_turning_object_is_in_the_middle_of_its_film(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of a run whose pictures are a window beside the middle of a film."""
+    monkeypatch.setattr(reconstruct, "FILM_FRAMES", 2)
+    monkeypatch.setattr(reconstruct, "FILM_SIDE", 64)
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    beside = finished[1].camera.cropped(0, 40, finished[1].camera.height, finished[1].camera.width)
+    tree.save(dataclasses.replace(finished[1], camera=beside), out / reconstruct.ASSET)
+    light = capture / "truth" / "lights" / "sun.hdr"
+    for number, run in enumerate((finished[0], out)):
+        reconstruct.film_run(run, light, tmp_path / f"{number}.mp4", fast=True)
+    films = [np.stack(list(video.read_clip(tmp_path / f"{number}.mp4"))) for number in range(2)]
+    assert films[0].max() > 60
+    assert (films[0] == films[1]).all()
 
 
 def test_the_third_axis_is_the_smallest_after_training(finished: tuple[Path, Asset]) -> None:

@@ -6,6 +6,7 @@ import html
 import json
 import math
 import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -138,6 +139,14 @@ def test_times_and_settings_are_those_of_the_log(page: Path) -> None:
     assert "weights.mask 0.125" in words
     assert 'bounce "none"' in words
     assert "seed 7" in words
+
+
+def test_without_xatlas_there_is_a_page_without_a_mesh(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.warns(UserWarning, match="xatlas.*the report shows no mesh"):
+        assert report.model(asset, tmp_path) is None
 
 
 def test_a_name_is_text_and_not_markup(page: Path) -> None:

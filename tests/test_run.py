@@ -77,6 +77,10 @@ def test_an_interrupted_pipeline_goes_on_to_the_bits_of_a_whole_one(tmp_path: Pa
     assert len(steps) == (42 - 8 if stage == "first" else 12 - 8)
     same = ("1-first/stage.json", "2-second/stage.json")
     assert all((tmp_path / "whole" / x).read_text() == (tmp_path / "run" / x).read_text() for x in same)
+    # The time of a stage is that of all processes that worked on it.
+    records = [record for record in run.records(tmp_path / "run") if record.get("name") == stage]
+    last, done = (next(x for x in reversed(records) if key in x) for key in ("step", "event"))
+    assert done["seconds"] >= last["seconds"]
 
 
 def test_stages_draw_from_seeds_of_their_own(tmp_path: Path) -> None:
@@ -204,6 +208,7 @@ def test_the_recipe_is_saved_and_the_same_one_goes_on(tmp_path: Path) -> None:
 
 def test_another_recipe_is_refused_with_what_differs(tmp_path: Path) -> None:
     run.open(tmp_path, Path("clip"), Recipe())
+    make_something(tmp_path)
     other = Recipe(second=toy.Config(steps=13), seed=5)
     with pytest.raises(
         BadFile, match=r"recipe\.second\.steps is 12 there and 13 here; recipe\.seed is 0 there and 5 here"
@@ -211,8 +216,23 @@ def test_another_recipe_is_refused_with_what_differs(tmp_path: Path) -> None:
         run.open(tmp_path, Path("clip"), other)
 
 
+def test_a_run_that_has_made_nothing_takes_another_recipe(tmp_path: Path) -> None:
+    run.open(tmp_path, Path("clip"), Recipe(seed=5))
+    run.open(tmp_path, Path("clip"), Recipe())
+    make_something(tmp_path)
+    run.open(tmp_path, Path("clip"), Recipe())
+    with pytest.raises(BadFile, match=r"recipe\.seed is 0 there and 5 here"):
+        run.open(tmp_path, Path("clip"), Recipe(seed=5))
+
+
+def make_something(path: Path) -> None:
+    """As if a stage had begun."""
+    files.write_whole(path / "1-first" / run.CHECKPOINT, lambda partial: partial.write_bytes(b"a state"))
+
+
 def test_a_capture_is_known_by_its_content_where_there_is_one_else_by_its_path(tmp_path: Path) -> None:
     run.open(tmp_path / "a", Path("clip"), Recipe(), content="key")
+    make_something(tmp_path / "a")
     run.open(tmp_path / "a", Path("moved"), Recipe(), content="key")
     with pytest.raises(BadFile, match=r"capture\.content is 'key' there and 'other' here"):
         run.open(tmp_path / "a", Path("clip"), Recipe(), content="other")
@@ -228,6 +248,8 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
         run.open(tmp_path / "photos", Path("clip"), Recipe())
     with pytest.raises(BadFile, match="is a file"):
         run.open(tmp_path / "photos" / "cat.png", Path("clip"), Recipe())
+    with pytest.raises(BadFile, match="is there already and is no run"), run.alone(tmp_path / "photos"):
+        raise AssertionError("nobody works in here")
     (tmp_path / "photos" / "recipe.json").write_text('{"eggs": 3}')
     with pytest.raises(BadFile, match="is no recipe of a run"):
         run.open(tmp_path / "photos", Path("clip"), Recipe())

@@ -69,6 +69,11 @@ class Camera:
         """The camera with focal lengths times a factor."""
         return replace(self, fx_fy_cx_cy=self.fx_fy_cx_cy * self.fx_fy_cx_cy.new_tensor([factor, factor, 1, 1]))
 
+    def centred(self) -> "Camera":
+        """The camera that looks through the middle of its picture."""
+        middle = self.fx_fy_cx_cy.new_tensor([self.width / 2, self.height / 2])
+        return replace(self, fx_fy_cx_cy=torch.cat([self.fx_fy_cx_cy[:2], middle]))
+
     def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
         """The part of the view that a window of pixels shows."""
         return Camera(self.fx_fy_cx_cy - self.fx_fy_cx_cy.new_tensor([0, 0, left, top]), height, width)

@@ -170,6 +170,7 @@ def _run():
 
         import torch
 
+        from tumble.named import named
         from tumble.pick import picked
         from tumble.recipes import QUALITIES
         from tumble.reconstruct import health, ingested, reconstruct
@@ -178,6 +179,7 @@ def _run():
 
         if device == "cuda" and not torch.cuda.is_available():
             raise ValueError("--device cuda: torch sees no NVIDIA GPU here; tumble doctor says what it sees")
+        named("matching", matcher)  # before a film is cut up for it
         options = picked(capture, options, out / CAPTURE) if pick else options
         folder = ingested(capture, out, options)
         recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
@@ -265,12 +267,15 @@ def report(run: Positional[Path], /, capture: Path | None = None) -> None:
     print(write(run, finished(run), capture=capture, health=health(run)))
 
 
-def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: OptionalFolder = None) -> None:
+def evaluate(
+    prediction: Positional[Path], capture: Positional[Path | None] = None, /, out: OptionalFolder = None
+) -> None:
     """Score a prediction folder, or a run, against a capture with truth: report.json and a picture sheet.
 
     Args:
         prediction: The prediction folder (docs/prediction.md), or a run directory: its prediction is rendered first.
-        capture: The capture: a folder of docs/format.md, or another layout that it lists.
+        capture: The capture: a folder of docs/format.md, or another layout that it lists; of a run, its own when left
+            out.
         out: Where report.json and sheet.png go; the prediction folder when left out.
     """
     from rich.console import Console
@@ -278,10 +283,13 @@ def evaluate(prediction: Positional[Path], capture: Positional[Path], /, out: Op
 
     from tumble import evaluate as evaluation
     from tumble.reconstruct import ASSET, evaluate_run
+    from tumble.run import source
 
-    where = out or prediction
-    score = evaluate_run if (prediction / ASSET).is_file() else evaluation.run
-    report = score(prediction, capture, where)
+    where, is_run = out or prediction, (prediction / ASSET).is_file()
+    if capture is None and not is_run:
+        raise ValueError(f"{prediction} is no finished run: name the capture that it answers, after it")
+    score = evaluate_run if is_run else evaluation.run
+    report = score(prediction, capture or source(prediction), where)
     table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
     regions = report["regions"]
     for heading in ("metric", *regions):

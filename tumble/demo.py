@@ -13,7 +13,7 @@ from typing import Any
 from tumble import files, reconstruct, report, video
 from tumble.datasets import folder as capture_folder
 from tumble.recipes import Recipe
-from tumble.run import CAPTURE
+from tumble.run import CAPTURE, alone
 
 CLIP = "clip.mp4"
 
@@ -44,7 +44,8 @@ def run(out: Path, recipe: Recipe) -> dict[str, Any]:
     Raises:
         BadFile: `out` holds something else.
     """
-    folder = unpack(out / CAPTURE)
+    with alone(out):
+        folder = unpack(out / CAPTURE)
     asset = reconstruct.reconstruct(folder, out, recipe)
     scores = reconstruct.evaluate_run(out, folder, out)
     report.write(out, asset, health=reconstruct.health(out))

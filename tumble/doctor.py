@@ -25,7 +25,7 @@ class Finding:
 
 def findings() -> list[Finding]:
     """Everything `tumble doctor` prints, in order."""
-    return [*_machine(), _renderer(), _compiler(), _codec(), *_extras()]
+    return [*_machine(), _renderer(), _compiler(), _codec(), _atlas(), *_extras()]
 
 
 def _machine() -> Iterator[Finding]:
@@ -78,8 +78,17 @@ def _codec() -> Finding:
     )
 
 
+def _atlas() -> Finding:
+    if importlib.util.find_spec("xatlas") is None:
+        return Finding(
+            "export", "no meshes: xatlas is not installed", "pip install xatlas (without a wheel: needs g++)"
+        )
+    return Finding("export", f"meshes by xatlas {importlib.metadata.version('xatlas')}")
+
+
 def _extras() -> Iterator[Finding]:
-    if importlib.util.find_spec("viser") is None:
-        yield Finding("extra view", "not installed", "optional: pip install 'tumble[view]'")
-    else:
-        yield Finding("extra view", f"viser {importlib.metadata.version('viser')}")
+    for extra, module, package in (("view", "viser", "viser"), ("cuda", "warp", "warp-lang")):
+        if importlib.util.find_spec(module) is None:
+            yield Finding(f"extra {extra}", "not installed", f"optional: pip install 'tumble[{extra}]'")
+        else:
+            yield Finding(f"extra {extra}", f"{package} {importlib.metadata.version(package)}")

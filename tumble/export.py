@@ -336,9 +336,11 @@ def poses(trajectory: Trajectory, asset: Asset, names: list[str], metres: float,
         for number, R, t in zip(numbers, R_cam_obj, t_mm, strict=True)
     }
     files.write_json(out / "bop" / "scene_gt.json", truth)
-    K = asset.camera.matrix.flatten().tolist()
+    K = asset.camera.matrix
+    K[:2, 2] -= 0.5  # BOP's pixel centres are whole numbers
     files.write_json(
-        out / "bop" / "scene_camera.json", {str(number): {"cam_K": K, "depth_scale": 1.0} for number in numbers}
+        out / "bop" / "scene_camera.json",
+        {str(number): {"cam_K": K.flatten().tolist(), "depth_scale": 1.0} for number in numbers},
     )
 
 

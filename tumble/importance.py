@@ -21,7 +21,7 @@ from tumble.trace import Tracer, trace
 RAYS = 1 << 18
 """Rays at once: bounds memory to some 300 MB, changes nothing else."""
 CELL_ROWS = 512
-"""Rows of cells aimed at: a million cells in all."""
+"""Rows of cells aimed at; a map of as many or more has twice as many: two million cells in all."""
 BOUNCE_DIRECTIONS = 256
 """Of the light of what stands in the way, in harmonics to degree 2."""
 HARMONIOUS = 1.2207440846057596
@@ -32,8 +32,8 @@ HARMONIOUS = 1.2207440846057596
 class LightSampler:
     """Directions in proportion to the radiance that arrives from them.
 
-    The density is constant on *cells*, at least four to a texel: it is nowhere zero where the bilinear map is not. The
-    finer the cells, the less noise a bright texel leaves.
+    The density is constant on *cells*, four and more to a texel of maps of up to `CELL_ROWS` rows: it is nowhere zero
+    where the bilinear map is not. The finer the cells, the less noise a bright texel leaves.
     """
 
     environment: Environment
@@ -80,9 +80,12 @@ def _place(
 def light_sampler(environment: Environment) -> LightSampler:
     """A sampler of an environment, by the mean of its channels."""
     h, w, _ = environment.log_radiance.shape
+    # Means of a map that is finer still: they, too, are nowhere zero where it is not.
+    coarse = environment if h <= CELL_ROWS else environment.resampled(CELL_ROWS, w * CELL_ROWS // h)
+    h, w, _ = coarse.log_radiance.shape
     h, w = (x * max(2, min(8, CELL_ROWS // h)) for x in (h, w))
     like = {"dtype": environment.log_radiance.dtype, "device": environment.log_radiance.device}
-    brightness = environment.lookup(texel_directions(h, w, **like)).mean(-1)
+    brightness = coarse.lookup(texel_directions(h, w, **like)).mean(-1)
     power = brightness.double() * texel_solid_angles(h, w, dtype=torch.float64, device=like["device"])
     density = brightness / power.sum().to(brightness)
     return LightSampler(environment, density, power.flatten().cumsum(0) / power.sum())

@@ -126,16 +126,16 @@ def _maps(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
     """Every picture of a prediction with the file it belongs to."""
     masks, roughness = prediction.masks, prediction.roughness
     parts = {
-        "albedo/{:04}.exr": prediction.albedo,
-        "normal/{:04}.exr": prediction.normals,
-        "roughness/{:04}.exr": None if roughness is None else roughness[..., None],
-        "mask/{:04}.png": None if masks is None else 255 * masks[..., None].to(torch.uint8),
-        "image/{:04}.png": prediction.images,
-        **{f"relit/{light}/{{:04}}.png": pixels for light, pixels in prediction.relit.items()},
+        ("albedo", "exr"): prediction.albedo,
+        ("normal", "exr"): prediction.normals,
+        ("roughness", "exr"): None if roughness is None else roughness[..., None],
+        ("mask", "png"): None if masks is None else 255 * masks[..., None].to(torch.uint8),
+        ("image", "png"): prediction.images,
+        **{(f"relit/{light}", "png"): pixels for light, pixels in prediction.relit.items()},
     }
-    for name, views in parts.items():
+    for (folder, suffix), views in parts.items():
         for i, pixels in enumerate([] if views is None else views.detach().cpu().numpy()):
-            yield Path(name.format(i)), pixels
+            yield Path(folder) / f"{i:04}.{suffix}", pixels
 
 
 # Reading --------------------------------------------------------------------------------------------------------------

@@ -138,7 +138,7 @@ def _track(opened: run.Run, capture: Capture, capture_path: Path, content: str) 
         inputs = route.gather(capture, matches)
     except ValueError as error:
         raise BadFile(capture_path, str(error), "give masks that show the object") from None
-    keys = [content, recipe.matcher]
+    keys = [content, matching.settings(recipe.matcher)]
     tracked = run.stage(opened, 1, "track", route, recipe.track, inputs, keys)
     health = tracked.health
     lost = int(health.lost.sum())
@@ -279,9 +279,10 @@ def film_run(out: Path, env: Path, film: Path, *, fast: bool, exposure: float = 
     # A film hides the noise of a quarter of the rays.
     cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
     R_gl_obj, turning = relight.turntable(asset.trajectory, FILM_FRAMES, FILM_ELEVATION)
-    scale = FILM_SIDE / max(asset.camera.height, asset.camera.width)
-    # H.264 wants even sides.
-    camera = asset.camera.resized(*(2 * round(side * scale / 2) for side in (asset.camera.height, asset.camera.width)))
+    # A run's pictures are a window of its film's; here the object turns in their middle. H.264 wants even sides.
+    camera = asset.camera.centred()
+    scale = FILM_SIDE / max(camera.height, camera.width)
+    camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     draw = relight.preview if fast else relight.relight
     views = draw(cfg, asset, light.rotated(R_gl_obj), turning, camera)
     frames = track(views, f"turning under {env.stem}", FILM_FRAMES, transient=True)

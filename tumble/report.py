@@ -10,6 +10,7 @@ import json
 import math
 import re
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -104,12 +105,16 @@ def of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Path) -> 
 
 
 def model(asset: Asset, folder: Path) -> Path | None:
-    """A small GLB of the asset in a folder; None where the Gaussians show no surface."""
+    """A small GLB of the asset in a folder; None where the Gaussians show no surface, or xatlas is not installed."""
     try:
         shape = export.surface(asset, MESH)
     except ValueError:
         return None
-    export.glb(asset, shape, MESH, 1.0, folder / "asset.glb")
+    try:
+        export.glb(asset, shape, MESH, 1.0, folder / "asset.glb")
+    except ModuleNotFoundError as error:
+        warnings.warn(f"{error}; the report shows no mesh", stacklevel=2)
+        return None
     return folder / "asset.glb"
 
 

@@ -49,10 +49,10 @@ def alone(path: Path) -> Iterator[None]:
     The lock is the system's, on a file in the directory: it ends with this process, however that ends.
 
     Raises:
-        BadFile: Another process works in it.
+        BadFile: Another process works in it, or it holds something else.
         OSError: The folder cannot be written.
     """
-    _refuse_file(path)
+    _refuse_other(path)
     if os.name != "posix":
         yield  # other systems lack this kind of lock
         return
@@ -96,7 +96,7 @@ def _locked(path: Path) -> int:
 
 
 def open(path: Path, capture_path: Path, recipe: Any, *, content: str = "") -> Run:
-    """Take a folder for a run, or go on with the run that is in it.
+    """Take a folder for a run, or go on with the run that is in it. One that has made nothing yet is another's to take.
 
     Args:
         path: The run directory; may exist if it is empty or holds this very run.
@@ -115,26 +115,40 @@ def open(path: Path, capture_path: Path, recipe: Any, *, content: str = "") -> R
         "recipe": _plain(recipe),
     }
     file = path / RECIPE
-    _refuse_file(path)
-    if not path.exists() or not any(inside.name not in (CAPTURE, LOCK) for inside in path.iterdir()):
+    _refuse_other(path)
+    if not file.is_file():
         files.write_json(file, wanted)
         return Run(path, recipe)
-    if not file.is_file():
-        raise BadFile(path, "is there already and is no run", "choose another folder with -o")
     found = files.read_json(file)
     if not isinstance(found, dict) or not {"capture", "recipe"} <= found.keys():
         raise BadFile(file, "is no recipe of a run", "choose another folder with -o")
     compared = ["recipe", "capture.content" if content and _at(found, "capture.content") else "capture.path"]
     different = [line for name in compared for line in differences(_at(found, name), _at(wanted, name), name)]
-    if different:
+    if different and any(path.glob("[0-9]-*/*.safetensors")):
         rule = f"holds another run: {'; '.join(different)}"
         raise BadFile(path, rule, "choose another folder with -o, or remove this one")
+    if different:
+        files.write_json(file, wanted)  # nothing is made yet
     return Run(path, recipe)
 
 
-def _refuse_file(path: Path) -> None:
-    if path.exists() and not path.is_dir():
+def source(path: Path) -> Path:
+    """Where the capture of a run comes from.
+
+    Raises:
+        BadFile: There is no run.
+    """
+    return Path(files.read_json(path / RECIPE)["capture"]["path"])
+
+
+def _refuse_other(path: Path) -> None:
+    if not path.exists():
+        return
+    if not path.is_dir():
         raise BadFile(path, "is a file", "a run is a folder: choose another with -o")
+    others = [p for p in path.iterdir() if p.name not in (CAPTURE, LOCK) and not p.name.startswith(files.PARTIAL)]
+    if others and not (path / RECIPE).is_file():
+        raise BadFile(path, "is there already and is no run", "choose another folder with -o")
 
 
 def stage(run: Run, number: int, name: str, stage: loop.Stage, cfg: Any, inputs: Any, input_keys: Sequence[str]) -> Any:
@@ -160,7 +174,13 @@ def stage(run: Run, number: int, name: str, stage: loop.Stage, cfg: Any, inputs:
     own_key = key(name, stage.VERSION, cfg, [*input_keys, f"seed {seed}"])
     if not _is_done(folder, own_key):
         log(run, {"name": name, "event": "start", "key": own_key})
-        begun = time.perf_counter()
+        spent, since = 0.0, time.perf_counter()
+
+        def report(record: dict[str, Any]) -> None:
+            nonlocal spent, since
+            log(run, record)
+            spent, since = record["seconds"], time.perf_counter()
+
         output = loop.drive(
             stage,
             cfg,
@@ -168,13 +188,13 @@ def stage(run: Run, number: int, name: str, stage: loop.Stage, cfg: Any, inputs:
             seed=seed,
             checkpoint=folder / CHECKPOINT,
             every=max(500, stage.length(cfg, inputs) // CHECKPOINTS),
-            report=lambda record: log(run, record),
+            report=report,
             name=name,
             key=own_key,
         )
         about = {"stage": name, "version": stage.VERSION, "seed": seed, "inputs": list(input_keys)}
         _store(output, folder, {"key": own_key, **about, "config": _plain(cfg)})
-        log(run, {"name": name, "event": "done", "seconds": round(time.perf_counter() - begun, 3)})
+        log(run, {"name": name, "event": "done", "seconds": round(spent + time.perf_counter() - since, 3)})
     if (folder / CHECKPOINT).exists():
         (folder / CHECKPOINT).unlink()  # of a process that was killed right after the last write
     return tree.load(_output_class(stage), folder / OUT, _device(inputs))

@@ -355,7 +355,7 @@ def _views(document: _Document, frames: list[dict[str, Any]], lens: _Lens) -> Tr
         # Half precision leaves lengths off by 1e-3: enough to invent an angle of 0.4 degrees in an arccos.
         normals=None if normals is None else torch.nn.functional.normalize(normals, dim=-1),
         depth=linear("depth_path", 1),
-        relit={light: _relit(document, frames, light, lens.camera) for light in _light_names(frames)},
+        relit={light: _relit(document, frames, light, lens.camera) for light in _light_names(document, frames)},
     )
 
 
@@ -373,8 +373,12 @@ def _linear_map(document: _Document, frame: dict[str, Any], key: str, channels: 
     return torch.from_numpy(pixels)
 
 
-def _light_names(frames: list[dict[str, Any]]) -> list[str]:
-    return sorted({name for frame in frames for name in frame.get("relit", {})})
+def _light_names(document: _Document, frames: list[dict[str, Any]]) -> list[str]:
+    names = sorted({name for frame in frames for name in frame.get("relit", {})})
+    for name in names:  # a prediction has folders of these names
+        if Path(name).name != name or name in ("", "..") or {"\\", "\0"} & set(name):
+            raise BadFile(document.path, f'"relit" names a light {name!r}, which no folder can be called')
+    return names
 
 
 def _relit(document: _Document, frames: list[dict[str, Any]], light: str, camera: Camera) -> Tensor:
@@ -389,6 +393,5 @@ def _light(document: _Document) -> Environment | None:
 
 
 def _lights(document: _Document, frames: list[dict[str, Any]]) -> dict[str, Environment]:
-    return {
-        name: Environment.read(files.inside(document.root, f"truth/lights/{name}.hdr")) for name in _light_names(frames)
-    }
+    paths = {name: f"truth/lights/{name}.hdr" for name in _light_names(document, frames)}
+    return {name: Environment.read(files.inside(document.root, path)) for name, path in paths.items()}

@@ -55,13 +55,13 @@ def match_pairs(
     """
     # Loaded at the first pair that is not in the cache: a network takes seconds, and may be gone by now.
     load = functools.cache(named("matching", matcher).load)
-    settings = json.dumps(_settings(matcher), sort_keys=True)
+    decides = settings(matcher)
     names = [_window.digest(view) for view in views]
     found = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         for i, j in bar.track(pairs, description=f"matching ({matcher})"):
-            path = _place(cache, matcher, settings, names[i], names[j])
+            path = _place(cache, matcher, decides, names[i], names[j])
             if path is not None and path.exists():
                 found.append(_read(path, views[i].number, views[j].number))
                 continue
@@ -71,8 +71,13 @@ def match_pairs(
     return found
 
 
+def settings(matcher: str) -> str:
+    """All that decides a matcher's result besides the views, as JSON."""
+    return json.dumps(_settings(matcher), sort_keys=True)
+
+
 def _settings(matcher: str) -> dict[str, object]:
-    """All that decides a matcher's result besides the views: the constants of its file, and of those it is made of."""
+    """The constants of a matcher's file, and of those it is made of."""
     module = named("matching", matcher)
     settings: dict[str, object] = {
         f"{source.__name__}.{name}": value
