@@ -101,7 +101,7 @@ def measure(path: Path) -> dict[str, Any]:
     assert truth is not None, "a capture with truth"
     assert capture.trajectory is not None, "a capture with known poses"
     inputs, clock, curve = refine.Inputs(capture, capture.trajectory), Clock(), []
-    cfg = known_poses(DRAFT.refine)
+    cfg = known_poses(DRAFT).refine
     refined, seconds = _staged(refine, cfg, inputs, clock, curve, lambda s: _of_refine(s, capture, truth))
     parts = {"refine": _shares(clock, seconds)}
     inputs = decompose.Inputs(capture, refined)

@@ -52,7 +52,7 @@ def main() -> None:
     rows = []
     for path in arguments.captures:
         capture, truth = folder.load(path), folder.load_truth(path)
-        refined = loop.drive(refine, known_poses(DRAFT.refine), refine.Inputs(capture, _known(capture)), seed=0)
+        refined = loop.drive(refine, known_poses(DRAFT).refine, refine.Inputs(capture, _known(capture)), seed=0)
         true_surface = on_the_surface(path, capture) if {"geometry", "all"} & set(arguments.given) else refined
         for given in arguments.given:
             surface = true_surface if given in ("geometry", "all") else refined
@@ -111,7 +111,7 @@ def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
         points = torch.tensor(positions, dtype=torch.float32)
         return hull.OrientedPoints(points, normalize(torch.tensor(normals).float(), dim=-1), hull.spacing(points))
 
-    cfg = known_poses(DRAFT.refine)
+    cfg = known_poses(DRAFT).refine
     rates = replace(cfg.rates, means=0.0, quats=0.0, sdf=0.0)
     cfg = replace(cfg, points=cfg.limit, limit=cfg.limit, every=cfg.steps, rates=rates)
     with patch.object(hull, "surface", surface):

@@ -67,6 +67,18 @@ def test_a_fine_map_is_averaged_down_and_keeps_its_light() -> None:
     torch.testing.assert_close(filtering.prefilter(fine).stack, filtering.prefilter(coarse).stack, rtol=5e-3, atol=1e-3)
 
 
+def test_a_sharp_mirror_sees_the_finest_texels_and_a_rough_one_their_mean() -> None:
+    torch.manual_seed(0)
+    environment = Environment.from_radiance(torch.rand(4 * filtering.ROWS, 8 * filtering.ROWS, 3))
+    light, d = filtering.prefilter(environment), fibonacci_sphere(300)
+    first = 1 / (filtering.LEVELS - 1)
+    at = [light.lookup(d, torch.full((300, 1), roughness)) for roughness in (0.0, first / 2, first)]
+    torch.testing.assert_close(at[0], environment.lookup(d))
+    torch.testing.assert_close(at[1], (at[0] + at[2]) / 2)
+    coarse = filtering.prefilter(environment.resampled(filtering.ROWS, 2 * filtering.ROWS))
+    torch.testing.assert_close(at[2], coarse.lookup(d, torch.full((300, 1), first)), rtol=0.02, atol=0)
+
+
 def test_gradients_reach_texels_direction_and_roughness() -> None:
     torch.manual_seed(0)
     d = normalize(torch.randn(5, 3, dtype=torch.float64), dim=-1)

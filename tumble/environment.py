@@ -62,7 +62,7 @@ class Environment:
 
         Differentiable in the texels and in the directions.
         """
-        return _bilinear(self.radiance, equirect_from_direction(d_env))
+        return bilinear(self.radiance, equirect_from_direction(d_env))
 
     def integral(self) -> Float[Tensor, "3"]:
         """Radiance times solid angle, summed over the sphere."""
@@ -107,7 +107,8 @@ class Environment:
         return texel_solid_angles(*self.log_radiance.shape[:2]).to(self.log_radiance)
 
 
-def _bilinear(texels: Float[Tensor, "h w c"], uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
+def bilinear(texels: Float[Tensor, "h w c"], uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
+    """Values of a lat-long map at places in [0, 1]^2, texel centres at +0.5; continuous over seam and poles."""
     h, w, _ = texels.shape
     x, y = uv[..., 0] * w - 0.5, uv[..., 1] * h - 0.5
     left, top = x.detach().floor(), y.detach().floor()

@@ -1,4 +1,4 @@
-"""The terms of the paper's objectives (eq. 9-14). Each is a scalar that is 0 where it must be; none knows a model.
+"""The terms of the paper's objectives (eq. 11, 14). Each is a scalar that is 0 where it must be; none knows a model.
 
 Pictures are sRGB in [0, 1], channels last. `valid` is 1 where the mask is known and 0 where it is not: unknown pixels
 enter no term.
@@ -39,7 +39,7 @@ def photometric(
     ssim_weight: float,
     size: tuple[int, int] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) L1 + w (1 - SSIM) over the picture (eq. 9).
+    """(1 - w) L1 + w (1 - SSIM) over the picture (L_render, eq. 11).
 
     Args:
         size: Height and width of the picture where only a window of it is given, outside of which both are black, as
@@ -93,7 +93,7 @@ def normal_consistency(
     *,
     crease: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """x = 1 - cosine between rendered normals and those of the rendered depth (eq. 10), averaged over the picture.
+    """x = 1 - cosine between rendered normals and those of the depth (L_normal, eq. 11), averaged over the picture.
 
     Args:
         crease: With c above 0, x / (1 + c x): differences beyond 1 / c are an edge or a groove, which smoothing would
@@ -107,12 +107,12 @@ def normal_consistency(
 
 
 def variance(depth_var: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Standard deviation of depth along each ray (eq. 11)."""
+    """Standard deviation of depth along each ray (L_variance, eq. 11)."""
     return (depth_var.clamp_min(0) + 1e-6).sqrt().mean() - 1e-3
 
 
 def effective_rank(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Penalty on needles: 0 for discs and balls (eq. 12), with the mean thickness added, which is what flattens."""
+    """Penalty on needles: 0 for discs and balls (L_rank, eq. 11), and the mean thickness, which is what flattens."""
     # Three long rows: softmax over many short ones takes most of a millisecond.
     log_share = (2 * log_scales.mT.contiguous()).log_softmax(0)
     entropy = -(log_share.exp() * log_share).sum(0)

@@ -50,9 +50,12 @@ EXACT = 2e-3
 
 
 def psnr(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"]) -> float:
-    """Peak signal-to-noise ratio over the counted pixels, for a peak of 1 [dB], at most `BEST_PSNR`."""
-    error = (x - y)[counted].square().mean()
-    return min(BEST_PSNR, -10 * math.log10(max(float(error), 1e-30)))
+    """Peak signal-to-noise ratio over the counted pixels, for a peak of 1 [dB], at most `BEST_PSNR`.
+
+    NaN where no pixel counts, or one that does is NaN.
+    """
+    error = float((x - y)[counted].square().mean())
+    return math.nan if math.isnan(error) else min(BEST_PSNR, -10 * math.log10(max(error, 1e-30)))
 
 
 def rmse(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counted: Bool[Tensor, "h w"]) -> float:

@@ -17,11 +17,12 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, grid_sample
 
 from tumble.directions import equirect_from_direction, texel_directions, texel_solid_angles
-from tumble.environment import Environment
+from tumble.environment import Environment, bilinear
 
 LEVELS = 9
 ROWS = 64
-"""Rows of the finest map that is convolved; finer ones are averaged down first. Its texels are 2.8 degrees."""
+"""Rows of the finest map that is convolved; finer ones are averaged down first. Its texels are 2.8 degrees: lobes of
+roughness 1 / (LEVELS - 1) and more are wider."""
 SUBDIVISIONS = 4
 """A lobe is integrated over a texel with this many samples each way."""
 
@@ -33,6 +34,8 @@ class Prefiltered:
     environment: Environment
     stack: Float[Tensor, "levels h w 3"]
     """Linear radiance, env frame."""
+    radiance: Float[Tensor, "H W 3"]
+    """Of the light itself, which may be finer than the stack."""
 
     def lookup(self, d_env: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]) -> Float[Tensor, "p 3"]:
         """Radiance in mirrored unit directions: linear between levels, bilinear on the map.
@@ -43,12 +46,17 @@ class Prefiltered:
         # One texel more on all sides: round the seam, and over the pole the same row on the far side of the map.
         rows = torch.cat([self.stack[:, :1].roll(w // 2, 2), self.stack, self.stack[:, -1:].roll(w // 2, 2)], 1)
         padded = torch.cat([rows[:, :, -1:], rows, rows[:, :, :1]], 2)
-        u, v = equirect_from_direction(d_env).split(1, -1)
+        uv = equirect_from_direction(d_env)
+        u, v = uv.split(1, -1)
         level = roughness.clamp(0, 1) * (levels - 1)
         places = [(2 * u * w + 2) / (w + 2) - 1, (2 * v * h + 2) / (h + 2) - 1, (2 * level + 1) / levels - 1]
         volume, grid = padded.permute(3, 0, 1, 2)[None], torch.cat(places, -1)[None, None, None]
         found = grid_sample(volume, grid, padding_mode="border", align_corners=False)
-        return found[0, :, 0, 0].mT
+        found = found[0, :, 0, 0].mT
+        if len(self.radiance) == h:
+            return found
+        share = (1 - level).clamp(min=0)
+        return found + share * (bilinear(self.radiance, uv) - bilinear(self.stack[0], uv))
 
     def cells(self, d_env: Float[Tensor, "D 3"]) -> Float[Tensor, "D 3"]:
         """Radiance of the cells that directions of equal area stand for, rather than of a point of each.
@@ -62,7 +70,7 @@ class Prefiltered:
 
 def prefilter(environment: Environment) -> Prefiltered:
     """The stack of a light; linear in its radiance and differentiable."""
-    radiance = environment.radiance
+    light = radiance = environment.radiance
     if radiance.shape[0] > ROWS:
         size, weight = (ROWS, 2 * ROWS), texel_solid_angles(*radiance.shape[:2]).to(radiance)
         total = adaptive_avg_pool2d((radiance * weight[..., None]).movedim(-1, 0), size)
@@ -72,7 +80,7 @@ def prefilter(environment: Environment) -> Prefiltered:
     mixed = _lobes(h, w).to(radiance) @ waves
     mixed = torch.view_as_complex(mixed.unflatten(2, (3, 2))).unflatten(1, (LEVELS - 1, h))
     rough = torch.fft.irfft(mixed, n=w, dim=0).permute(1, 2, 0, 3)
-    return Prefiltered(environment, torch.cat([radiance[None], rough]))
+    return Prefiltered(environment, torch.cat([radiance[None], rough]), light)
 
 
 @cache

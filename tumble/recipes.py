@@ -131,9 +131,13 @@ a heavier match term: the cracker box is 8 degrees off after 99 degrees of turn,
 QUALITIES = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 
 
-def known_poses(cfg: Refine) -> Refine:
-    """Stage 2 of captures whose poses are given: they stay as they are."""
-    return replace(cfg, rates=replace(cfg.rates, poses=0.0), realignments=0)
+def known_poses(recipe: Recipe) -> Recipe:
+    """For captures whose poses are given: they stay as they are."""
+    second, third = recipe.refine, recipe.decompose
+    second = replace(second, rates=replace(second.rates, poses=0.0), realignments=0)
+    if isinstance(third, Decompose):
+        third = replace(third, rates=replace(third.rates, poses=0.0))
+    return replace(recipe, refine=second, decompose=third)
 
 
 def static_colour(recipe: Recipe) -> Recipe:

@@ -105,17 +105,17 @@ def reconstruct(
 def _reconstruct(capture: Capture, capture_path: Path, out: Path, recipe: Recipe, device: torch.device | str) -> Asset:
     content = run.capture_key(capture)
     opened = run.open(out, capture_path, recipe, content=content)
-    trajectory, keys, cfg = capture.trajectory, [content], recipe.refine
+    trajectory, keys = capture.trajectory, [content]
     if trajectory is None:
         tracked, key = _track(opened, capture, capture_path, content)
         kept = torch.where(~tracked.health.lost)[0].tolist()
         trajectory, keys = tracked.trajectory.select(kept), [key]
         capture = replace(capture.select(kept), camera=tracked.camera)
     else:
-        cfg = known_poses(cfg)
+        recipe = known_poses(recipe)
     capture, trajectory = tree.to(capture, device), tree.to(trajectory, device)
-    refined = run.stage(opened, 2, "refine", refine, cfg, refine.Inputs(capture, trajectory), keys)
-    keys = [run.key("refine", refine.VERSION, cfg, keys)]
+    refined = run.stage(opened, 2, "refine", refine, recipe.refine, refine.Inputs(capture, trajectory), keys)
+    keys = [run.key("refine", refine.VERSION, recipe.refine, keys)]
     last = average if isinstance(recipe.decompose, average.Config) else decompose
     asset = run.stage(opened, 3, "decompose", last, recipe.decompose, decompose.Inputs(capture, refined), keys)
     asset = tree.to(asset, "cpu")

@@ -40,7 +40,8 @@ OUTLINE = 0.3
 
 @dataclass(frozen=True)
 class Weights:
-    """Eq. 9-13; values from appendix A, stage 2."""
+    """Eq. 11; values from appendix A, stage 2. A hundredth of `gamma` counts; its rate moves gamma whatever that is,
+    for nothing else pulls at it and Adam knows no scale."""
 
     mask: float = 1.0
     normal: float = 0.05
@@ -299,7 +300,7 @@ def _terms(
     cfg: Config, params: Params, view: Buffers, truth: Frame, camera: Camera, T_cam_obj: SE3, progress: float
 ) -> dict[str, Tensor]:
     weights, gaussians = cfg.weights, params.points.gaussians
-    ramp = min(1.0, progress / cfg.ramp)
+    ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
     full, size, seen, depth = camera, (camera.height, camera.width), view.weight > 0, view.depth
     view, truth, camera, share = _window(view, truth, camera)
     image = losses.developed(view.rgb, truth.image)

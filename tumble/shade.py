@@ -136,7 +136,7 @@ def shade(
     f0: float,
     bounce: Bounce | AveragedBounce | None = None,
 ) -> Float[Tensor, "p 3"]:
-    """Reflected radiance (eq. 10), both lobes summed over the visibility's directions.
+    """Reflected radiance (eq. 3), both lobes summed over the visibility's directions.
 
     Differentiable in everything but directions and visibility. Unbiased if the directions are rotated at random.
 
