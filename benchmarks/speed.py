@@ -160,15 +160,17 @@ def _shares(clock: Clock, seconds: float) -> dict[str, float]:
 
 def _of_refine(state: State, capture: Capture, truth: Truth) -> dict[str, float]:
     assert truth.trajectory is not None
-    params, sky, image = state.params, refine.sky(state), []
+    params, sky, image, full = state.params, refine.sky(state), [], []
     albedo = torch.sigmoid(params.points.albedo_logits)
     for number in truth.views("shared"):
         arguments = (truth.trajectory.T_cam_obj[number], truth.trajectory, capture.camera)
         view = refine.render(params.points, params.gamma, params.light, *arguments, sky=sky)
         rendered, photograph = srgb_from_linear(view.rgb).clamp(0, 1), truth.images[number] / 255
         image.append(metrics.psnr(rendered, photograph, truth.foreground[number]))
+        full.append(metrics.psnr(rendered, photograph, torch.ones_like(truth.foreground[number])))
     gaussians = params.points.gaussians
-    return {"image": round(sum(image) / len(image), 2)} | _albedo(gaussians, params.gamma, albedo, capture, truth)
+    scores = {name: round(sum(x) / len(x), 2) for name, x in (("image", image), ("image_full", full))}
+    return scores | _albedo(gaussians, params.gamma, albedo, capture, truth)
 
 
 def _of_decompose(params: decompose.Params, capture: Capture, truth: Truth) -> dict[str, float]:
@@ -192,9 +194,9 @@ def page(command: str, rows: list[dict[str, Any]]) -> str:
         for stage, parts in row["parts"].items():
             listed = ", ".join(f"{name} {value:.1f}" for name, value in parts.items())
             lines += [f"- {stage} {seconds[stage]:.1f} s: {listed}"]
-        lines += ["", "| s | stage | step | image [dB] | albedo [dB] |", "|---|---|---|---|---|"]
+        lines += ["", "| s | stage | step | image fg / full [dB] | albedo fg [dB] |", "|---|---|---|---|---|"]
         for look in row["curve"]:
-            image = look.get("image", "")
+            image = f"{look['image']} / {look['image_full']}" if "image" in look else ""
             lines += [f"| {look['seconds']:.0f} | {look['stage']} | {look['step']} | {image} | {look['albedo']} |"]
         lines += [""]
     return "\n".join(lines)

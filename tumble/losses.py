@@ -1,4 +1,4 @@
-"""The terms of the paper's objectives (eq. 11, 14). Each is a scalar that is 0 where it must be; none knows a model.
+"""The terms of the paper's objectives (eq. 11, 14). Each is a scalar; none knows a model.
 
 Pictures are sRGB in [0, 1], channels last. `valid` is 1 where the mask is known and 0 where it is not: unknown pixels
 enter no term.
@@ -189,6 +189,10 @@ def unevenness(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
 
 
 def material(view: Buffers, mask: Float[Tensor, "h w"], photograph: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Edge-aware smoothness of albedo and roughness on the object (L_material, eq. 14)."""
+    """Edge-aware smoothness of albedo and roughness, which count as 0 beyond the outline (L_material, eq. 14).
+
+    So it was published (Relightable 3D Gaussian); what that takes off the outermost pixels is within the noise of a run
+    at the weights of STANDARD and DRAFT.
+    """
     inside = (mask * (view.alpha > 0.5))[..., None]
     return edge_aware(torch.cat([view.features["albedo"], view.features["roughness"]], -1) * inside, photograph)
