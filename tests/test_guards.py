@@ -21,7 +21,7 @@ LAYERS = [
     | {"texture", "symmetry"},
     {"prefilter", "shade", "importance", "mesh", "hull", "views", "shadow"},
     {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching", "comeback"}
-    | {"pairwise", "averaging", "evidence", "bundle", "relocate", "gauge", "realign", "matte"},
+    | {"pairwise", "averaging", "evidence", "bundle", "relocate", "gauge", "realign"},
     {"loop"},
     {"track", "lift", "graph", "progressive", "refine", "decompose", "average", "relight"},
     {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}

@@ -48,11 +48,11 @@ def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkey
         # The rasterizer has nothing to differentiate where nothing is.
         return [*terms.values(), *(x[rendered > 0] for x in gradients)]
 
-    cut, _, _, share = losses.window(view, truth, arguments[4])
+    cut, _, _, share = refine._window(view, truth, arguments[4])
     assert cut.alpha.shape == (19 + 2 * losses.SSIM_MARGIN, 21 + 2 * losses.SSIM_MARGIN)
     assert share == cut.alpha.numel() / (h * w)
     found = terms_and_gradients()
-    monkeypatch.setattr(losses, "window", lambda view, truth, camera: (view, truth, camera, 1.0))
+    monkeypatch.setattr(refine, "_window", lambda view, truth, camera: (view, truth, camera, 1.0))
     torch.testing.assert_close(found, terms_and_gradients())
 
 
@@ -61,7 +61,7 @@ def test_a_picture_with_nothing_in_it_has_losses_too() -> None:
     coloured = torch.zeros(20, 20, 3)
     view = Buffers(black, black, black, coloured, coloured, {}, none, none.int(), black.int())
     truth, camera = Frame(coloured, black, torch.ones(20, 20, 1)), Camera.from_fov(1.0, 20, 20)
-    assert losses.window(view, truth, camera) == (view, truth, camera, 1.0)
+    assert refine._window(view, truth, camera) == (view, truth, camera, 1.0)
 
 
 def ball() -> tuple[Points, SE3, Capture]:

@@ -58,12 +58,6 @@ class State:
     memory: dict[str, Tensor] = field(default_factory=dict)
     """What else a stage remembers: accumulators, caches."""
 
-    def next_frame(self, n: int) -> int:
-        """The next of `n` frames: all in a new random order, again and again. `memory["order"]` starts empty."""
-        if self.step % n == 0 or not len(self.memory["order"]):
-            self.memory["order"] = torch.randperm(n, generator=self.rng)
-        return int(self.memory["order"][self.step % n])
-
 
 @runtime_checkable
 class Stage(Protocol):

@@ -4,8 +4,6 @@ Pictures are sRGB in [0, 1], channels last. `valid` is 1 where the mask is known
 enter no term.
 """
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -14,8 +12,7 @@ from torch.nn.functional import grid_sample, pad
 from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.gaussians import Gaussians
-from tumble.images import crop, crop_box, edge_aware, planes, srgb_from_linear, ssim_map
-from tumble.photograph import Frame
+from tumble.images import edge_aware, planes, srgb_from_linear, ssim_map
 from tumble.se3 import SE3
 
 SSIM_MARGIN = 10
@@ -32,24 +29,6 @@ def developed(linear: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
     """
     srgb = srgb_from_linear(linear)
     return torch.where((photograph >= SATURATED) & (srgb > photograph), photograph, srgb)
-
-
-def window(view: Buffers, truth: Frame, camera: Camera) -> tuple[Buffers, Frame, Camera, float]:
-    """The part of a view beyond which rendering and photograph are black, and its share of the picture.
-
-    Means over the picture are those over the window times the share: often a third of the work.
-    """
-    shown = (view.alpha.detach() > 0) | (truth.image > 0).any(-1) | (truth.mask > 0)
-    if not shown.any():
-        return view, truth, camera, 1.0
-    box = crop_box(shown, SSIM_MARGIN)
-    cut = replace(
-        view,
-        **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
-        rgb=planes(crop(view.rgb, box)).movedim(0, -1),
-    )
-    seen = Frame(planes(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box))
-    return cut, seen, camera.cropped(*box), box[2] * box[3] / shown.numel()
 
 
 def photometric(

@@ -13,13 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble import coarse_light, densify, hull, losses, matte, optim
+from tumble import coarse_light, densify, hull, losses, optim
 from tumble.backends import threads_for_kernels
 from tumble.buffers import Buffers
 from tumble.camera import Camera
 from tumble.capture import Capture
 from tumble.coarse_light import CoarseLight
 from tumble.gaussians import Gaussians, constant_sh, facing, opacity, sdf_from_opacity
+from tumble.images import crop, crop_box, planes
 from tumble.loop import State
 from tumble.photograph import Frame, frame
 from tumble.rasterize import rasterize
@@ -27,15 +28,12 @@ from tumble.realign import realign
 from tumble.se3 import SE3
 from tumble.shadow import Sky, look_around
 from tumble.trajectory import Trajectory, env_from_obj
-from tumble.tree import detach
 
-VERSION = 10
+VERSION = 9
 SEEN_FROM = 16  # frames, in tracing what Gaussians see
 HINT = 0.3
 """Share of the gradient of colours that turns normals: the light is too coarse to be trusted. Hand-held, all of it
 leaves the knight's normals at 8.2 degrees, this share or none at 7.3; the bottle's are 3.8 with it, 4.0 without."""
-MATTE = 0.2
-"""Share of the run after which it is asked whether there is a highlight (`matte`)."""
 OUTLINE = 0.3
 """Weight of coverage against colours where poses are realigned."""
 
@@ -52,8 +50,8 @@ class Weights:
     gamma: float = 5.0
     proj: float = 1.0
     highlight: float = 0.0
-    """Of an object whose highlight is not that of glass: noise in normals and light alone pulls the highlight down by a
-    third, and a third too faint puts the rest into the albedo. It saturates: a matte object pays it (`matte`).
+    """Of an object whose highlight is not that of glass. It saturates: noise in normals and light alone pulls the
+    highlight down by a third, and a third too faint puts the rest into the albedo; a Lambertian object pays it.
     """
 
 
@@ -250,11 +248,6 @@ def render(
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
 
 
-def _view(params: Params, inputs: Inputs, T_cam_obj: SE3, shade: Sky | None, mask: Tensor | None = None) -> Buffers:
-    camera = inputs.capture.camera
-    return render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera, mask, sky=shade)
-
-
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
@@ -265,15 +258,13 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         _look_around(inputs, state)
     if state.step in _realignments(cfg):
         _realign(inputs, state)
-    if state.step == int(MATTE * cfg.steps) and cfg.rates.highlight and cfg.colour == "light":
-        _ask_for_highlight(inputs, state)
     params, camera = state.params, inputs.capture.camera
-    number = state.next_frame(len(inputs.capture))
+    number = _draw(state, len(inputs.capture))
     T_cam_obj = pose(params, inputs, number)
-    view = _view(params, inputs, T_cam_obj, sky(state))
+    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera, sky=sky(state))
     state.memory["shown"] = torch.maximum(state.memory["shown"], view.weight.detach())
     terms = _terms(cfg, params, view, frame(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
-    optim.anneal(state.optimizer, _annealed(cfg, progress, matte="matte" in state.memory))
+    optim.anneal(state.optimizer, _annealed(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()} | {
         "gaussians": float(len(params.points.albedo_logits))
@@ -288,33 +279,21 @@ def _look_around(inputs: Inputs, state: State) -> None:
     state.memory |= {"sky.seen": found.seen, "sky.whole": found.whole}
 
 
-def _ask_for_highlight(inputs: Inputs, state: State) -> None:
-    """Leave the object without a highlight, from here on, if it is matte."""
-    params = detach(state.params)
-
-    def error(trial: matte.Trial, number: int) -> Tensor:
-        tried = replace(params, points=replace(params.points, albedo_logits=trial.albedo_logits), light=trial.light)
-        view = _view(tried, inputs, pose(params, inputs, number), sky(state))
-        return matte.left_over(view, frame(inputs.capture, number, view.alpha))
-
-    start = matte.Trial(params.points.albedo_logits, params.light)
-    found = matte.without_highlight(start, error, len(inputs.capture))
-    if found is not None:
-        params.points.albedo_logits.copy_(found.albedo_logits)  # detached: the same memory
-        params.light.coefficients.copy_(found.light.coefficients)
-        params.light.log_highlight.copy_(found.light.log_highlight)
-        state.memory["matte"] = torch.ones_like(params.gamma)
-
-
 def sky(state: State) -> Sky | None:
     """What Gaussians saw when it was last traced."""
     return Sky(state.memory["sky.seen"], state.memory["sky.whole"]) if "sky.seen" in state.memory else None
 
 
-def _annealed(cfg: Config, progress: float, *, matte: bool) -> dict[str, float]:
+def _draw(state: State, n: int) -> int:
+    """The next frame: all frames in a new random order, again and again."""
+    if state.step % n == 0 or not len(state.memory["order"]):
+        state.memory["order"] = torch.randperm(n, generator=state.rng)
+    return int(state.memory["order"][state.step % n])
+
+
+def _annealed(cfg: Config, progress: float) -> dict[str, float]:
     slow = 0.2**progress
-    means, highlight = cfg.rates.decay**progress, 0.0 if matte else slow
-    return {"": slow, "points.gaussians.means": means, "gamma": 1.0, "light.log_highlight": highlight}
+    return {"": slow, "points.gaussians.means": cfg.rates.decay**progress, "gamma": 1.0}
 
 
 def _terms(
@@ -323,7 +302,7 @@ def _terms(
     weights, gaussians = cfg.weights, params.points.gaussians
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
     full, size, seen, depth = camera, (camera.height, camera.width), view.weight > 0, view.depth
-    view, truth, camera, share = losses.window(view, truth, camera)
+    view, truth, camera, share = _window(view, truth, camera)
     image = losses.developed(view.rgb, truth.image)
     from_depth, known = losses.surface_normals(view.depth, view.alpha > 0.5, camera, T_cam_obj)
     normal = losses.normal_consistency(view.normal, from_depth, known, crease=cfg.crease)
@@ -339,19 +318,38 @@ def _terms(
     }
 
 
+def _window(view: Buffers, truth: Frame, camera: Camera) -> tuple[Buffers, Frame, Camera, float]:
+    """The part of a view beyond which rendering and photograph are black, and its share of the picture.
+
+    Means over the picture are those over the window times the share: often a third of the work.
+    """
+    shown = (view.alpha.detach() > 0) | (truth.image > 0).any(-1) | (truth.mask > 0)
+    if not shown.any():
+        return view, truth, camera, 1.0
+    box = crop_box(shown, losses.SSIM_MARGIN)
+    cut = replace(
+        view,
+        **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
+        rgb=planes(crop(view.rgb, box)).movedim(0, -1),
+    )
+    seen = Frame(planes(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box))
+    return cut, seen, camera.cropped(*box), box[2] * box[3] / shown.numel()
+
+
 @torch.no_grad()
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
-    params = state.params
+    params, camera = state.params, inputs.capture.camera
     assert state.optimizer is not None, "init makes one"
     bad = params.gamma.new_zeros(len(params.points.albedo_logits))
     numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: cfg.views].tolist()
     for number in numbers:
         T_cam_obj = pose(params, inputs, number)
-        first = _view(params, inputs, T_cam_obj, sky(state))
+        arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+        first = render(*arguments, sky=sky(state))
         truth = frame(inputs.capture, number, first.alpha)
         error = (losses.developed(first.rgb, truth.image) - truth.image).abs().mean(-1)
         where = densify.bad_pixels(error, truth.mask, relative=cfg.bad, absolute=cfg.bad_floor)
-        bad += _view(params, inputs, T_cam_obj, sky(state), where).touched / len(numbers)
+        bad += render(*arguments, mask=where, sky=sky(state)).touched / len(numbers)
     drop = opacity(params.points.gaussians.sdf, params.gamma) < cfg.least_opacity
     drop |= state.memory["shown"] < cfg.least_weight
     plan = densify.plan(bad, drop, threshold=cfg.importance, fraction=cfg.fraction, limit=cfg.limit)
@@ -379,7 +377,8 @@ def _unexplained(
     params: Params, inputs: Inputs, truth: Frame, shade: Sky | None, T_cam_obj: SE3
 ) -> Float[Tensor, " r"]:
     """Colours and, with less weight, coverage that a pose leaves over of a photograph, sRGB."""
-    view = _view(params, inputs, T_cam_obj, shade)
+    arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)
+    view = render(*arguments, sky=shade)
     colour = losses.developed(view.rgb, truth.image) - truth.image
     outline = OUTLINE * (view.alpha - truth.mask)[..., None]
     return (torch.cat([colour, outline], -1) * truth.valid).flatten()
