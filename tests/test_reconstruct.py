@@ -355,3 +355,16 @@ def test_a_highlight_that_a_trial_found_has_no_price(
     n = len(refined.albedo)
     assert price(None) == pytest.approx(cfg.weights.highlight)
     assert price(highlight.Fit(1, 0.7, torch.zeros(5, n, 3))) == 0
+
+
+@pytest.mark.parametrize(("strength", "tried"), [(1.0, True), (0.9, True), (0.8, False), (0.1, False)])
+def test_only_a_highlight_like_that_of_glass_is_tried(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch, strength: float, tried: bool
+) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    light = dataclasses.replace(refined.light, log_highlight=torch.tensor(strength).log())
+    asked: list[int] = []
+    monkeypatch.setattr(highlight, "fit", lambda *samples: asked.append(1))
+    inputs = decompose.Inputs(folder.load(capture), dataclasses.replace(refined, light=light))
+    decompose.init(dataclasses.replace(RECIPE.decompose, fitted=True), inputs, torch.Generator().manual_seed(0))
+    assert bool(asked) == tried

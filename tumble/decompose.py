@@ -35,7 +35,7 @@ from tumble.trajectory import Trajectory, env_from_obj
 from tumble.tree import detach, named_tensors
 from tumble.views import buffers_of
 
-VERSION = 13
+VERSION = 14
 LOOK_EVERY = 100
 """Steps between two looks at how far geometry has moved."""
 FAINT = 0.2
@@ -170,7 +170,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     memory = {"directions": torch.stack(turns), "price": cfg.weights.highlight * torch.ones_like(params.gamma)}
     state = State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
     _look_around(cfg, inputs, state)
-    if cfg.fitted and params.log_tint.exp().mean() > FAINT:
+    if cfg.fitted and refined.light.log_highlight.exp() > highlight.SURE:
         fit_highlight(cfg, inputs, state)
     return state
 
