@@ -573,3 +573,11 @@ def test_true_views_in_the_predicted_frame_show_the_same_pixels() -> None:
     seen_true = truth.T_cam_obj @ x_true
     seen_pred = alignment.to_prediction(truth).T_cam_obj @ x_pred
     torch.testing.assert_close(seen_pred[:, :2] / seen_pred[:, 2:], seen_true[:, :2] / seen_true[:, 2:])
+
+
+def test_what_is_not_a_number_scores_none() -> None:
+    x, everywhere = torch.full((2, 2, 3), 0.5), torch.ones(2, 2, dtype=torch.bool)
+    assert math.isnan(metrics.psnr(x, x, ~everywhere))
+    assert metrics.psnr(x, x, everywhere) == metrics.BEST_PSNR
+    x[0, 0, 0] = math.nan
+    assert math.isnan(metrics.psnr(x, torch.full_like(x, 0.5), everywhere))

@@ -368,3 +368,10 @@ def test_only_a_highlight_like_that_of_glass_is_tried(
     inputs = decompose.Inputs(folder.load(capture), dataclasses.replace(refined, light=light))
     decompose.init(dataclasses.replace(RECIPE.decompose, fitted=True), inputs, torch.Generator().manual_seed(0))
     assert bool(asked) == tried
+
+
+def test_given_poses_stay_in_every_stage() -> None:
+    loose = dataclasses.replace(RECIPE.decompose, rates=dataclasses.replace(RECIPE.decompose.rates, poses=1e-2))
+    known = recipes.known_poses(dataclasses.replace(RECIPE, decompose=loose))
+    assert (known.refine.rates.poses, known.refine.realignments, known.decompose.rates.poses) == (0, 0, 0)
+    assert recipes.known_poses(recipes.averaging(RECIPE)).decompose == average.Config()
