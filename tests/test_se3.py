@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -68,7 +69,8 @@ def test_motions_form_a_group(a: Tensor, b: Tensor, c: Tensor) -> None:
 @settings(deadline=None)
 @given(tangents())
 def test_exponential_is_the_matrix_exponential(tangent: Tensor) -> None:
-    same(SE3.exp(tangent).matrix(), torch.linalg.matrix_exp(generator_matrix(tangent)))
+    # Torch's own matrix exponential errs by 2e-11 at a rotation of 1/32.
+    same(SE3.exp(tangent).matrix(), torch.from_numpy(expm(generator_matrix(tangent).numpy())))
 
 
 @settings(deadline=None)
