@@ -22,7 +22,7 @@ from tumble.confidence import confidence
 from tumble.datasets import which
 from tumble.images import srgb_from_linear
 from tumble.rasterize import rasterize
-from tumble.run import RECIPE
+from tumble.run import source
 from tumble.views import buffers_of
 
 COUNTS = ("views", "lights", "halves")
@@ -38,7 +38,7 @@ def main() -> None:
     for run, capture in zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True):
         truth = which(capture).load_truth(capture)
         assert truth is not None, f"{capture} has no truth"
-        assert Path(files.read_json(run / RECIPE)["capture"]["path"]).name == capture.name, "another capture's run"
+        assert source(run).name == capture.name, "another capture's run"
         pixels.append(counted(reconstruct.finished(run), truth))
         rows.append({"capture": capture.name, **correlations(pixels[-1])})
         print(rows[-1], flush=True)

@@ -268,7 +268,10 @@ def report(run: Positional[Path], /, capture: Path | None = None) -> None:
 
 
 def evaluate(
-    prediction: Positional[Path], capture: Positional[Path | None] = None, /, out: OptionalFolder = None
+    prediction: Positional[Path],
+    capture: Annotated[Positional[Path | None], arg(metavar="[PATH]")] = None,
+    /,
+    out: OptionalFolder = None,
 ) -> None:
     """Score a prediction folder, or a run, against a capture with truth: report.json and a picture sheet.
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from tumble import decompose, export, files, gallery, loop, run, tree
+from tumble import decompose, export, gallery, loop, run, tree
 from tumble.asset import Asset
 from tumble.capture import Capture
 from tumble.datasets import which
@@ -279,7 +279,7 @@ def _viser() -> Any:
 
 def _capture(out: Path) -> Capture | None:
     """The run's photographs, if they are still where the run found them."""
-    path = Path(files.read_json(out / run.RECIPE)["capture"]["path"])
+    path = run.source(out)
     return which(path).load(path) if path.exists() else None
 
 
