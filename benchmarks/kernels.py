@@ -51,80 +51,93 @@ def main() -> None:
     arguments.out.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
-def measure(backend: Backend, name: str, threads: int, sizes: list[tuple[int, int]]) -> list[dict[str, Any]]:
+CPU = torch.device("cpu")
+
+
+def measure(
+    backend: Backend, name: str, threads: int, sizes: list[tuple[int, int]], *, device: torch.device = CPU
+) -> list[dict[str, Any]]:
     """All rows of one backend at one number of threads."""
     return [
-        *rasterizing(backend, name, threads, sizes),
-        *tracing(backend, name, threads),
-        *shading(backend, name, threads),
+        *rasterizing(backend, name, threads, sizes, device=device),
+        *tracing(backend, name, threads, device=device),
+        *shading(backend, name, threads, device=device),
     ]
 
 
 def rasterizing(
-    backend: Backend, name: str, threads: int, sizes: list[tuple[int, int]], runs: int = RUNS
+    backend: Backend,
+    name: str,
+    threads: int,
+    sizes: list[tuple[int, int]],
+    runs: int = RUNS,
+    *,
+    device: torch.device = CPU,
 ) -> list[dict[str, Any]]:
     """Milliseconds, projection and binning included, with no feature and with FEATURES of them."""
     rows = []
     for n, size in sizes:
         for c in (0, FEATURES):
             inputs = [*shell(n), torch.rand(n, 1, 3) + 0.5, torch.rand(n, 4, c), *camera(size)]
-            inputs = [x.requires_grad_() for x in inputs]
-            mask = torch.ones(1, 1)
+            inputs = [x.to(device).requires_grad_() for x in inputs]
+            mask = torch.ones(1, 1, device=device)
             with torch.no_grad():
-                forward = median(partial(backend.rasterize, *inputs, size, size, mask), threads, runs)
+                forward = median(partial(backend.rasterize, *inputs, size, size, mask), threads, runs, device)
             view = backend.rasterize(*inputs, size, size, mask)[:6]
             seeds = [torch.randn_like(x) for x in view]
-            backward = median(partial(torch.autograd.grad, view, inputs, seeds, retain_graph=True), threads, runs)
+            adjoint = partial(torch.autograd.grad, view, inputs, seeds, retain_graph=True)
+            backward = median(adjoint, threads, runs, device)
             what = f"rasterize {n // 1000}k, {size} px, {c} features"
             rows.append(row(what, name, threads, "ms", forward * 1e3, backward * 1e3))
     return rows
 
 
-def tracing(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
+def tracing(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
     """Million rays per second: from outside at random, and from points of the surface to the hemisphere above."""
     rows = []
     for n in (10_000, 50_000):
-        means, quats, scales, opacity = shell(n)
+        means, quats, scales, opacity = (x.to(device) for x in shell(n))
         k = f"{n // 1000}k"
-        build = median(partial(backend.build, means, quats, scales, opacity), threads)
+        build = median(partial(backend.build, means, quats, scales, opacity), threads, RUNS, device)
         rows.append(row(f"build {k}", name, threads, "ms", build * 1e3))
         bvh = backend.build(means, quats, scales, opacity)
         rng = torch.Generator().manual_seed(0)
         origins = 2.5 * normalize(torch.randn(100_000, 3, generator=rng), dim=-1)
         aims = normalize(torch.randn(100_000, 3, generator=rng), dim=-1) * torch.rand(100_000, 1, generator=rng)
-        rays = origins, normalize(aims - origins, dim=-1), torch.rand(n, 3)
-        rate = 0.1 / median(partial(backend.trace, bvh, *rays), threads)
+        rays = [x.to(device) for x in (origins, normalize(aims - origins, dim=-1), torch.rand(n, 3))]
+        rate = 0.1 / median(partial(backend.trace, bvh, *rays), threads, RUNS, device)
         rows.append(row(f"trace {k}, ordered, all blocked", name, threads, "M rays/s", rate))
         normals = normalize(means[:: n // 1000], dim=-1)
-        directions = fibonacci(DIRECTIONS)
+        directions = fibonacci(DIRECTIONS).to(device)
         above = (normals @ directions.T > 0).sum().item() / 1e6
         outside = 1.03 * normals, normals, directions
-        rate = above / median(partial(backend.visible, bvh, *outside), threads)
+        rate = above / median(partial(backend.visible, bvh, *outside), threads, RUNS, device)
         rows.append(row(f"visible {k}, open sky", name, threads, "M rays/s", rate))
         # A shell that faces inwards, seen from within: every ray is blocked.
-        inwards = backend.build(means, quats[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1, 1, -1]), scales, opacity)
+        over = quats[:, [1, 0, 3, 2]] * quats.new_tensor([1.0, -1, 1, -1])
+        inwards = backend.build(means, over, scales, opacity)
         inside = 0.5 * normals, normals, directions
-        rate = above / median(partial(backend.visible, inwards, *inside), threads)
+        rate = above / median(partial(backend.visible, inwards, *inside), threads, RUNS, device)
         rows.append(row(f"visible {k}, all blocked", name, threads, "M rays/s", rate))
     return rows
 
 
-def shading(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
+def shading(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
     """Million evaluations of light and BRDF per second: 2000 points under DIRECTIONS directions."""
     p = 2000
     rng = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 0.3 * torch.randn(p, 3, generator=rng), dim=-1)
     surface = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
-    surface = [x.requires_grad_() for x in surface]
-    light, directions = torch.rand(DIRECTIONS, 3).requires_grad_(), fibonacci(DIRECTIONS)
-    seen = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32)
-    rest = seen, torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3), 0.04
+    surface = [x.to(device).requires_grad_() for x in surface]
+    light, directions = torch.rand(DIRECTIONS, 3).to(device).requires_grad_(), fibonacci(DIRECTIONS).to(device)
+    seen = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
+    rest = seen, seen.new_full((1, 1), -1), light.new_zeros(0, 3), 0.04
     with torch.no_grad():
-        forward = median(partial(backend.shade, *surface, directions, light, *rest), threads)
+        forward = median(partial(backend.shade, *surface, directions, light, *rest), threads, RUNS, device)
     shaded = backend.shade(*surface, directions, light, *rest)
-    seed = torch.randn(p, 3)
-    backward = median(partial(torch.autograd.grad, shaded, [*surface, light], seed, retain_graph=True), threads)
+    adjoint = partial(torch.autograd.grad, shaded, [*surface, light], torch.randn_like(shaded), retain_graph=True)
+    backward = median(adjoint, threads, RUNS, device)
     million = p * DIRECTIONS / 1e6
     return [
         row("shade, forward", name, threads, "M evaluations/s", million / forward),
@@ -132,14 +145,17 @@ def shading(backend: Backend, name: str, threads: int) -> list[dict[str, Any]]:
     ]
 
 
-def comparing(threads: int) -> list[dict[str, Any]]:
+def comparing(threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
     """Milliseconds of L1 + SSIM with its gradient, in plain torch: what a step pays beside the kernels."""
     rows = []
     for size in (128, 256):
-        rendered, photograph = torch.rand(size, size, 3, requires_grad=True), torch.rand(size, size, 3)
-        loss = partial(losses.photometric, rendered, photograph, torch.ones(size, size, 1), ssim_weight=0.2)
-        forward = median(loss, threads)
-        backward = median(partial(torch.autograd.grad, loss(), [rendered], retain_graph=True), threads)
+        rendered, photograph = torch.rand(2, size, size, 3, device=device)
+        rendered.requires_grad_()
+        valid = torch.ones(size, size, 1, device=device)
+        loss = partial(losses.photometric, rendered, photograph, valid, ssim_weight=0.2)
+        forward = median(loss, threads, RUNS, device)
+        adjoint = partial(torch.autograd.grad, loss(), [rendered], retain_graph=True)
+        backward = median(adjoint, threads, RUNS, device)
         rows.append(row(f"L1 + SSIM, {size} px", "torch", threads, "ms", forward * 1e3, backward * 1e3))
     return rows
 
@@ -152,13 +168,16 @@ def row(what: str, name: str, threads: int, unit: str, value: float, backward: f
     return kept if backward is None else {**kept, "backward": round(backward, 3)}
 
 
-def median(run: Callable[[], Any], threads: int, runs: int = RUNS) -> float:
-    """Median seconds of a call, after two for warmth."""
-    clock = time.thread_time if threads == 1 else time.perf_counter
+def median(run: Callable[[], Any], threads: int, runs: int = RUNS, device: torch.device = CPU) -> float:
+    """Median seconds of a call, after two for warmth; a device is waited for."""
+    waits = device.type == "cuda"
+    clock = time.thread_time if threads == 1 and not waits else time.perf_counter
     seconds = []
     for i in range(runs + min(2, runs - 1)):
         start = clock()
         run()
+        if waits:
+            torch.cuda.synchronize(device)
         if i >= min(2, runs - 1):
             seconds.append(clock() - start)
     return statistics.median(seconds)
