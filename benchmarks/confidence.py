@@ -15,15 +15,18 @@ from jaxtyping import Float
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from tumble import files, gallery, metrics, reconstruct
-from tumble.asset import Asset
-from tumble.capture import OBJECT, Truth
-from tumble.confidence import confidence
+from tumble import pipeline
 from tumble.datasets import which
-from tumble.images import srgb_from_linear
-from tumble.rasterize import rasterize
-from tumble.run import source
-from tumble.views import buffers_of
+from tumble.engine.run import source
+from tumble.evaluation import metrics
+from tumble.export.confidence import confidence
+from tumble.io import files
+from tumble.maths.images import srgb_from_linear
+from tumble.rendering.gbuffer import buffers_of
+from tumble.rendering.rasterize import rasterize
+from tumble.report import figures
+from tumble.scene.asset import Asset
+from tumble.scene.capture import OBJECT, Truth
 
 COUNTS = ("views", "lights", "halves")
 """Fields of `Confidence`."""
@@ -39,7 +42,7 @@ def main() -> None:
         truth = which(capture).load_truth(capture)
         assert truth is not None, f"{capture} has no truth"
         assert source(run).name == capture.name, "another capture's run"
-        pixels.append(counted(reconstruct.finished(run), truth))
+        pixels.append(counted(pipeline.finished(run), truth))
         rows.append({"capture": capture.name, **correlations(pixels[-1])})
         print(rows[-1], flush=True)
     if len(pixels) > 1:
@@ -53,7 +56,7 @@ def counted(asset: Asset, truth: Truth) -> Float[Tensor, "m 4"]:
     """Per pixel that both cover: the error of the albedo, and the counts."""
     assert truth.albedo is not None, "a capture with true albedo"
     assert truth.trajectory is not None, "a capture with evaluation views"
-    seen, n = confidence(asset, gallery.small(asset.camera)), len(asset.gaussians)
+    seen, n = confidence(asset, figures.small(asset.camera)), len(asset.gaussians)
     counts = torch.stack([getattr(seen, name) for name in COUNTS], -1)[:, None].expand(n, 4, len(COUNTS))
     albedo, rendered, solid = [], [], []
     for i in range(len(truth)):

@@ -21,17 +21,18 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from benchmarks import of_runs
-from tumble import metrics, tree
-from tumble.asset import Asset
 from tumble.datasets import folder
-from tumble.directions import fibonacci_sphere
-from tumble.images import linear_from_srgb, srgb_from_linear
-from tumble.material import DIELECTRIC
-from tumble.prefilter import prefilter
-from tumble.shade import shade_split, surface
-from tumble.trace import open_sky
-from tumble.trajectory import env_from_obj
-from tumble.views import antialiased
+from tumble.evaluation import metrics
+from tumble.io import tree
+from tumble.maths.directions import fibonacci_sphere
+from tumble.maths.images import linear_from_srgb, srgb_from_linear
+from tumble.rendering.gbuffer import antialiased
+from tumble.rendering.prefilter import prefilter
+from tumble.rendering.shade import shade_split, surface
+from tumble.rendering.trace import open_sky
+from tumble.scene.asset import Asset
+from tumble.scene.material import DIELECTRIC
+from tumble.scene.trajectory import env_from_obj
 
 DARK, GRAZING = 0.02, 0.5
 DIRECTIONS = 1024

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels import machine
-from tumble import files
+from tumble.engine.run import records
+from tumble.io import files
+from tumble.pipeline import evaluate_run, reconstruct
 from tumble.recipes import ABLATIONS, QUALITIES, Recipe
-from tumble.reconstruct import evaluate_run, reconstruct
-from tumble.run import records
-from tumble.synthesize import NOTE
+from tumble.synthetic.synthesize import NOTE
 
 KEPT = (
     "albedo.psnr_fg_srgb",

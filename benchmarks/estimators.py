@@ -16,11 +16,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tumble.directions import fibonacci_sphere, random_rotation
-from tumble.environment import Environment
-from tumble.prefilter import prefilter
-from tumble.shade import Surface, shade, shade_split
-from tumble.trace import open_sky
+from tumble.maths.directions import fibonacci_sphere, random_rotation
+from tumble.rendering.prefilter import prefilter
+from tumble.rendering.shade import Surface, shade, shade_split
+from tumble.rendering.trace import open_sky
+from tumble.scene.environment import Environment
 
 ROUGHNESS = (0.1, 0.2, 0.3, 0.5, 0.8)
 DIRECTIONS, TURNS, POINTS = 256, 32, 800

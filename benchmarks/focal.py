@@ -18,19 +18,21 @@ import torch
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import OTHERS, TEXTURED, Case, load
 from benchmarks.poses import against, table
-from tumble import evidence, files, graph, matching
-from tumble.capture import Capture
-from tumble.loop import drive
-from tumble.match import Match
-from tumble.pairs import neighbours
+from tumble import matching
+from tumble.engine.loop import drive
+from tumble.io import files
+from tumble.poses.frame_pairs import neighbours
+from tumble.poses.sfm import observations, stage
 from tumble.recipes import DRAFT
-from tumble.trajectory import Trajectory
+from tumble.scene.capture import Capture
+from tumble.scene.match import Match
+from tumble.scene.trajectory import Trajectory
 
 COMMAND = "python -m benchmarks.focal FOLDER"
 CASES = (Case(TEXTURED[1]), Case(TEXTURED[0]), Case(OTHERS[0]))
 UNSEEN = (Case(TEXTURED[0], setting="turntable"), Case("bare_can"), Case("grey_sphere"))
 """Of which frames say less: turned about one axis, and, without poses to find, without texture."""
-POSES = graph.Config()
+POSES = stage.Config()
 WRONG = (0.5, 0.8, 1.25)
 """A phone's main camera where a lens twice as long was used, and usual errors of a guess."""
 CURVE = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
@@ -71,7 +73,7 @@ def measure(
 ) -> Row:
     """Stage 1 with the true focal length times a factor, which stays as it is unless it is called a guess."""
     told = replace(capture, camera=capture.camera.zoomed(factor), focal_guessed=guess)
-    tracked = drive(graph, POSES, graph.gather(told, matches), seed=0)
+    tracked = drive(stage, POSES, stage.gather(told, matches), seed=0)
     scores = {} if truth is None else against(tracked.trajectory, truth)
     return {
         "capture": case.name,
@@ -88,19 +90,19 @@ def measure(
 @torch.no_grad()
 def curve(case: Case, capture: Capture, matches: Sequence[Match]) -> Row:
     """The loss per observation of all frames adjusted anew at other focal lengths [pixels^2]."""
-    inputs = graph.gather(capture, matches)
-    state = graph.init(POSES, inputs, torch.Generator().manual_seed(0))
-    for state.step in range(graph.length(POSES, inputs)):
-        graph.step(POSES, inputs, state)
+    inputs = stage.gather(capture, matches)
+    state = stage.init(POSES, inputs, torch.Generator().manual_seed(0))
+    for state.step in range(stage.length(POSES, inputs)):
+        stage.step(POSES, inputs, state)
     row: Row = {"capture": case.name}
     found = state.params
     for factor in CURVE:
-        seen = evidence.through(inputs, torch.tensor(factor).log())
+        seen = observations.through(inputs, torch.tensor(factor).log())
         t = found.t / torch.tensor([factor, factor, 1.0])
-        alone = graph.State(0, replace(found, t=t), None, torch.Generator(), state.memory)
+        alone = stage.State(0, replace(found, t=t), None, torch.Generator(), state.memory)
         for scale in SETTLING:
             alone.rng.manual_seed(0)
-            alone.params, said = graph._whole(POSES, seen, alone, scale)
+            alone.params, said = stage._whole(POSES, seen, alone, scale)
         row[str(factor)] = round(float(said["loss"]), 4)
     return row
 

@@ -28,12 +28,16 @@ from typing import Any
 import torch
 
 from benchmarks import kernels
-from tumble import backends, capture_writer, decompose, demo, evaluate, files, loop, predict, refine, run, tree
-from tumble.asset import Asset
-from tumble.capture import Capture, Truth
-from tumble.datasets import folder
+from tumble import backends, demo
+from tumble.datasets import _capture_folder, folder
+from tumble.engine import loop, run
+from tumble.evaluation import evaluate, render_prediction
+from tumble.inverse_rendering import decompose, refine
+from tumble.io import files, tree
+from tumble.pipeline import reconstruct
 from tumble.recipes import DRAFT, STANDARD, Recipe, known_poses
-from tumble.reconstruct import reconstruct
+from tumble.scene.asset import Asset
+from tumble.scene.capture import Capture, Truth
 
 GPU = torch.device("cuda")
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (100_000, 256), (100_000, 512), (100_000, 1024)]
@@ -152,8 +156,8 @@ def scored(path: Path, asset: Asset, where: Path, recipe: Recipe) -> dict[str, f
     known = evaluate.subject(path)
     there = tree.to(asset, GPU)
     capture, truth = tree.to(known.capture, GPU), tree.to(known.truth, GPU)
-    alignment, _ = predict.aligned(there.trajectory, capture.names, capture, truth, given=True)
-    answer = predict.predict(recipe.relight, there, capture, truth, alignment, names=capture.names)
+    alignment, _ = render_prediction.aligned(there.trajectory, capture.names, capture, truth, given=True)
+    answer = render_prediction.predict(recipe.relight, there, capture, truth, alignment, names=capture.names)
     tree.to(answer, "cpu").write(where)
     scores = evaluate.run(where, known, where)["regions"]["shared"]
     return {key: round(scores[key], 3) for key in SCORES if scores.get(key) is not None}
@@ -231,7 +235,7 @@ def posed_clip(out: Path) -> Path:
         bare = demo.unpack(out.with_name("bare"))
         capture, truth = folder.load(bare), folder.load_truth(bare)
         assert truth is not None
-        capture_writer.save(out, with_poses(capture, truth), truth, setting="handheld")
+        _capture_folder.save(out, with_poses(capture, truth), truth, setting="handheld")
     return out
 
 

@@ -21,11 +21,12 @@ import numpy as np
 
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import DATA
-from tumble import files, reconstruct
-from tumble.capture import OBJECT
+from tumble import pipeline
 from tumble.datasets import folder
-from tumble.survey import Options as FilmOptions
-from tumble.synthesize import Options, synthesize
+from tumble.io import files
+from tumble.preprocess.survey import Options as FilmOptions
+from tumble.scene.capture import OBJECT
+from tumble.synthetic.synthesize import Options, synthesize
 
 OBJECTS = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "chess_Knight")
 LIGHT, OTHERS = "immenstadter_horn", ("forest_slope", "studio_small_03")
@@ -96,7 +97,7 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
     row |= {"check": "GO" if checked["exit"] == 0 else "NO-GO", "check_seconds": checked["seconds"]}
     made = tumble("run", *clip, "-o", str(run), "--quality", quality)
     row |= {"run_exit": made["exit"], "run_seconds": made["seconds"], "run_memory_MiB": made["memory_MiB"]}
-    health = reconstruct.health(run)
+    health = pipeline.health(run)
     if health is not None:
         row |= {"verdict": health.verdict, "verdict_sentence": health.sentence}
     if made["exit"] != 0:
@@ -105,7 +106,7 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
         scored = tumble("evaluate", str(run), str(capture))
         row |= {"score_exit": scored["exit"], "score_seconds": scored["seconds"]}
         found = files.read_json(run / "report.json") if scored["exit"] == 0 else {"regions": {}, "poses": {}}
-        row |= {"kept": len(files.read_json(run / reconstruct.POSES)), **found["regions"], "poses": found["poses"]}
+        row |= {"kept": len(files.read_json(run / pipeline.POSES)), **found["regions"], "poses": found["poses"]}
     return row
 
 

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble import backends, losses
+from tumble import backends
 from tumble.backends import Backend, _native
+from tumble.inverse_rendering import losses
 
 RUNS = 9
 FEATURES = 16

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels import machine
-from tumble import files
+from tumble.io import files
 
 
 def main(file: str, about: str, row: Callable[[Path, Path], dict[str, Any]]) -> None:

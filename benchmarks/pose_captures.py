@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tumble import files
-from tumble.capture import BACKGROUND, OBJECT, Capture
 from tumble.datasets import folder
-from tumble.images import linear_from_srgb, srgb_from_linear
-from tumble.synthesize import Options, synthesize
-from tumble.trajectory import Trajectory
+from tumble.io import files
+from tumble.maths.images import linear_from_srgb, srgb_from_linear
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.trajectory import Trajectory
+from tumble.synthetic.synthesize import Options, synthesize
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TEXTURED = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "ycb_005_tomato_soup_can")

@@ -18,13 +18,18 @@ from typing import Any
 
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import COMPARED, FRAMES, LARGE, ODD, OTHERS, PLAIN, TEXTURED, Case, load
-from tumble import files, graph, matching, metrics, progressive, refine
-from tumble.capture import Capture
-from tumble.gauge import Tracked
-from tumble.loop import drive
-from tumble.pairs import neighbours
+from tumble import matching
+from tumble.engine.loop import drive
+from tumble.evaluation import metrics
+from tumble.inverse_rendering import refine
+from tumble.io import files
+from tumble.poses.frame_pairs import neighbours
+from tumble.poses.progressive import stage as progressive
+from tumble.poses.sfm import stage as graph
+from tumble.poses.sfm.finalize import Tracked
 from tumble.recipes import DRAFT, progressive_poses
-from tumble.trajectory import Trajectory
+from tumble.scene.capture import Capture
+from tumble.scene.trajectory import Trajectory
 
 COMMAND = "python -m benchmarks.poses FOLDER [--only WORD..., --route progressive, --refined]"
 TOLERANCE = 0.1

@@ -21,16 +21,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tests import devtools
-from tumble import files, metrics, reconstruct, relight
-from tumble.asset import Asset
-from tumble.camera import Camera
-from tumble.directions import texel_directions
-from tumble.environment import Environment
-from tumble.images import srgb_from_linear
-from tumble.run import RECIPE
-from tumble.se3 import SE3, SO3
-from tumble.trajectory import Trajectory, opengl_from_opencv
-from tumble.views import buffers_of
+from tumble import pipeline
+from tumble.engine.run import RECIPE
+from tumble.evaluation import metrics
+from tumble.io import files
+from tumble.maths.directions import texel_directions
+from tumble.maths.images import srgb_from_linear
+from tumble.maths.se3 import SE3, SO3
+from tumble.rendering import relight
+from tumble.rendering.gbuffer import buffers_of
+from tumble.scene.asset import Asset
+from tumble.scene.camera import Camera
+from tumble.scene.environment import Environment
+from tumble.scene.trajectory import Trajectory, opengl_from_opencv
 
 SPOT = (0.8, 0.5, 0.4)
 """Camera axes: x right, y up, z to the viewer."""
@@ -52,7 +55,7 @@ def main() -> None:
     lights = {name: read_light(part(page, name)) for name in ("recovered", "studio", "overcast", "sunset")}
     lights["spot"] = spot()
     shown = panel(arguments.run / "report.html", lights["spot"])
-    asset = reconstruct.finished(arguments.run)
+    asset = pipeline.finished(arguments.run)
     cfg = relight.Config(**files.read_json(arguments.run / RECIPE)["recipe"]["relight"])
     reference, rows = strength(lights["recovered"]), {}
     for name, picture in shown.items():

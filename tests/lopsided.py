@@ -6,17 +6,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tumble import settings
-from tumble.camera import Camera
-from tumble.capture import BACKGROUND, OBJECT, Capture
-from tumble.match import Match
-from tumble.se3 import SE3
-from tumble.trajectory import Trajectory
+from tumble.maths.se3 import SE3
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.match import Match
+from tumble.scene.trajectory import Trajectory
+from tumble.synthetic import trajectories
 
 AXES = torch.tensor([0.9, 0.6, 0.4], dtype=torch.float64)
 KNOBS = torch.tensor([[0.55, 0.5, 0.25, 0.25], [-0.5, 0.1, -0.5, 0.3]], dtype=torch.float64)
 """Centres and radii of balls that break the ellipsoid's symmetry in the silhouettes; no matches lie on them."""
-DISTANCE = settings.distance_for(math.radians(30))
+DISTANCE = trajectories.distance_for(math.radians(30))
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Tumble:
 def tumbling(n: int, *, size: int = 128, points: int = 400, seed: int = 1) -> Tumble:
     """`n` hand-held frames, 5 to 12 degrees apart."""
     camera = Camera.from_fov(math.radians(30), size, size)
-    T_cam_obj = settings.handheld(n, DISTANCE, seed=seed)
+    T_cam_obj = trajectories.handheld(n, DISTANCE, seed=seed)
     directions = camera.directions().double()
     masks = []
     for i in range(n):

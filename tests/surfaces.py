@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tumble.directions import GOLDEN_ANGLE, fibonacci_sphere, local_frame
-from tumble.gaussians import Gaussians, constant_sh
-from tumble.pathtracer import Part
-from tumble.se3 import SE3, SO3
+from tumble.maths.directions import GOLDEN_ANGLE, fibonacci_sphere, local_frame
+from tumble.maths.se3 import SE3, SO3
+from tumble.scene.gaussians import Gaussians, constant_sh
+from tumble.synthetic.pathtracer import Part
 
 MAJOR, MINOR = 0.65, 0.3
 """Radii of the torus around +z: it fits the unit ball, with a hole of radius 0.35."""

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from tumble import demo, recipes, settings, video
+from tumble import demo, recipes
 from tumble.datasets import folder
+from tumble.io import video
+from tumble.synthetic import trajectories
 
 
 def test_the_bundle_is_small_and_whole() -> None:
@@ -31,7 +33,7 @@ def test_the_clip_unpacks_to_a_pose_free_capture_with_truth(tmp_path: Path) -> N
     assert outside.mean() < 2
     T = truth.poses.T_cam_obj
     turn = torch.rad2deg((T.rotation[1:] @ T.rotation[:-1].inverse()).angle())
-    low, high = (np.rad2deg(angle) for angle in settings.TUMBLE_STEP)
+    low, high = (np.rad2deg(angle) for angle in trajectories.TUMBLE_STEP)
     # Poses are written with all digits, and read as 32-bit numbers.
     assert turn.min() > low - 0.05
     assert turn.max() < high + 0.05

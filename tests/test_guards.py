@@ -1,4 +1,4 @@
-"""The design's rules that a machine can check: layers, sizes, hygiene of imports, one place for devices."""
+"""The design's rules that a machine can check: rooms, sizes, hygiene of imports, one place for devices."""
 
 import ast
 import subprocess
@@ -11,47 +11,40 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tumble"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
-LAYERS = [
-    {"tree", "named", "files", "weights", "schedule"},
-    {"se3", "directions", "harmonics", "images", "video", "backends"},
-    {"brdf", "camera", "trajectory"},
-    {"gaussians", "material", "environment", "buffers", "coarse_light", "highlight"},
-    {"capture", "asset", "match", "photograph"},
-    {"rasterize", "trace", "volume", "virtual_camera", "pairs", "pixels", "tracks", "frontier", "health"}
-    | {"texture", "symmetry"},
-    {"prefilter", "shade", "importance", "mesh", "hull", "views", "shadow"},
-    {"losses", "optim", "densify", "fields", "neus", "posenets", "metrics", "lpips", "matching", "comeback"}
-    | {"pairwise", "averaging", "evidence", "bundle", "relocate", "gauge", "realign"},
-    {"loop"},
-    {"track", "lift", "graph", "progressive", "refine", "decompose", "average", "relight"},
-    {"datasets", "settings", "pathtracer", "synthesize", "capture_writer", "segment", "prediction", "predict", "sheet"}
-    | {"footage", "backdrop", "appearance", "selection", "sam", "survey", "ingest", "pick", "colmap", "posed", "check"}
-    | {"scoresheet", "evaluate", "bake", "confidence", "export", "doctor", "demo_assets"},
-    {"plots", "lamps", "rerender", "diagnosis", "gallery"},
-    {"recipes", "run", "report", "reconstruct", "demo", "viewer"},
-    {"cli", "__main__"},
-]
-"""Each row may import only rows above it and itself."""
+MAY_IMPORT = {
+    "io": set(),
+    "maths": set(),
+    "backends": set(),
+    "scene": {"io", "maths"},
+    "engine": {"io"},
+    "rendering": {"maths", "backends", "scene"},
+    "matching": {"io", "scene"},
+    "datasets": {"io", "maths", "scene"},
+    "preprocess": {"io", "maths", "scene", "datasets"},
+    "synthetic": {"io", "maths", "scene", "datasets"},
+    "poses": {"io", "maths", "scene", "engine", "matching"},
+    "inverse_rendering": {"io", "maths", "scene", "rendering", "engine"},
+    "evaluation": {"io", "maths", "scene", "rendering", "datasets"},
+    "export": {"io", "maths", "scene", "rendering"},
+    "report": {"io", "maths", "scene", "rendering", "engine", "datasets", "poses", "evaluation", "export"},
+}
+"""Rooms that each room may import, besides itself; the files beside them may import all."""
+PENDING = {("engine", "scene"), ("inverse_rendering", "backends")}
+"""Arrows that are still to go."""
 
 LONG_FILES: dict[str, int] = {}
-"""Files over 400 lines, each with the reason beside it."""
+"""Files over 600 lines, each with the reason beside it."""
 MANY_PARAMETERS = {"rasterize"}
 """Functions over 12 parameters: the backends' contract hands tensors over one by one."""
 
 
-def module(path: Path) -> str:
-    """The name a layer knows a file by: `backends` for all files in that folder."""
+def room(path: Path) -> str:
+    """The room of a file, or its name where it stands beside the rooms."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def layer(name: str) -> int:
-    found = [i for i, row in enumerate(LAYERS) if name in row]
-    assert len(found) == 1, f"{name} stands in no row of LAYERS: give it one"
-    return found[0]
-
-
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Modules of the package that a file imports, at any depth."""
+    """Rooms and files of the package that a file imports, at any depth."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "tumble":
             parts = (node.module or "").split(".")
@@ -61,21 +54,18 @@ def imported(tree: ast.AST) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_a_module_imports_only_its_own_layer_and_those_below(path: Path) -> None:
-    if path == PACKAGE / "__init__.py":
+def test_a_room_imports_only_the_rooms_that_it_may(path: Path) -> None:
+    own = room(path)
+    if own not in MAY_IMPORT:
         return
-    own = module(path)
-    for name in imported(ast.parse(path.read_text())):
-        if name in ("__version__", own):
-            continue
-        assert layer(name) <= layer(own), f"{own} (row {layer(own)}) imports {name} (row {layer(name)})"
-        assert own != "backends", f"backends import nothing of the package, {path.name} imports {name}"
+    for name in {*imported(ast.parse(path.read_text()))} - {"__version__", own}:
+        assert name in MAY_IMPORT[own] or (own, name) in PENDING, f"{own} may not import {name}"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_files_and_functions_stay_within_the_size_budget(path: Path) -> None:
     text = path.read_text()
-    assert len(text.splitlines()) <= LONG_FILES.get(str(path.relative_to(PACKAGE)), 400)
+    assert len(text.splitlines()) <= LONG_FILES.get(str(path.relative_to(PACKAGE)), 600)
     for node in ast.walk(ast.parse(text)):
         if not isinstance(node, ast.FunctionDef):
             continue
@@ -90,7 +80,7 @@ def test_files_and_functions_stay_within_the_size_budget(path: Path) -> None:
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_devices_are_named_only_at_the_borders(path: Path) -> None:
     """Everywhere else device and dtype come from the inputs. The doctor asks the machine, that is its work."""
-    if module(path) in ("cli", "backends", "doctor"):
+    if room(path) in ("cli", "backends", "doctor"):
         return
     words = {n.attr for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Attribute)}
     strings = {n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant)}

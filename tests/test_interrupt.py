@@ -22,15 +22,17 @@ import pytest
 import safetensors
 import torch
 
+from tests.engine.test_loop import full_disk
 from tests.films import scene, written
-from tests.test_hull import silhouettes
-from tests.test_loop import full_disk
-from tumble import capture_writer, files, recipes, reconstruct, run, video
-from tumble.capture import OBJECT, Capture
-from tumble.datasets import folder
-from tumble.environment import Environment
-from tumble.files import BadFile
-from tumble.survey import Options
+from tests.scene.test_visual_hull import silhouettes
+from tumble import pipeline, recipes
+from tumble.datasets import _capture_folder, folder
+from tumble.engine import run
+from tumble.io import files, video
+from tumble.io.files import BadFile
+from tumble.preprocess.survey import Options
+from tumble.scene.capture import OBJECT, Capture
+from tumble.scene.environment import Environment
 
 RECIPE = dataclasses.replace(recipes.SMOKE, seed=3)
 RANDOM = random.Random(0)
@@ -115,20 +117,20 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     images = torch.where(frames.masks[..., None] == OBJECT, shade, 0).to(torch.uint8).repeat(1, 1, 1, 3)
     taken = Capture(images, frames.masks, frames.camera, frames.names, "camera", trajectory)
     path = tmp_path_factory.mktemp("capture") / "c"
-    capture_writer.save(path, taken)
+    _capture_folder.save(path, taken)
     return path
 
 
 @pytest.fixture(scope="module")
 def whole(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "whole"
-    reconstruct.reconstruct(capture, out, RECIPE)
+    pipeline.reconstruct(capture, out, RECIPE)
     return out
 
 
 def killed_and_resumed(capture: Path, out: Path, n: int) -> dict[str, str]:
-    assert ending(lambda: (killed_at(n, out), reconstruct.reconstruct(capture, out, RECIPE))) == -signal.SIGKILL
-    reconstruct.reconstruct(capture, out, RECIPE)
+    assert ending(lambda: (killed_at(n, out), pipeline.reconstruct(capture, out, RECIPE))) == -signal.SIGKILL
+    pipeline.reconstruct(capture, out, RECIPE)
     return finished_run(out)
 
 
@@ -153,7 +155,7 @@ def test_a_run_of_a_film_killed_at_ten_random_moments_goes_on_to_the_same_bits(t
     film = written(scene().pictures, tmp_path / "x.mp4")
 
     def everything(out: Path) -> None:
-        reconstruct.reconstruct(reconstruct.ingested(film, out, FILM_OPTIONS), out, RECIPE)
+        pipeline.reconstruct(pipeline.ingested(film, out, FILM_OPTIONS), out, RECIPE)
 
     # The first one also compiles and loads what the others find ready.
     everything(tmp_path / "warm")
@@ -187,7 +189,7 @@ def test_two_processes_never_work_in_one_folder_and_a_killed_one_lets_go(capture
         os._exit(0)
     assert os.read(inside, 1) == b"x"
     with pytest.raises(BadFile, match=rf"run: is being worked in by another process, {process} \(wait until"):
-        reconstruct.reconstruct(capture, out, RECIPE)
+        pipeline.reconstruct(capture, out, RECIPE)
     os.kill(process, signal.SIGKILL)
     os.waitpid(process, 0)
     assert (out / run.LOCK).exists()
@@ -231,11 +233,11 @@ def test_a_damaged_output_is_named_with_the_fix_and_the_fix_works(
     shutil.copytree(whole, out)
     with (out / name).open("r+b") as file:
         file.truncate((out / name).stat().st_size // 2)
-    read = (lambda: reconstruct.finished(out)) if name == reconstruct.ASSET else None
+    read = (lambda: pipeline.finished(out)) if name == pipeline.ASSET else None
     with pytest.raises(BadFile, match=rf"{name}: is damaged: .*\(remove it, and give the command that made it again\)"):
-        read() if read else reconstruct.reconstruct(capture, out, RECIPE)
+        read() if read else pipeline.reconstruct(capture, out, RECIPE)
     (out / name).unlink()
-    reconstruct.reconstruct(capture, out, RECIPE)
+    pipeline.reconstruct(capture, out, RECIPE)
     assert finished_run(out) == finished_run(whole)
 
 
@@ -256,10 +258,10 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
     Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
     before = finished_run(whole)
     with full_disk(100), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
-        reconstruct.relight_run(whole, light, tmp_path / "pictures", fast=True)
+        pipeline.relight_run(whole, light, tmp_path / "pictures", fast=True)
     assert list((tmp_path / "pictures").iterdir()) == []
     with full_disk(3000), pytest.raises(OSError, match=r"asset\.ply: cannot be written"):
-        reconstruct.export_run(whole, tmp_path / "export", "splat", None)
+        pipeline.export_run(whole, tmp_path / "export", "splat", None)
     for name, write in (("x.exr", files.write_exr), ("x.hdr", files.write_hdr)):
         with full_disk(100), pytest.raises(OSError, match=rf"{name}: cannot be written: .*(too large|full)"):
             write(tmp_path / name, torch.rand(8, 16, 3).numpy())
@@ -279,15 +281,15 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
 
 def test_a_run_takes_up_the_capture_of_its_own_film_and_options_alone(tmp_path: Path) -> None:
     film, out = written(scene().pictures, tmp_path / "x.mp4"), tmp_path / "run"
-    made = reconstruct.ingested(film, out, FILM_OPTIONS)
+    made = pipeline.ingested(film, out, FILM_OPTIONS)
     before = finished_run(out)
-    assert reconstruct.ingested(film, out, FILM_OPTIONS) == made
+    assert pipeline.ingested(film, out, FILM_OPTIONS) == made
     film.rename(tmp_path / "moved.mp4")
-    assert reconstruct.ingested(tmp_path / "moved.mp4", out, FILM_OPTIONS) == made
+    assert pipeline.ingested(tmp_path / "moved.mp4", out, FILM_OPTIONS) == made
     with pytest.raises(BadFile, match=r"in another way: options\.frames is 16 there and 12 here \(choose another"):
-        reconstruct.ingested(tmp_path / "moved.mp4", out, dataclasses.replace(FILM_OPTIONS, frames=12))
+        pipeline.ingested(tmp_path / "moved.mp4", out, dataclasses.replace(FILM_OPTIONS, frames=12))
     with pytest.raises(BadFile, match=r"of another film, .*: footage is"):
-        reconstruct.ingested(written(scene(18).pictures, film), out, FILM_OPTIONS)
+        pipeline.ingested(written(scene(18).pictures, film), out, FILM_OPTIONS)
     assert finished_run(out) == before
 
 
@@ -295,9 +297,9 @@ def test_a_folder_of_pictures_is_footage_unless_it_is_a_capture(capture: Path, t
     for i in range(6):
         alpha = np.where(scene().object[i], 255, 0).astype(np.uint8)
         files.write_png(tmp_path / "in" / f"{i}.png", np.dstack([scene().pictures[i], alpha]))
-    made = reconstruct.ingested(tmp_path / "in", tmp_path / "run", Options(fov=40.0))
+    made = pipeline.ingested(tmp_path / "in", tmp_path / "run", Options(fov=40.0))
     assert len(folder.load(made)) == 6
-    assert reconstruct.ingested(capture, tmp_path / "other", Options()) == capture
+    assert pipeline.ingested(capture, tmp_path / "other", Options()) == capture
     assert not (tmp_path / "other").exists()
 
 
@@ -307,9 +309,9 @@ def test_lights_of_the_same_name_get_folders_of_their_own(whole: Path, tmp_path:
     lights = [tmp_path / name / "studio.hdr" for name in ("a", "b")]
     for light in lights:
         Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
-    folders = [reconstruct.relight_run(out, light, fast=True) for light in (*lights, lights[0])]
+    folders = [pipeline.relight_run(out, light, fast=True) for light in (*lights, lights[0])]
     assert [path.name for path in folders] == ["studio", "studio-2", "studio"]
     dark = files.read_picture(folders[0] / "0000.png").mean()
-    reconstruct.relight_run(out, lights[0], fast=True, exposure=1.0)
+    pipeline.relight_run(out, lights[0], fast=True, exposure=1.0)
     bright = files.read_picture(folders[0] / "0000.png").mean()
     assert bright > 1.2 * dark

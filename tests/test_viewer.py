@@ -11,11 +11,14 @@ import pytest
 import torch
 
 from tests.test_interrupt import RECIPE, capture, whole  # noqa: F401 (fixtures)
-from tumble import decompose, reconstruct, refine, run, tree, viewer
-from tumble.asset import Asset
+from tumble import pipeline, viewer
 from tumble.datasets import folder
-from tumble.files import BadFile
-from tumble.images import linear_from_srgb
+from tumble.engine import run
+from tumble.inverse_rendering import decompose, refine
+from tumble.io import tree
+from tumble.io.files import BadFile
+from tumble.maths.images import linear_from_srgb
+from tumble.scene.asset import Asset
 
 
 def free_port() -> int:
@@ -63,7 +66,7 @@ def test_a_run_that_is_still_going_on_shows_its_last_checkpoint(
 
     monkeypatch.setattr(stage, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct.reconstruct(capture, tmp_path / "run", RECIPE)
+        pipeline.reconstruct(capture, tmp_path / "run", RECIPE)
     seen = viewer.look(tmp_path / "run", folder.load(capture))
     assert seen.stage == found
     assert seen.gaussians is not None

@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def _synth():
-    from tumble.synthesize import Options, sweep, synthesize
+    from tumble.synthetic.synthesize import Options, sweep, synthesize
 
     def synth(
         model: Positional[Path],
@@ -94,7 +94,7 @@ def _synth():
 
 
 def _check():
-    from tumble.survey import Options
+    from tumble.preprocess.survey import Options
 
     def check(
         film: Positional[Path],
@@ -114,8 +114,8 @@ def _check():
         """
         from rich.console import Console
 
-        from tumble import check as checking
-        from tumble.pick import picked
+        from tumble.preprocess import check as checking
+        from tumble.preprocess.box_picker import picked
 
         where = out or Path("runs/check") / film.stem
         options = picked(film, options, where / "capture") if pick else options
@@ -135,7 +135,7 @@ def _check():
 
 
 def _run():
-    from tumble.survey import Options
+    from tumble.preprocess.survey import Options
 
     def run(
         capture: Positional[Path],
@@ -170,12 +170,12 @@ def _run():
 
         import torch
 
-        from tumble.named import named
-        from tumble.pick import picked
+        from tumble.engine.run import CAPTURE
+        from tumble.io.plugins import named
+        from tumble.pipeline import health, ingested, reconstruct
+        from tumble.preprocess.box_picker import picked
         from tumble.recipes import QUALITIES
-        from tumble.reconstruct import health, ingested, reconstruct
-        from tumble.report import write
-        from tumble.run import CAPTURE
+        from tumble.report.page import write
 
         if device == "cuda" and not torch.cuda.is_available():
             raise ValueError("--device cuda: torch sees no NVIDIA GPU here; tumble doctor says what it sees")
@@ -221,7 +221,7 @@ def relight(
         fast: Prefiltered light without shadows, instead of rays.
         exposure: How much brighter the pictures are than the light makes them [stops].
     """
-    from tumble.reconstruct import film_run, relight_run
+    from tumble.pipeline import film_run, relight_run
 
     if turntable is not None:
         film_run(run, env, turntable, fast=fast, exposure=exposure)
@@ -245,7 +245,7 @@ def export(
         scale_mm: The largest distance between two points of the object, as a ruler finds it [mm]: files in metres.
         out: Where the files go; RUN/export/PRESET when left out.
     """
-    from tumble.reconstruct import export_run
+    from tumble.pipeline import export_run
 
     if scale_mm is not None and not 0 < scale_mm < 1e6:
         raise ValueError(f"--scale-mm is out of range: {scale_mm:g}; give millimetres above 0")
@@ -261,8 +261,8 @@ def report(run: Positional[Path], /, capture: Path | None = None) -> None:
         run: The run directory.
         capture: Where the run's capture is now, if it was moved.
     """
-    from tumble.reconstruct import finished, health
-    from tumble.report import write
+    from tumble.pipeline import finished, health
+    from tumble.report.page import write
 
     print(write(run, finished(run), capture=capture, health=health(run)))
 
@@ -284,9 +284,9 @@ def evaluate(
     from rich.console import Console
     from rich.table import Table
 
-    from tumble import evaluate as evaluation
-    from tumble.reconstruct import ASSET, evaluate_run
-    from tumble.run import source
+    from tumble.engine.run import source
+    from tumble.evaluation import evaluate as evaluation
+    from tumble.pipeline import ASSET, evaluate_run
 
     where, is_run = out or prediction, (prediction / ASSET).is_file()
     if capture is None and not is_run:
@@ -320,7 +320,7 @@ def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = 
         action: get: fetch those of NAME; list: say which there are and which are here.
         name: The network, named as its matcher.
     """
-    from tumble import weights as networks
+    from tumble.io import weights as networks
 
     if action == "get":
         for path in networks.get(name):
@@ -340,7 +340,7 @@ def demo(out: Folder = Path("runs/demo")) -> None:
     """
     from tumble.demo import run
     from tumble.recipes import DRAFT
-    from tumble.report import REPORT
+    from tumble.report.page import REPORT
 
     scores = run(out, DRAFT)
     shared = scores["regions"]["shared"]

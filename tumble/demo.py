@@ -10,10 +10,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from tumble import files, reconstruct, report, video
+from tumble import pipeline
 from tumble.datasets import folder as capture_folder
+from tumble.engine.run import CAPTURE, alone
+from tumble.io import files, video
 from tumble.recipes import Recipe
-from tumble.run import CAPTURE, alone
+from tumble.report import page
 
 CLIP = "clip.mp4"
 
@@ -46,9 +48,9 @@ def run(out: Path, recipe: Recipe) -> dict[str, Any]:
     """
     with alone(out):
         folder = unpack(out / CAPTURE)
-    asset = reconstruct.reconstruct(folder, out, recipe)
-    scores = reconstruct.evaluate_run(out, folder, out)
-    report.write(out, asset, health=reconstruct.health(out))
+    asset = pipeline.reconstruct(folder, out, recipe)
+    scores = pipeline.evaluate_run(out, folder, out)
+    page.write(out, asset, health=pipeline.health(out))
     return scores
 
 
@@ -57,14 +59,14 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
 
     $ python -c "from tumble.demo import build; build()"
     """
-    from tumble import demo_assets
-    from tumble.synthesize import NOTE, Options, synthesize
+    from tumble.synthetic import demo_object
+    from tumble.synthetic.synthesize import NOTE, Options, synthesize
 
     with tempfile.TemporaryDirectory() as folder_name:
         work = Path(folder_name)
-        demo_assets.write_object(work / "pot.glb")
-        demo_assets.environment().write(work / "room.hdr")
-        demo_assets.other_environment().write(work / "sunset.hdr")
+        demo_object.write_object(work / "pot.glb")
+        demo_object.environment().write(work / "room.hdr")
+        demo_object.other_environment().write(work / "sunset.hdr")
         options = Options(
             env=str(work / "room.hdr"),
             relight=(str(work / "sunset.hdr"),),

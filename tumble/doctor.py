@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import torch
 
-from tumble import __version__, pathtracer
+from tumble import __version__
+from tumble.synthetic import pathtracer
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,17 @@ paper are recipes too.
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tumble import average, graph
-from tumble.decompose import Config as Decompose
-from tumble.decompose import Rates as DecomposeRates
-from tumble.decompose import Weights as DecomposeWeights
-from tumble.fields import Sizes
-from tumble.refine import Config as Refine
-from tumble.relight import Config as Relight
-from tumble.track import Config as Track
-from tumble.track import Rates as TrackRates
-from tumble.track import Weights as TrackWeights
+from tumble.inverse_rendering import mean_colour_baseline
+from tumble.inverse_rendering.decompose import Config as Decompose
+from tumble.inverse_rendering.decompose import Rates as DecomposeRates
+from tumble.inverse_rendering.decompose import Weights as DecomposeWeights
+from tumble.inverse_rendering.refine import Config as Refine
+from tumble.poses.progressive.sdf_field import Sizes
+from tumble.poses.progressive.tracker import Config as Track
+from tumble.poses.progressive.tracker import Rates as TrackRates
+from tumble.poses.progressive.tracker import Weights as TrackWeights
+from tumble.poses.sfm import stage as graph
+from tumble.rendering.relight import Config as Relight
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Recipe:
     """Stage 1, for captures without poses: by the graph route, or by the paper's (`progressive`)."""
     refine: Refine = field(default_factory=Refine)
     """Its pose rate and realignments count where poses are estimated; known ones stay as they are."""
-    decompose: Decompose | average.Config = field(default_factory=Decompose)
+    decompose: Decompose | mean_colour_baseline.Config = field(default_factory=Decompose)
     """Of the method, or of the baseline that takes its place."""
     relight: Relight = field(default_factory=Relight)
     seed: int = 0
@@ -182,7 +183,7 @@ def full_light(recipe: Recipe) -> Recipe:
 
 def averaging(recipe: Recipe) -> Recipe:
     """Baseline: albedo is the mean colour over the frames, the light is white; no inverse rendering."""
-    return replace(recipe, decompose=average.Config())
+    return replace(recipe, decompose=mean_colour_baseline.Config())
 
 
 def descended_highlight(recipe: Recipe) -> Recipe:

@@ -16,21 +16,25 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from tumble import decompose, export, gallery, loop, run, tree
-from tumble.asset import Asset
-from tumble.capture import Capture
 from tumble.datasets import which
-from tumble.directions import texel_directions
-from tumble.environment import Environment
-from tumble.files import BadFile
-from tumble.gauge import Tracked
-from tumble.gaussians import Gaussians, opacity
-from tumble.images import resize_area, srgb_from_linear
-from tumble.material import Material
-from tumble.reconstruct import ASSET
-from tumble.refine import Refined
-from tumble.se3 import SO3
-from tumble.trajectory import Trajectory
+from tumble.engine import loop, run
+from tumble.export import asset as export
+from tumble.inverse_rendering import decompose
+from tumble.inverse_rendering.refine import Refined
+from tumble.io import tree
+from tumble.io.files import BadFile
+from tumble.maths.directions import texel_directions
+from tumble.maths.images import resize_area, srgb_from_linear
+from tumble.maths.se3 import SO3
+from tumble.pipeline import ASSET
+from tumble.poses.sfm.finalize import Tracked
+from tumble.report import figures
+from tumble.scene.asset import Asset
+from tumble.scene.capture import Capture
+from tumble.scene.environment import Environment
+from tumble.scene.gaussians import Gaussians, opacity
+from tumble.scene.material import Material
+from tumble.scene.trajectory import Trajectory
 
 SECONDS = 2.0
 """Between two looks at the run."""
@@ -234,8 +238,8 @@ class Window:
     def _light(self) -> None:
         if self.look.environment is None:
             return
-        picture = gallery.panorama(self.look.environment, SKY_ROWS)
-        self.panorama.image = gallery.panorama(self.look.environment, 96)
+        picture = figures.panorama(self.look.environment, SKY_ROWS)
+        self.panorama.image = figures.panorama(self.look.environment, 96)
         around = SKY * texel_directions(SKY_ROWS, 2 * SKY_ROWS).reshape(-1, 3).numpy()
         self.server.scene.add_point_cloud("/light", around, picture.reshape(-1, 3), point_size=SKY_TEXEL)
 

@@ -11,8 +11,8 @@ The last two are apart so that a reconstruction cannot read its own answer.
 from pathlib import Path
 from types import ModuleType
 
-from tumble.files import BadFile
-from tumble.named import named, names
+from tumble.io.files import BadFile
+from tumble.io.plugins import named, names
 
 
 def which(path: Path) -> ModuleType:

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from tumble import files
-from tumble.camera import Camera
-from tumble.capture import BACKGROUND, Capture
-from tumble.files import BadFile
-from tumble.trajectory import Light
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, Capture
+from tumble.scene.trajectory import Light
 
 
 def camera(K: np.ndarray, picture: Path) -> Camera:

@@ -19,14 +19,14 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from tumble import files
-from tumble.camera import Camera
-from tumble.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, no_views
 from tumble.datasets import _pictures
 from tumble.datasets.folder import RIGID_TOLERANCE
-from tumble.files import BadFile
-from tumble.se3 import SE3
-from tumble.trajectory import Light, Trajectory
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.maths.se3 import SE3
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, no_views
+from tumble.scene.trajectory import Light, Trajectory
 
 CAMERAS, ANNOTATION = "scene_camera.json", "scene_gt.json"
 LAYOUT = f"SCENE/{CAMERAS}, SCENE/{ANNOTATION}, SCENE/rgb/000000.png and SCENE/mask_visib/000000_000000.png of BOP"

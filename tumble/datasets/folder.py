@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from tumble import files
-from tumble.camera import Camera
-from tumble.capture import BACKGROUND, OBJECT, REGIONS, UNITS, UNKNOWN, Capture, Truth, no_views
-from tumble.environment import Environment
-from tumble.files import BadFile
-from tumble.images import linear_from_srgb, photograph
-from tumble.trajectory import LIGHTS, Light, Trajectory
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.maths.images import linear_from_srgb, photograph
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, REGIONS, UNITS, UNKNOWN, Capture, Truth, no_views
+from tumble.scene.environment import Environment
+from tumble.scene.trajectory import LIGHTS, Light, Trajectory
 
 TRANSFORMS = "transforms.json"
 LAYOUT = f"CAPTURE/{TRANSFORMS} (docs/format.md)"

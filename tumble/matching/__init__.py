@@ -17,12 +17,12 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tumble import files
-from tumble.capture import Capture
-from tumble.files import BadFile
-from tumble.match import Match, View
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.io.plugins import named
 from tumble.matching import _window
-from tumble.named import named
+from tumble.scene.capture import Capture
+from tumble.scene.match import Match, View
 
 Matcher = Callable[[View, View], Match]
 

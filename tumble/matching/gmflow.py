@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble import weights
-from tumble.match import Match, View, no_match
+from tumble.io import weights
 from tumble.matching import _gmflow
 from tumble.matching._window import Window, windows
+from tumble.scene.match import Match, View, no_match
 
 VERSION = 1
 SIZE = 256

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tumble.match import Match, View, no_match
 from tumble.matching._window import Window, windows
+from tumble.scene.match import Match, View, no_match
 
 VERSION = 1
 WEIGHTS = "naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric"

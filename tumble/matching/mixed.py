@@ -6,8 +6,8 @@ the way back, hence its trust in the rest, and falls under the bar as a whole: t
 
 import torch
 
-from tumble.match import Match, View
 from tumble.matching import dis, sift
+from tumble.scene.match import Match, View
 
 VERSION = 1
 PARTS = ("sift", "dis")

@@ -10,8 +10,8 @@ import importlib
 import numpy as np
 import torch
 
-from tumble.match import Match, View, no_match
 from tumble.matching._window import windows
+from tumble.scene.match import Match, View, no_match
 
 VERSION = 1
 SETTING, SIZE = "base", 640

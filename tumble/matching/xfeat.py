@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from tumble import weights
-from tumble.match import Match, View, no_match
+from tumble.io import weights
 from tumble.matching._window import MARGIN, digest, extent, window
+from tumble.scene.match import Match, View, no_match
 
 VERSION = 1
 SIZE = 512

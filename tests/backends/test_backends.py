@@ -1,0 +1,397 @@
+"""Every backend against the reference, and the reference against closed forms, brute force and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from tests.backends import cases
+from tumble import backends
+from tumble.backends import _brute, reference
+
+CPU = torch.device("cpu")
+RELATIVE = 1e-4
+"""32 bits against 64: about 1e-7 a step, some thousand steps, and nothing that cancels."""
+
+
+@pytest.fixture(params=cases.fast())
+def backend(request: pytest.FixtureRequest) -> backends.Backend:
+    module = backends.load(request.param)
+    device = torch.device("cuda" if request.param == "cuda" else "cpu")
+    if reason := module.ready(device, torch.float32):
+        pytest.skip(reason)
+    return module
+
+
+# ------------------------------------------------------------------------------------------------ rasterize
+
+
+@pytest.mark.parametrize("name", cases.SCENES)
+def test_values_and_gradients_are_those_of_the_reference(backend: backends.Backend, name: str) -> None:
+    scene = cases.SCENES[name]()
+    rng = torch.Generator().manual_seed(0)
+    mask = (torch.rand(scene.height, scene.width, generator=rng) > 0.4).double()
+    view, gradients = cases.render(backend, scene, torch.float32, mask)
+    truth, true_gradients = cases.render(reference, scene, torch.float64, mask)
+    worst = {field: cases.difference(a, b) for field, a, b in zip(view._fields[:7], view, truth, strict=False)}
+    # The variance is a difference of nearly equal numbers.
+    assert worst.pop("depth_var") < 5 * RELATIVE
+    assert max(worst.values()) < RELATIVE, worst
+    assert torch.equal(view.touched, truth.touched)
+    assert torch.equal(view.dominant, truth.dominant)
+    worst = {i: cases.difference(a, b) for i, (a, b) in enumerate(zip(gradients, true_gradients, strict=True))}
+    assert max(worst.values()) < RELATIVE, worst
+
+
+def test_the_hard_scene_is_hard() -> None:
+    """It reaches the alpha clamp and the early stop many times, and holds what is culled for every reason."""
+    scene = cases.hard()
+    means, quats, scales, opacity, sh, corners, R, t, focal = scene.inputs
+    view = reference.project(means, quats, scales, opacity, sh, R, t)
+    mask = torch.zeros(scene.height, scene.width, dtype=torch.float64)
+
+    def alpha(rules: reference.Rules) -> torch.Tensor:
+        return reference.composite(view, opacity, corners, t, focal, mask, rules).alpha
+
+    truth = alpha(reference.SHARP)
+    assert (alpha(reference.SHARP._replace(alpha_max=1.0)) != truth).sum() > 50
+    assert (alpha(reference.SHARP._replace(T_min=0.0)) != truth).sum() > 1000
+    p_cam = means @ R.T + t
+    assert (p_cam[:, 2] < 0).sum() >= 5
+    pixel = p_cam[:, :2] / p_cam[:, 2:] * focal[:2] + focal[2:]
+    outside = (pixel < -5).any(1) | (pixel[:, 0] > scene.width + 5) | (pixel[:, 1] > scene.height + 5)
+    assert (outside & (p_cam[:, 2] > 0.5)).sum() > 5
+    assert 50 < len(view.index) < len(means) - 50
+    assert (view.rgb == 0).any()
+    assert (scales.amax(1) / scales.amin(1)).max() > 1000
+
+
+def test_one_gaussian_has_the_closed_form() -> None:
+    """An isotropic Gaussian on the axis: |peak - mu|^2 = 9 r^2 / (1 + r^2), z = 3 / (1 + r^2), r = tan of the angle."""
+    sigma, o, size = 0.1, 0.8, 9
+    inputs = [
+        [[0.0, 0.0, 0.0]],
+        [[0.0, 1.0, 0.0, 0.0]],  # Half a turn about x: the normal looks back at the camera.
+        [[sigma, sigma, sigma]],
+        [o],
+        [[[0.7 / 0.28209479177387814] * 3]],
+        [[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]],
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [0.0, 0.0, 3.0],
+        [40.0, 40.0, size / 2, size / 2],
+    ]
+    doubles = [torch.tensor(x, dtype=torch.float64) for x in inputs]
+    view = reference.rasterize(*doubles, size, size, torch.ones(1, 1).double())
+    x = (torch.arange(size).double() + 0.5 - size / 2) / 40
+    x, y = x[None, :], x[:, None]
+    rr = x * x + y * y
+    alpha = o * torch.exp(-0.5 * 9 * rr / (1 + rr) / sigma**2)
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0)
+    on = alpha > 0
+    z = 3 / (1 + rr)
+    # The second local axis is the camera's -y.
+    u, v = (z * x / (4 * sigma) + 0.5).clamp(0, 1), (-z * y / (4 * sigma) + 0.5).clamp(0, 1)
+    assert 30 < on.sum() < size * size
+    expected = {
+        "alpha": alpha,
+        "depth": torch.where(on, z, 0),
+        "depth_var": torch.zeros(size, size),
+        "rgb": 0.7 * alpha[..., None].expand(-1, -1, 3),
+        "normal": torch.where(on[..., None], torch.tensor([0.0, 0.0, -1.0]), 0),
+        "features": torch.where(on[..., None], torch.stack([u, v], -1), 0),
+        "weight": alpha.sum()[None],
+        "touched": on.sum()[None],
+        "dominant": torch.where(on, 0, -1),
+    }
+    for name, value in expected.items():
+        torch.testing.assert_close(getattr(view, name), value, check_dtype=False, rtol=1e-12, atol=1e-12)
+
+
+def test_gradients_of_the_reference_are_finite_differences() -> None:
+    rng = torch.Generator().manual_seed(3)
+    scene = cases.easy()
+    p_cam = scene.inputs[0] @ scene.inputs[6].T + scene.inputs[7]
+    index = p_cam[:, 2].argsort()[[0, 9, 18, 27, 36]]
+    inputs = [x[index].requires_grad_() for x in scene.inputs[:6]]
+    inputs[5] = inputs[5][..., :2].detach().requires_grad_()
+    focal = torch.tensor([4.0, 4.0, 2.0, 1.5], dtype=torch.float64, requires_grad=True)
+    inputs += [x.clone().requires_grad_() for x in scene.inputs[6:8]] + [focal]
+    weights = torch.randn(3, 4, 13, generator=rng, dtype=torch.float64)
+
+    def draw(*x: torch.Tensor) -> torch.Tensor:
+        view = reference.project(*x[:5], x[6], x[7])
+        picture = reference.composite(view, x[3], x[5], x[7], x[8], torch.ones(3, 4).double(), reference.SMOOTH)
+        flat = [y if y.ndim == 3 else y[..., None] for y in picture[: cases.DIFFERENTIABLE]]
+        return (torch.cat(flat, -1) * weights[..., : sum(y.shape[-1] for y in flat)]).sum((0, 1))
+
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("c", [0, 1, 8, 13, 16, 21])
+def test_any_number_of_features_is_drawn(backend: backends.Backend, c: int) -> None:
+    scene = cases.easy()
+    rng = torch.Generator().manual_seed(c)
+    scene.inputs[5] = torch.randn(150, 4, c, generator=rng).double()
+    view, gradients = cases.render(backend, scene, torch.float32)
+    truth, true_gradients = cases.render(reference, scene, torch.float64)
+    assert cases.difference(view.features, truth.features) < RELATIVE
+    assert max(cases.difference(a, b) for a, b in zip(gradients, true_gradients, strict=True)) < RELATIVE
+
+
+@pytest.mark.parametrize("name", ["easy", "hard"])
+def test_features_alone_get_the_gradient_they_get_with_the_rest(backend: backends.Backend, name: str) -> None:
+    scene = cases.SCENES[name]()
+    inputs = [x.float() for x in scene.inputs]
+    corners = inputs[5].requires_grad_()
+    view = backend.rasterize(*inputs, scene.height, scene.width, torch.ones(1, 1))
+    seeded = [v.float() for v in cases.seeds(scene)]
+    alone = torch.autograd.grad([view.features, view.alpha], corners, [seeded[5], seeded[1]])[0]
+    _, gradients = cases.render(backend, scene, torch.float32)
+    torch.testing.assert_close(alone, gradients[5])
+
+
+def test_kernels_keep_the_threads_that_torch_gives_up() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with backends.threads_for_kernels(), backends.threads_for_kernels():
+            assert (torch.get_num_threads(), backends.threads()) == (1, 2)
+        assert (torch.get_num_threads(), backends.threads()) == (2, 2)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_results_repeat_bit_for_bit_and_hardly_depend_on_threads(backend: backends.Backend) -> None:
+    scene = cases.hard()
+    threads = torch.get_num_threads()
+    try:
+        runs = []
+        for count in (1, 2, 2):
+            torch.set_num_threads(count)
+            view, gradients = cases.render(backend, scene, torch.float32)
+            runs.append([*view, *gradients])
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(runs[1], runs[2], strict=True))
+    # Sums over pixels are the same numbers in another order.
+    assert max(cases.difference(a, b) for a, b in zip(runs[0], runs[1], strict=True)) < 1e-5
+
+
+# ---------------------------------------------------------------------------------------------------- trace
+
+
+def _cloud(name: str) -> list[torch.Tensor]:
+    return cases.shell(700) if name == "shell" else cases.SCENES[name]().inputs[:4]
+
+
+def _rays(n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = torch.Generator().manual_seed(7)
+    origins = normalize(torch.randn(n, 3, generator=rng), dim=-1) * 2.5 * torch.rand(n, 1, generator=rng)
+    return origins, normalize(torch.randn(n, 3, generator=rng), dim=-1)
+
+
+def test_a_ray_past_one_gaussian_has_the_closed_form() -> None:
+    """At distance b of the centre, alpha = o exp(-b^2 / 2 s^2), cut at three sigma, and only from the front."""
+    sigma, o = 0.1, 0.7
+    gaussian = [torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), sigma), torch.tensor([o])]
+    bvh = reference.build(*(x.double() for x in gaussian))
+    b = torch.linspace(-0.4, 0.4, 33).double()
+    origins = torch.stack([b, 0 * b, 0 * b + 2], -1)
+    down = torch.tensor([0.0, 0.0, -1.0]).double().expand(33, 3)
+    hits = reference.trace(bvh, origins, down, torch.tensor([[1.0, 2.0, 3.0]]).double())
+    alpha = torch.where(b.abs() <= 3 * sigma, o * torch.exp(-0.5 * (b / sigma) ** 2), 0)
+    torch.testing.assert_close(hits.transmittance, 1 - alpha)
+    torch.testing.assert_close(hits.radiance, alpha[:, None] * torch.tensor([1.0, 2.0, 3.0]).double())
+    assert torch.equal(hits.hit, torch.where(alpha > 0, 0, -1).int())
+    for origin, direction in ((origins, -down), (-origins, -down)):
+        assert (reference.trace(bvh, origin, direction, torch.zeros(0, 3).double()).transmittance == 1).all()
+
+
+@pytest.mark.parametrize("name", ["shell", "easy", "hard", "empty"])
+def test_rays_meet_what_brute_force_meets(backend: backends.Backend, name: str) -> None:
+    cloud = _cloud(name)
+    origins, directions = _rays(3000)
+    radiance = torch.rand(len(cloud[0]), 3, generator=torch.Generator().manual_seed(0))
+    tree = backend.build(*(x.float() for x in cloud))
+    hits = backend.trace(tree, origins, directions, radiance)
+    bvh = reference.build(*(x.float().double() for x in cloud))
+    truth = reference.trace(bvh, origins.double(), directions.double(), radiance.double())
+    assert cases.difference(hits.transmittance, truth.transmittance) < RELATIVE
+    assert cases.difference(hits.radiance, truth.radiance) < RELATIVE
+    # Two Gaussians of equal weight may change places.
+    assert (hits.hit != truth.hit).float().mean() < 2e-3
+    if name != "empty":
+        assert 0.005 < (truth.transmittance == 0).double().mean() < 0.9
+
+
+def test_a_ray_through_hundreds_of_faint_gaussians_is_exact(backend: backends.Backend) -> None:
+    """More hits than any buffer holds, among them exact duplicates: 600 of alpha 0.005 leave T = 0.995^600."""
+    n = 600
+    rng = torch.Generator().manual_seed(2)
+    z = torch.rand(n, generator=rng).round(decimals=2)
+    cloud = [torch.stack([0 * z, 0 * z, z], -1), torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4)]
+    cloud += [torch.full((n, 3), 0.05), torch.full((n,), 0.005)]
+    origins, down = torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    hits = backend.trace(backend.build(*cloud), origins, down, torch.ones(n, 3))
+    # 600 roundings of 6e-8 each.
+    torch.testing.assert_close(hits.transmittance.item(), 0.995**n, rtol=4e-5, atol=0)
+    torch.testing.assert_close(hits.radiance[0, 0].item(), 1 - 0.995**n, rtol=4e-5, atol=0)
+    assert z[hits.hit.item()] == z.max()
+
+
+@pytest.mark.parametrize("name", ["shell", "hard"])
+def test_visibility_bits_and_blockers_are_those_of_brute_force(backend: backends.Backend, name: str) -> None:
+    cloud = _cloud(name)
+    points, normals = _rays(150)
+    directions = cases.fibonacci(75).float()
+    tree, bvh = backend.build(*(x.float() for x in cloud)), reference.build(*(x.float().double() for x in cloud))
+    bits = backend.visible(tree, points, normals, directions)
+    truth = reference.visible(bvh, points.double(), normals.double(), directions.double())
+    seen, truly = _brute.unpack(bits, 75), _brute.unpack(truth, 75)
+    # A transmittance may lie within rounding of one half.
+    assert (seen != truly).float().mean() < 1e-3
+    assert not seen[normals @ directions.T <= 0].any()
+    assert 0.1 < truly.double().mean() < 0.49
+    blockers = backend.blockers(tree, points, normals, directions, truth)
+    true_blockers = reference.blockers(bvh, points.double(), normals.double(), directions.double(), truth)
+    assert (blockers != true_blockers).float().mean() < 1e-3
+    assert torch.equal(true_blockers >= 0, (normals @ directions.T > 0) & ~truly)
+
+
+def test_packed_bits_come_back() -> None:
+    bits = torch.rand(5, 70, generator=torch.Generator().manual_seed(0)) > 0.5
+    words = _brute.pack(bits)
+    assert words.shape == (5, 3)
+    assert torch.equal(_brute.unpack(words, 70), bits)
+    assert words[0, 0].item() & 0xFFFFFFFF == sum(1 << j for j in range(32) if bits[0, j])
+
+
+def test_a_convex_object_hardly_shades_itself(backend: backends.Backend) -> None:
+    """A sphere of Gaussians, from points of its *rendered* surface: mean visibility above the horizon > 0.985."""
+    n, size = 4000, 48
+    means, quats, scales, opacity = (x.float() for x in cases.shell(n))
+    R, t, focal = (x.float() for x in cases.camera(size, size))
+    flat = torch.zeros(n, 1, 3), torch.zeros(n, 4, 0)
+    view = backend.rasterize(means, quats, scales, opacity, *flat, R, t, focal, size, size, torch.ones(1, 1))
+    y, x = torch.where(view.alpha > 0.5)
+    rays = torch.stack([(x + 0.5 - focal[2]) / focal[0], (y + 0.5 - focal[3]) / focal[1], torch.ones(len(x))], -1)
+    points = (rays * view.depth[y, x][:, None] - t) @ R
+    normals = normalize(view.normal[y, x], dim=-1)
+    # The surface lies where the sphere is, to a fraction of the Gaussians' spacing.
+    assert (points.norm(dim=-1) - 1).abs().mean() < 0.01
+    directions = cases.fibonacci(256).float()
+    lifted = points + 2 * scales[0, 0] * normals
+    seen = _brute.unpack(
+        backend.visible(backend.build(means, quats, scales, opacity), lifted, normals, directions), 256
+    )
+    assert seen.sum() / (normals @ directions.T > 0).sum() > 0.985
+
+
+# ---------------------------------------------------------------------------------------------------- shade
+
+
+def _surface(p: int, rough: tuple[float, float]) -> list[torch.Tensor]:
+    """Normals, albedo, roughness and view directions, some of them behind the surface."""
+    rng = torch.Generator().manual_seed(11)
+    normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
+    view = normalize(normal + 1.1 * normalize(torch.randn(p, 3, generator=rng), dim=-1), dim=-1)
+    roughness = rough[0] + (rough[1] - rough[0]) * torch.rand(p, generator=rng)
+    return [normal, torch.rand(p, 3, generator=rng), roughness, view]
+
+
+@pytest.mark.parametrize(("d", "m", "rough"), [(100, 0, (0.3, 1.0)), (256, 7, (0.03, 0.6)), (1, 3, (0.5, 0.5))])
+def test_shading_and_its_gradients_are_those_of_the_reference(
+    backend: backends.Backend, d: int, m: int, rough: tuple[float, float]
+) -> None:
+    rng = torch.Generator().manual_seed(d)
+    p = 80
+    inputs = [*_surface(p, rough), torch.rand(d, 3, generator=rng), torch.rand(m, 3, generator=rng)]
+    directions = cases.fibonacci(d).float()
+    visibility = _brute.pack(torch.rand(p, d, generator=rng) > 0.3)
+    blocker = torch.randint(-1, m, (p, d), generator=rng).int() if m else torch.full((1, 1), -1).int()
+    seed = torch.randn(p, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        rest = visibility, blocker, x[5], 0.04
+        shaded = by.shade(*x[:4], directions.to(dtype), x[4], *rest)
+        used = x if m else x[:5]
+        return shaded, *torch.autograd.grad(shaded, used, seed.to(dtype))
+
+    for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True):
+        assert cases.difference(a, b) < RELATIVE
+
+
+def test_gradients_of_reference_shading_are_finite_differences() -> None:
+    inputs = [x[:4].double().requires_grad_() for x in _surface(4, (0.2, 0.9))]
+    rng = torch.Generator().manual_seed(1)
+    inputs += [torch.rand(9, 3, generator=rng).double().requires_grad_() for _ in range(2)]
+    visibility = _brute.pack(torch.rand(4, 9, generator=rng) > 0.3)
+    blocker = torch.randint(-1, 9, (4, 9), generator=rng).int()
+
+    def draw(*x: torch.Tensor) -> torch.Tensor:
+        return reference.shade(*x[:4], cases.fibonacci(9), x[4], visibility, blocker, x[5], 0.04)
+
+    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
+def test_a_sphere_in_constant_light_shows_the_textbook_integral(backend: backends.Backend, roughness: float) -> None:
+    """Lambert gives albedo; GGX as D F G / (4 n.l n.v) with half vectors, integrated on another grid."""
+    normal = cases.fibonacci(40)
+    view = torch.tensor([0.0, 0.0, 1.0]).double()
+    front = normal @ view > 0.2
+    normal, p = normal[front], int(front.sum())
+    albedo = torch.tensor([0.2, 0.5, 0.8]).expand(p, 3)
+    d = 1 << 14
+    light = torch.full((d, 3), 1.5)
+    visibility = torch.full((p, d // 32), -1, dtype=torch.int32)
+    black = torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3)
+    shaded = backend.shade(
+        normal.float(),
+        albedo,
+        torch.full((p,), roughness),
+        view.float().expand(p, 3),
+        cases.fibonacci(d).float(),
+        light,
+        visibility,
+        *black,
+        0.04,
+    )
+    expected = 1.5 * (albedo.numpy() + _textbook_ggx(normal.numpy(), view.numpy(), roughness)[:, None])
+    # Both grids resolve the narrowest of these lobes to about 1e-3.
+    np.testing.assert_allclose(shaded.numpy(), expected, rtol=3e-3)
+
+
+def _textbook_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: float = 0.04) -> np.ndarray:
+    """Integral of f_s cos over the hemisphere by the midpoint rule in polar angles about each normal."""
+    a = roughness**2
+    mu = (np.arange(400) + 0.5) / 400
+    phi = (np.arange(400) + 0.5) / 400 * 2 * math.pi
+    mu, phi = np.meshgrid(mu, phi)
+    s = np.sqrt(1 - mu * mu)
+    result = []
+    for n in normals:
+        side = np.cross(n, [0.6, -0.8, 0.1])
+        side /= np.linalg.norm(side)
+        w = (s * np.cos(phi))[..., None] * side + (s * np.sin(phi))[..., None] * np.cross(n, side) + mu[..., None] * n
+        h = w + view
+        h /= np.linalg.norm(h, axis=-1, keepdims=True)
+        nh, vh, nv = h @ n, h @ view, n @ view
+        D = a**2 / (math.pi * (nh**2 * (a**2 - 1) + 1) ** 2)
+        # Walter 2007, equation 34.
+        G = 4 / (1 + np.sqrt(1 + a**2 * (1 / mu**2 - 1))) / (1 + np.sqrt(1 + a**2 * (1 / nv**2 - 1)))
+        inside = np.sqrt(1 - (1 - vh**2) / 1.5**2)
+        F = f0 / 0.08 * ((vh - 1.5 * inside) / (vh + 1.5 * inside)) ** 2
+        F += f0 / 0.08 * ((inside - 1.5 * vh) / (inside + 1.5 * vh)) ** 2
+        result.append((D * F * G / (4 * mu * nv) * mu).mean() * 2 * math.pi)
+    return np.array(result)
+
+
+# --------------------------------------------------------------------------------------------------- choice
+
+
+def test_doubles_are_drawn_by_the_reference() -> None:
+    assert backends.choose(CPU, torch.float64) is reference

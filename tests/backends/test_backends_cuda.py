@@ -1,0 +1,189 @@
+"""The GPU's kernels: their arithmetic on the CPU, that they compile for a GPU, and what they do on one where there is.
+
+The cases and what they must show are those of `test_backends.py`.
+"""
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.backends import cases
+from tests.backends import test_backends as conformance
+from tumble import backends
+from tumble.backends import Hits, Rendering, cuda, reference
+
+GPU = torch.device("cuda")
+
+CONFORMANCE = [
+    *[(conformance.test_values_and_gradients_are_those_of_the_reference, name) for name in cases.SCENES],
+    *[(conformance.test_any_number_of_features_is_drawn, c) for c in (0, 8, 21)],
+    *[(conformance.test_rays_meet_what_brute_force_meets, name) for name in ("shell", "hard", "empty")],
+    (conformance.test_a_ray_through_hundreds_of_faint_gaussians_is_exact,),
+    (conformance.test_visibility_bits_and_blockers_are_those_of_brute_force, "hard"),
+    (conformance.test_a_convex_object_hardly_shades_itself,),
+    (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 100, 0, (0.3, 1.0)),
+    (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 256, 7, (0.03, 0.6)),
+    (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 1, 3, (0.5, 0.5)),
+    (conformance.test_a_sphere_in_constant_light_shows_the_textbook_integral, 0.3),
+]
+every_case = pytest.mark.parametrize(
+    "case", CONFORMANCE, ids=lambda case: "-".join([case[0].__name__, *map(str, case[1:])])
+)
+
+
+@pytest.fixture
+def kernels() -> Any:
+    """The backend, if Warp is here; tensors on the CPU run its kernels there."""
+    if importlib.util.find_spec("warp") is None:
+        pytest.skip("needs NVIDIA Warp: pip install 'tumble[cuda]'")
+    return cuda
+
+
+@every_case
+def test_the_kernels_keep_the_contract_on_the_cpu(kernels: Any, case: tuple[Callable[..., None], ...]) -> None:
+    check, *arguments = case
+    check(kernels, *arguments)
+
+
+def test_rays_along_the_axes_meet_what_brute_force_meets(kernels: Any) -> None:
+    """They run in the sides of boxes, where the inverse of a direction is infinite."""
+    cloud = [x.float() for x in cases.shell(300)]
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    starts = torch.tensor([[0.3, -0.2, 0.4], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    origins = (starts[None] - 2 * axes[:, None]).reshape(-1, 3)
+    directions = axes.repeat_interleave(3, 0)
+    hits = kernels.trace(kernels.build(*cloud), origins, directions, torch.zeros(0, 3))
+    bvh = reference.build(*(x.double() for x in cloud))
+    truth = reference.trace(bvh, origins.double(), directions.double(), torch.zeros(0, 3).double())
+    assert (truth.hit >= 0).sum() > 5
+    assert torch.equal(hits.hit, truth.hit)
+    assert cases.difference(hits.transmittance, truth.transmittance) < conformance.RELATIVE
+
+
+def test_tile_lists_hold_the_tiles_that_are_touched_and_hardly_any_other(kernels: Any) -> None:
+    """Against every Gaussian at every pixel."""
+    from tumble.backends import _warp, _warp_project
+
+    scene = cases.hard()
+    height, width = 8 * scene.height, 8 * scene.width
+    means, quats, scales, opacity, sh, _, R, t, focal = scene.inputs
+    camera = torch.cat([R.flatten(), t, 8 * focal]).float()
+    n = len(means)
+    record, depth, n_tiles = torch.empty(n, 8, 4), torch.empty(n), torch.empty(n, dtype=torch.int32)
+    with _warp.stream(means.device):
+        gaussians = [x.float().contiguous() for x in (means, quats, scales, opacity, sh)]
+        prepared = record, depth, n_tiles
+        _warp.launch(_warp_project.project_forward, n, *gaussians, camera, height, width, *prepared)
+        starts, listed = cuda._bin(*prepared, height, width)
+    across, down = -(-width // 16), -(-height // 16)
+    in_list = torch.zeros(across * down, n, dtype=torch.bool)
+    in_list[torch.repeat_interleave(torch.arange(across * down), starts.diff().long()), listed.long()] = True
+    view = reference.project(means, quats, scales, opacity, sh, R, t)
+    touched = torch.zeros(across * down, n, dtype=torch.bool)
+    for tile in range(across * down):
+        y, x = 16 * (tile // across), 16 * (tile % across)
+        square = slice(y, min(y + 16, height)), slice(x, min(x + 16, width))
+        d = reference._rays(8 * focal, square)
+        Wd = torch.einsum("vij,pj->pvi", view.WR_obj_cam, d)
+        Wp = torch.einsum("vij,vj->vi", view.WR_obj_cam, view.p_cam)
+        off = torch.linalg.cross(Wd, Wp.expand_as(Wd)).square().sum(-1) / Wd.square().sum(-1)
+        alpha = opacity[view.index] * torch.exp(-0.5 * off)
+        touched[tile, view.index] = (alpha >= backends.ALPHA_MIN).any(0)
+    # On the border of the threshold, 32 bits may decide otherwise.
+    assert (touched & ~in_list).sum() <= 1e-3 * touched.sum()
+    # What is listed in excess: the pixel centres miss needles, and outlines are a fiftieth of a pixel wider.
+    assert (in_list & ~touched).sum() < 0.01 * touched.sum()
+    ordered = depth[listed.long()].split(starts.diff().tolist())
+    assert all((x.diff() >= 0).all() for x in ordered)
+
+
+def test_every_kernel_compiles_for_a_gpu_that_is_not_here(kernels: Any, tmp_path: Path) -> None:
+    import warp
+
+    from tumble.backends import _warp_adjoint, _warp_composite, _warp_project, _warp_shade, _warp_trace
+
+    if 90 not in warp.get_cuda_supported_archs():
+        pytest.skip("this build of Warp has no compiler for sm_90")
+    modules = [warp.get_module(file.__name__) for file in (_warp_project, _warp_adjoint, _warp_trace, _warp_shade)]
+    made = _warp_composite.forward, _warp_composite.adjoint
+    modules += [make(channels).module for make in made for channels in _warp_composite.WIDTHS]
+    for module in modules:
+        (path,) = warp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+        assert b".target sm_90" in path.read_bytes()
+
+
+def test_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "not torch.float32 on cpu" in cuda.ready(torch.device("cpu"), torch.float32)
+    assert "not torch.float64 on cuda" in cuda.ready(GPU, torch.float64)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "driver" in cuda.ready(GPU, torch.float32)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert "pip install 'tumble[cuda]'" in cuda.ready(GPU, torch.float32)
+    backends._warn_once.cache_clear()
+    with pytest.warns(RuntimeWarning, match="tumble\\[cuda\\]"):
+        assert backends.choose(GPU, torch.float32) is reference
+    backends._warn_once.cache_clear()
+
+
+def test_warp_is_not_loaded_before_it_is_needed() -> None:
+    program = (
+        "import sys, torch; from tumble import backends\n"
+        "for name in backends.names(): backends.load(name).ready(torch.device('cuda'), torch.float32)\n"
+        "assert 'warp' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+# ------------------------------------------------------------------------------------------------ on a GPU
+
+
+class OnGpu:
+    """The backend for callers whose tensors are on the CPU."""
+
+    def __getattr__(self, verb: str) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            there = (x.to(GPU) if isinstance(x, torch.Tensor) else x for x in arguments)
+            result = getattr(cuda, verb)(*there)
+            if isinstance(result, Rendering | Hits):
+                return type(result)(*(x.cpu() for x in result))
+            return result.cpu() if isinstance(result, torch.Tensor) else result
+
+        return call
+
+
+@pytest.fixture
+def on_gpu() -> Any:
+    if reason := cuda.ready(GPU, torch.float32):
+        pytest.skip(reason)
+    return OnGpu()
+
+
+@pytest.mark.gpu
+@every_case
+def test_the_kernels_keep_the_contract_on_a_gpu(on_gpu: Any, case: tuple[Callable[..., None], ...]) -> None:
+    check, *arguments = case
+    check(on_gpu, *arguments)
+
+
+@pytest.mark.gpu
+def test_runs_on_a_gpu_agree_to_rounding_in_any_stream(on_gpu: Any) -> None:
+    """Atomic additions come in any order, a few thousand of them, each rounded to 6e-8."""
+    scene = cases.hard()
+    view, gradients = cases.render(on_gpu, scene, torch.float32)
+    with torch.cuda.stream(torch.cuda.Stream()):
+        again, gradients_again = cases.render(on_gpu, scene, torch.float32)
+    assert torch.equal(view.rgb, again.rgb)
+    pairs = zip([view.weight, *gradients], [again.weight, *gradients_again], strict=True)
+    assert max(cases.difference(a, b) for a, b in pairs) < 1e-5
+
+
+@pytest.mark.gpu
+def test_tensors_on_a_gpu_choose_these_kernels(on_gpu: Any) -> None:
+    assert backends.choose(GPU, torch.float32) is cuda

@@ -1,0 +1,401 @@
+"""The loop, driving this very module as a stage: stopped and taken up again in every way, it comes to the same bits."""
+
+import io
+import os
+import resource
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from tumble.engine import loop, optim
+from tumble.engine.loop import Stage, State, drive, fingerprint
+from tumble.engine.optim import NotFinite
+from tumble.io import files, tree
+from tumble.io.files import BadFile
+
+# A stage: points that move to a target, are born and die, under a light on a growing grid -----------------------------
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Config:
+    steps: int = 30
+    rate: float = 0.05
+    regrow: int = 4
+    finer: int = 11
+
+
+@dataclass(frozen=True)
+class Inputs:
+    target: Tensor = field(default_factory=lambda: torch.tensor([0.3, -0.2]))
+    at: dict[int, Callable[[State], Any]] = field(default_factory=dict)
+    """Accidents by step; no part of the settings, as accidents are not."""
+
+
+@dataclass(frozen=True)
+class Params:
+    points: Tensor
+    weight: Tensor
+    light: Tensor
+    frozen: Tensor
+
+
+@dataclass(frozen=True)
+class Output:
+    params: Params
+    rest: dict[str, Tensor]
+    """Moments, memory and the generator: two runs are equal only if these are."""
+
+
+def length(cfg: Config, inputs: Inputs) -> int:
+    return cfg.steps
+
+
+def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
+    points = torch.randn(6, 2, generator=rng)
+    params = optim.leaves(Params(points, torch.ones(()), torch.zeros(2, 3), torch.ones(2)))
+    optimizer = optim.adam(params, {"": cfg.rate, "frozen": 0.0})
+    return State(0, params, optimizer, rng, {"seen": torch.zeros(6), "least": torch.tensor(float("inf"))})
+
+
+def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+    params, optimizer = state.params, state.optimizer
+    assert optimizer is not None
+    noise = 0.1 * torch.randn(params.points.shape, generator=state.rng)
+    away = ((params.points + noise - inputs.target) ** 2).sum(-1)
+    loss = params.weight * away.mean() + ((params.light - 1) ** 2).mean() + params.weight**2
+    inputs.at.get(state.step, lambda state: None)(state)
+    optim.anneal(optimizer, {"points": 1 - state.step / cfg.steps})
+    optim.descend(loss, optimizer, step=state.step)
+    state.memory["seen"] += away.detach()
+    state.memory["least"] = torch.minimum(state.memory["least"], loss.detach())
+    if (state.step + 1) % cfg.regrow == 0:
+        densify(state)
+    if state.step + 1 == cfg.finer:
+        state.params = optim.resample(state.params, optimizer, "light", lambda x: x.repeat_interleave(2, 0))
+    return {"loss": loss, "points": len(params.points)}
+
+
+def densify(state: State) -> None:
+    """Drop a point and split others, by lot."""
+    assert state.optimizer is not None
+    n = len(state.params.points)
+    index = torch.multinomial(state.memory["seen"] + 1, n + 1, replacement=True, generator=state.rng)
+    fresh = torch.rand(n + 1, generator=state.rng) < 0.5
+    grown = optim.regrow({"points": state.params.points}, state.optimizer, index, fresh)
+    state.params = replace(state.params, **grown)
+    with torch.no_grad():
+        state.params.points[fresh] += 0.01 * torch.randn(int(fresh.sum()), 2, generator=state.rng)
+    state.memory["seen"] = torch.zeros(n + 1)
+
+
+def finish(cfg: Config, inputs: Inputs, state: State) -> Output:
+    moments = optim.pack(state.optimizer) if state.optimizer else {}
+    rest = moments | state.memory | {"rng": state.rng.get_state()}
+    return Output(tree.detach(state.params), {name: x.clone() for name, x in rest.items()})
+
+
+THIS = sys.modules[__name__]
+
+
+class Previewed:
+    """The same stage with a preview that draws at random."""
+
+    VERSION, Config = VERSION, Config
+    length, init, step, finish = staticmethod(length), staticmethod(init), staticmethod(step), staticmethod(finish)
+
+    @staticmethod
+    def preview(cfg: Config, inputs: Inputs, state: State) -> Tensor:
+        return (255 * torch.rand(4, 5, 3, generator=state.rng)).to(torch.uint8)
+
+
+def bits(output: Output) -> dict[str, bytes]:
+    return {name: x.numpy().tobytes() for name, x in tree.named_tensors(output).items()}
+
+
+def whole(**settings: Any) -> dict[str, bytes]:
+    return bits(drive(THIS, Config(**settings), Inputs(), seed=3))
+
+
+def press_ctrl_c(state: State) -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def crash(state: State) -> None:
+    raise RuntimeError("power cut")
+
+
+def poison(state: State) -> None:
+    with torch.no_grad():
+        state.params.points[0, 0] = float("nan")
+
+
+# Stopping and going on ------------------------------------------------------------------------------------------------
+
+
+def test_a_module_is_a_stage_and_learns() -> None:
+    assert isinstance(THIS, Stage)
+    assert not isinstance(loop, Stage)
+    output = drive(THIS, Config(steps=400), Inputs(), seed=0)
+    assert output.params.light.shape == (4, 3)
+    # Adam's steps shrink to nothing with the rate: what remains is the noise of the last ones.
+    assert (output.params.light - 1).abs().max() < 0.05
+    assert torch.equal(output.params.frozen, torch.ones(2))
+
+
+def test_the_seed_decides_the_result() -> None:
+    assert whole() == whole()
+    assert whole() != bits(drive(THIS, Config(), Inputs(), seed=4))
+
+
+@pytest.mark.parametrize("stops", [[0], [3], [10], [11], [29], [2, 5, 12, 20]])
+def test_a_run_stopped_by_ctrl_c_and_taken_up_again_equals_a_whole_one_bit_for_bit(
+    tmp_path: Path, stops: list[int]
+) -> None:
+    """Stops lie before, at and after the steps in which leaves change their shapes."""
+    path = tmp_path / "1-toy" / "state.safetensors"
+    for stop in stops:
+        with pytest.raises(KeyboardInterrupt, match=rf"toy stopped at step {stop + 1} of 30; the same .* from {path}"):
+            drive(THIS, Config(), Inputs(at={stop: press_ctrl_c}), seed=3, checkpoint=path, name="toy")
+    resumed = drive(THIS, Config(), Inputs(at={stops[-1]: crash}), seed=3, checkpoint=path)
+    assert bits(resumed) == whole()
+    assert [p.name for p in path.parent.iterdir()] == ["state.safetensors"]
+
+
+@pytest.mark.parametrize("stop", [7, 8, 9, 22])
+def test_a_run_that_crashed_goes_on_from_its_last_checkpoint_bit_for_bit(tmp_path: Path, stop: int) -> None:
+    path = tmp_path / "state"
+    with pytest.raises(RuntimeError, match="power cut"):
+        drive(THIS, Config(), Inputs(at={stop: crash}), seed=3, checkpoint=path, every=8)
+    redone: list[int] = []
+    at = {n: lambda state, n=n: redone.append(n) for n in range(30)}
+    resumed = drive(THIS, Config(), Inputs(at=at), seed=3, checkpoint=path, every=8)
+    assert redone[0] == stop // 8 * 8
+    assert bits(resumed) == whole()
+
+
+def test_a_finished_training_is_not_repeated_when_finishing_failed(tmp_path: Path) -> None:
+    drive(THIS, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state")
+    again = drive(THIS, Config(), Inputs(at=dict.fromkeys(range(30), crash)), seed=3, checkpoint=tmp_path / "state")
+    assert bits(again) == whole()
+
+
+@pytest.mark.parametrize("other", [{"cfg": Config(rate=0.06)}, {"seed": 4}, {"key": "other inputs"}])
+def test_a_checkpoint_of_other_settings_is_started_over(tmp_path: Path, other: dict[str, Any]) -> None:
+    usual: dict[str, Any] = {"cfg": Config(), "seed": 3, "key": "inputs"}
+    with pytest.raises(KeyboardInterrupt):
+        drive(THIS, inputs=Inputs(at={9: press_ctrl_c}), checkpoint=tmp_path / "state", **usual)
+    changed = usual | other
+    fresh = drive(THIS, inputs=Inputs(), **changed)
+    assert bits(drive(THIS, inputs=Inputs(), checkpoint=tmp_path / "state", **changed)) == bits(fresh)
+
+
+def test_a_second_ctrl_c_stops_at_once_and_the_handler_is_put_back(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGINT)
+
+    def press_twice(state: State) -> None:
+        press_ctrl_c(state)
+        press_ctrl_c(state)
+
+    path = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        drive(THIS, Config(), Inputs(at={10: press_twice}), seed=3, checkpoint=path, every=8)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == whole()
+
+
+def test_without_a_checkpoint_ctrl_c_says_that_nothing_is_kept() -> None:
+    with pytest.raises(KeyboardInterrupt, match="nothing was saved"):
+        drive(THIS, Config(), Inputs(at={2: press_ctrl_c}), seed=3)
+
+
+def test_a_stage_can_be_driven_from_another_thread() -> None:
+    """Signals cannot be handled there."""
+    results: list[dict[str, bytes]] = []
+    thread = threading.Thread(target=lambda: results.append(whole()))
+    thread.start()
+    thread.join()
+    assert results == [whole()]
+
+
+def test_tensors_without_gradients_or_optimizer_come_back(tmp_path: Path) -> None:
+    """Booleans, empty tensors and shared storage are all a state may hold."""
+
+    class Plain(Previewed):
+        @staticmethod
+        def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
+            shared = torch.arange(6)
+            memory = {"flags": torch.tensor([True, False]), "none": torch.zeros(0, 3), "tail": shared[3:].flip(0)}
+            return State(0, {"all": shared, "turned": shared.reshape(2, 3).T}, None, rng, memory)
+
+        @staticmethod
+        def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+            inputs.at.get(state.step, lambda state: None)(state)
+            state.params["all"] += torch.randint(9, (6,), generator=state.rng)
+            state.memory["flags"] = ~state.memory["flags"]
+            return {}
+
+        @staticmethod
+        def finish(cfg: Config, inputs: Inputs, state: State) -> Output:
+            return Output(state.params, state.memory)
+
+    def result(**kwargs: Any) -> dict[str, Tensor]:
+        return tree.named_tensors(drive(Plain, Config(), seed=1, **kwargs))
+
+    with pytest.raises(KeyboardInterrupt):
+        result(inputs=Inputs(at={6: press_ctrl_c}), checkpoint=tmp_path / "state")
+    again, expected = result(inputs=Inputs(), checkpoint=tmp_path / "state"), result(inputs=Inputs())
+    assert again["rest.flags"].dtype == torch.bool
+    assert again["rest.none"].shape == (0, 3)
+    assert torch.equal(again["params.all"], expected["params.all"])
+    assert torch.equal(again["rest.tail"], torch.tensor([5, 4, 3]))
+
+
+# What goes wrong ------------------------------------------------------------------------------------------------------
+
+
+def test_a_nan_raises_with_its_name_its_step_and_the_last_good_state(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    with pytest.raises(NotFinite, match=r"not finite at step 10; the last good state is in .*state") as caught:
+        drive(THIS, Config(), Inputs(at={9: poison}), seed=3, checkpoint=path, every=8)
+    assert (caught.value.state_file, caught.value.step) == (path, 10)
+    # The state of step 8 is there still, and good.
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == whole()
+
+
+def test_a_nan_that_no_step_notices_is_neither_saved_nor_handed_on(tmp_path: Path) -> None:
+    def hide(state: State) -> None:
+        with torch.no_grad():
+            state.params.frozen[1] = float("inf")
+
+    path = tmp_path / "state"
+    for n, checkpoint in ((9, path), (9, None), (29, None)):
+        with pytest.raises(NotFinite, match="frozen is not finite") as caught:
+            drive(THIS, Config(), Inputs(at={n: hide}), seed=3, checkpoint=checkpoint, every=8)
+        assert caught.value.state_file == checkpoint
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == whole()
+
+
+@contextmanager
+def full_disk(room: int) -> Iterator[None]:
+    """No file may grow beyond `room` bytes: the system refuses the write as it does on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_is_told_and_the_state_before_survives_it(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        drive(THIS, Config(), Inputs(at={4: press_ctrl_c}), seed=3, checkpoint=path)
+    with full_disk(3000), pytest.raises(OSError, match=r"state: cannot be written: .*; the same command goes on"):
+        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    assert [p.name for p in tmp_path.iterdir()] == ["state"]
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)) == whole()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(OSError, match=r"state: cannot .* \(choose a folder that you may write to"):
+        drive(THIS, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state")
+    tmp_path.chmod(0o700)
+
+
+def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    path.write_bytes(b"junk" * 20)
+    with pytest.raises(BadFile, match="state: is not a checkpoint"):
+        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    tree.save(Params(*torch.zeros(4, 1)), path)
+    with pytest.raises(BadFile, match="state: is not a checkpoint"):
+        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+
+
+def test_a_checkpoint_of_another_structure_is_refused(tmp_path: Path) -> None:
+    """The stage was edited and its VERSION was not."""
+
+    class Edited(Previewed):
+        @staticmethod
+        def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
+            params = optim.leaves({"points": torch.zeros(6, 2), "more": torch.zeros(1)})
+            return State(0, params, optim.adam(params, {"": 0.1}), rng)
+
+    path = tmp_path / "state"
+    drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    with pytest.raises(BadFile, match="does not fit this stage"):
+        drive(Edited, Config(), Inputs(), seed=3, checkpoint=path)
+
+
+# What people see ------------------------------------------------------------------------------------------------------
+
+
+def test_reports_are_few_and_hold_what_a_log_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    records: list[dict[str, Any]] = []
+    drive(THIS, Config(), Inputs(), seed=3, report=records.append, name="toy")
+    # Thirty steps of a millisecond: the first and the last.
+    assert (records[0]["step"], records[-1]["step"]) == (1, 30)
+    assert len(records) < 5
+    assert records[-1]["of"] == 30
+    assert records[-1]["name"] == "toy"
+    assert records[-1]["eta"] == 0
+    assert set(records[-1]["metrics"]) == {"loss", "points"}
+    monkeypatch.setattr(loop, "REPORT_SECONDS", 0.0)
+    records.clear()
+    path = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        drive(THIS, Config(), Inputs(at={9: press_ctrl_c}), seed=3, report=records.append, checkpoint=path)
+    drive(THIS, Config(), Inputs(), seed=3, report=records.append, checkpoint=path)
+    assert [record["step"] for record in records] == list(range(1, 31))
+    seconds = [record["seconds"] for record in records]
+    assert seconds == sorted(seconds), "the clock of a resumed run goes on"
+
+
+def test_a_terminal_shows_the_stage_its_metric_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(loop, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120))
+    monkeypatch.setattr(loop, "BAR_SECONDS", 0.0)
+    drive(THIS, Config(), Inputs(), seed=3, name="toy")
+    shown = screen.getvalue()
+    assert all(word in shown for word in ("toy", "30/30", "loss", "0:00:0"))
+
+
+def test_nothing_is_printed_without_a_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    drive(THIS, Config(), Inputs(), seed=3, name="toy")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_preview_lies_beside_the_checkpoint_and_changes_nothing(tmp_path: Path) -> None:
+    output = drive(Previewed, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state", every=3)
+    assert files.read_picture(tmp_path / "preview.png").shape == (4, 5, 3)
+    assert bits(output) == whole()
+
+
+def test_fingerprints_tell_settings_and_their_classes_apart() -> None:
+    @dataclass(frozen=True)
+    class Other:
+        steps: int = 30
+        rate: float = 0.05
+        regrow: int = 4
+        finer: int = 11
+
+    assert fingerprint("a", Config()) == fingerprint("a", Config())
+    prints = [fingerprint("a", x) for x in (Config(), Config(rate=0.06), Other(), {"x": Config()}, float("inf"), None)]
+    assert len(set(prints)) == len(prints)
+    assert all(len(x) == 64 for x in prints)
+    with pytest.raises(TypeError, match="not a Tensor"):
+        fingerprint(torch.zeros(2))

@@ -1,0 +1,344 @@
+"""Run directories: what is done is kept, what differs is named, and what is kept decides nothing but time."""
+
+import errno
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.engine import test_loop as toy
+from tests.engine.test_loop import full_disk, press_ctrl_c
+from tumble.datasets import _capture_folder
+from tumble.datasets import folder as datasets_folder
+from tumble.engine import run
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.maths.se3 import SE3
+from tumble.scene.camera import Camera
+from tumble.scene.capture import Capture
+from tumble.scene.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Recipe:
+    first: toy.Config = field(default_factory=toy.Config)
+    second: toy.Config = field(default_factory=lambda: toy.Config(steps=12))
+    until: float = float("inf")
+    seed: int = 0
+
+
+Steps = list[int]
+"""Steps that were really taken."""
+
+
+def counted(steps: Steps, accidents: dict[int, Callable[..., Any]] | None = None) -> toy.Inputs:
+    at = {n: lambda state, n=n: steps.append(n) for n in range(100)}
+    return toy.Inputs(at=at | (accidents or {}))
+
+
+def pipeline(path: Path, recipe: Recipe, steps: Steps, **accidents: dict[int, Callable[..., Any]]) -> Any:
+    """Two stages, the second of which reads the first's output."""
+    opened = run.open(path, Path("clip"), recipe)
+    first = run.stage(opened, 1, "first", toy, recipe.first, counted(steps, accidents.get("first")), ["clip"])
+    own = run.key("first", toy.VERSION, recipe.first, ["clip"])
+    target = first.params.points.mean(0)
+    inputs = replace(counted(steps, accidents.get("second")), target=target)
+    return run.stage(opened, 2, "second", toy, recipe.second, inputs, [own])
+
+
+# Stages ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_finished_stage_is_not_run_again_and_its_output_is_the_same(tmp_path: Path) -> None:
+    steps: Steps = []
+    once = pipeline(tmp_path / "run", Recipe(), steps)
+    assert len(steps) == 30 + 12
+    again = pipeline(tmp_path / "run", Recipe(), steps)
+    assert len(steps) == 30 + 12
+    assert toy.bits(again) == toy.bits(once)
+    made = sorted(str(p.relative_to(tmp_path / "run")) for p in (tmp_path / "run").rglob("*") if p.is_file())
+    stages = [f"{name}/{file}" for name in ("1-first", "2-second") for file in ("out.safetensors", "stage.json")]
+    assert made == sorted([*stages, "log.jsonl", "recipe.json"])
+
+
+@pytest.mark.parametrize("stage", ["first", "second"])
+def test_an_interrupted_pipeline_goes_on_to_the_bits_of_a_whole_one(tmp_path: Path, stage: str) -> None:
+    whole = pipeline(tmp_path / "whole", Recipe(), [])
+    with pytest.raises(KeyboardInterrupt, match=f"{stage} stopped at step 8 of .*; the same command goes on from"):
+        pipeline(tmp_path / "run", Recipe(), [], **{stage: {7: press_ctrl_c}})
+    steps: Steps = []
+    assert toy.bits(pipeline(tmp_path / "run", Recipe(), steps)) == toy.bits(whole)
+    assert len(steps) == (42 - 8 if stage == "first" else 12 - 8)
+    same = ("1-first/stage.json", "2-second/stage.json")
+    assert all((tmp_path / "whole" / x).read_text() == (tmp_path / "run" / x).read_text() for x in same)
+    # The time of a stage is that of all processes that worked on it.
+    records = [record for record in run.records(tmp_path / "run") if record.get("name") == stage]
+    last, done = (next(x for x in reversed(records) if key in x) for key in ("step", "event"))
+    assert done["seconds"] >= last["seconds"]
+
+
+def test_stages_draw_from_seeds_of_their_own(tmp_path: Path) -> None:
+    seeds = [run.stage_seed(seed, name) for seed in (0, 1) for name in ("refine", "decompose")]
+    assert len(set(seeds)) == 4
+    one, other = (pipeline(tmp_path / str(seed), Recipe(seed=seed), []) for seed in (0, 1))
+    assert toy.bits(one) != toy.bits(other)
+
+
+def test_what_decides_a_result_decides_its_key() -> None:
+    usual = ("refine", 1, toy.Config(), ["capture"])
+    variants = [
+        ("decompose", *usual[1:]),
+        ("refine", 2, *usual[2:]),
+        ("refine", 1, toy.Config(rate=0.1), ["capture"]),
+        ("refine", 1, toy.Config(), ["another"]),
+        ("refine", 1, toy.Config(), ["capture", "poses"]),
+    ]
+    keys = [run.key(*usual), *(run.key(*variant) for variant in variants)]
+    assert len(set(keys)) == len(keys)
+    assert run.key(*usual) == keys[0]
+
+
+def test_a_stage_whose_inputs_changed_is_made_anew(tmp_path: Path) -> None:
+    opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
+    for keys in (["a"], ["b"], ["b"]):
+        run.stage(opened, 1, "first", toy, toy.Config(), counted(steps), keys)
+    assert len(steps) == 60
+
+
+def test_a_stage_of_another_seed_is_made_anew(tmp_path: Path) -> None:
+    steps: Steps = []
+    for seed in (0, 1, 1):
+        opened = run.Run(tmp_path, Recipe(seed=seed))
+        run.stage(opened, 1, "first", toy, toy.Config(), counted(steps), ["a"])
+    assert len(steps) == 60
+
+
+def test_a_stored_output_goes_where_the_inputs_are() -> None:
+    elsewhere = toy.Inputs(target=torch.zeros(2, device="meta"))
+    assert run._device((Recipe(), (elsewhere, a_capture()))).type == "meta"
+    assert run._device(()).type == "cpu"
+
+
+def test_a_key_never_stands_beside_the_output_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The power fails between the two files of a stage; then the stage's old settings come back."""
+    opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
+    inputs = counted(steps)
+    once = run.stage(opened, 1, "first", toy, toy.Config(), inputs, ["a"])
+    monkeypatch.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(RuntimeError("power cut")))
+    with pytest.raises(RuntimeError, match="power cut"):
+        run.stage(opened, 1, "first", toy, toy.Config(rate=0.2), inputs, ["a"])
+    monkeypatch.undo()
+    again = run.stage(opened, 1, "first", toy, toy.Config(), inputs, ["a"])
+    assert len(steps) == 90
+    assert toy.bits(again) == toy.bits(once)
+
+
+def test_a_full_disk_is_told_and_costs_no_step(tmp_path: Path) -> None:
+    steps: Steps = []
+    whole = pipeline(tmp_path / "whole", Recipe(), [])
+    path = tmp_path / "run"
+    with pytest.raises(RuntimeError, match="power cut"):
+        pipeline(path, Recipe(), steps, second={0: toy.crash})
+    assert len(steps) == 30
+    with full_disk(3000), pytest.raises(OSError, match=r"2-second/state\.safetensors: cannot be written"):
+        pipeline(path, Recipe(), steps)
+    assert not list(path.rglob("*partial*"))
+    assert len(steps) == 30 + 12
+    assert toy.bits(pipeline(path, Recipe(), steps)) == toy.bits(whole)
+    assert len(steps) == 30 + 24, "the finished stage was kept"
+
+
+def test_an_output_that_does_not_fit_on_the_disk_leaves_nothing_behind(tmp_path: Path) -> None:
+    class Big(toy.Previewed):
+        @staticmethod
+        def finish(cfg: toy.Config, inputs: toy.Inputs, state: toy.State) -> toy.Output:
+            return toy.Output(toy.finish(cfg, inputs, state).params, {"big": torch.zeros(100_000)})
+
+    opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
+    inputs = counted(steps)
+    with full_disk(100_000), pytest.raises(OSError, match=r"out\.safetensors: cannot be written"):
+        run.stage(opened, 1, "big", Big, toy.Config(), inputs, [])
+    names = sorted(p.name for p in (tmp_path / "run" / "1-big").iterdir())
+    assert names == ["preview.png", "state.safetensors"]
+    run.stage(opened, 1, "big", Big, toy.Config(), inputs, [])
+    assert len(steps) == 30, "training was not repeated"
+
+
+def test_a_stage_without_steps_and_one_without_a_class_of_output(tmp_path: Path) -> None:
+    class Untold(toy.Previewed):
+        @staticmethod
+        def finish(cfg: toy.Config, inputs: toy.Inputs, state: toy.State):
+            return toy.finish(cfg, inputs, state)
+
+    opened = run.open(tmp_path / "run", Path("clip"), Recipe())
+    output = run.stage(opened, 1, "none", toy, toy.Config(steps=0), toy.Inputs(), [])
+    assert output.params.points.shape == (6, 2)
+    with pytest.raises(TypeError, match="return annotation"):
+        run.stage(opened, 2, "untold", Untold, toy.Config(), toy.Inputs(), [])
+
+
+def test_the_log_has_a_line_of_json_for_what_happened(tmp_path: Path) -> None:
+    pipeline(tmp_path / "run", Recipe(), [])
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert all("time" in line for line in lines)
+    assert [(x["name"], x["event"]) for x in lines if "event" in x] == [
+        (name, event) for name in ("first", "second") for event in ("start", "done")
+    ]
+    last = next(x for x in lines if x.get("step") == 30)
+    assert last["metrics"].keys() == {"loss", "points"}
+
+
+# The folder -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_recipe_is_saved_and_the_same_one_goes_on(tmp_path: Path) -> None:
+    for _ in range(2):
+        opened = run.open(tmp_path / "runs" / "mug", tmp_path / "clip.mp4", Recipe())
+        assert opened.recipe == Recipe()
+    document = files.read_json(tmp_path / "runs" / "mug" / "recipe.json")
+    assert document["recipe"]["second"]["steps"] == 12
+    assert document["capture"]["path"] == str(tmp_path / "clip.mp4")
+
+
+def test_another_recipe_is_refused_with_what_differs(tmp_path: Path) -> None:
+    run.open(tmp_path, Path("clip"), Recipe())
+    make_something(tmp_path)
+    other = Recipe(second=toy.Config(steps=13), seed=5)
+    with pytest.raises(
+        BadFile, match=r"recipe\.second\.steps is 12 there and 13 here; recipe\.seed is 0 there and 5 here"
+    ):
+        run.open(tmp_path, Path("clip"), other)
+
+
+def test_a_run_that_has_made_nothing_takes_another_recipe(tmp_path: Path) -> None:
+    run.open(tmp_path, Path("clip"), Recipe(seed=5))
+    run.open(tmp_path, Path("clip"), Recipe())
+    make_something(tmp_path)
+    run.open(tmp_path, Path("clip"), Recipe())
+    with pytest.raises(BadFile, match=r"recipe\.seed is 0 there and 5 here"):
+        run.open(tmp_path, Path("clip"), Recipe(seed=5))
+
+
+def make_something(path: Path) -> None:
+    """As if a stage had begun."""
+    files.write_whole(path / "1-first" / run.CHECKPOINT, lambda partial: partial.write_bytes(b"a state"))
+
+
+def test_a_capture_is_known_by_its_content_where_there_is_one_else_by_its_path(tmp_path: Path) -> None:
+    run.open(tmp_path / "a", Path("clip"), Recipe(), content="key")
+    make_something(tmp_path / "a")
+    run.open(tmp_path / "a", Path("moved"), Recipe(), content="key")
+    with pytest.raises(BadFile, match=r"capture\.content is 'key' there and 'other' here"):
+        run.open(tmp_path / "a", Path("clip"), Recipe(), content="other")
+    run.open(tmp_path / "a", Path("clip"), Recipe())
+    with pytest.raises(BadFile, match=r"capture\.path is '.*clip' there and '.*moved' here"):
+        run.open(tmp_path / "a", Path("moved"), Recipe())
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.png").write_bytes(b"cat")
+    with pytest.raises(BadFile, match="is there already and is no run"):
+        run.open(tmp_path / "photos", Path("clip"), Recipe())
+    with pytest.raises(BadFile, match="is a file"):
+        run.open(tmp_path / "photos" / "cat.png", Path("clip"), Recipe())
+    with pytest.raises(BadFile, match="is there already and is no run"), run.alone(tmp_path / "photos"):
+        raise AssertionError("nobody works in here")
+    (tmp_path / "photos" / "recipe.json").write_text('{"eggs": 3}')
+    with pytest.raises(BadFile, match="is no recipe of a run"):
+        run.open(tmp_path / "photos", Path("clip"), Recipe())
+    assert sorted(p.name for p in (tmp_path / "photos").iterdir()) == ["cat.png", "recipe.json"]
+
+
+def test_a_read_only_place_is_told_with_the_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(tempfile, "mkstemp", refuse)
+    with pytest.raises(OSError, match=r"recipe\.json: cannot be written: Read-only file system \(choose a folder") as e:
+        run.open(tmp_path / "run", Path("clip"), Recipe())
+    assert e.value.errno == errno.EROFS
+
+
+def test_a_finished_run_can_be_read_where_nothing_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once = pipeline(tmp_path / "run", Recipe(), [])
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    for module, name in ((tempfile, "mkstemp"), (run, "log"), (Path, "mkdir"), (Path, "unlink")):
+        monkeypatch.setattr(module, name, refuse)
+    assert toy.bits(pipeline(tmp_path / "run", Recipe(), [])) == toy.bits(once)
+
+
+# The capture's key ----------------------------------------------------------------------------------------------------
+
+
+def a_capture() -> Capture:
+    torch.manual_seed(0)
+    images, masks = torch.randint(0, 255, (2, 6, 8, 3)).to(torch.uint8), torch.full((2, 6, 8), 255, dtype=torch.uint8)
+    poses = Trajectory(SE3.exp(torch.randn(2, 6)), "camera")
+    return Capture(images, masks, Camera.from_fov(0.5, 6, 8), ("0.png", "1.png"), "camera", poses)
+
+
+def changed(x: Tensor) -> Tensor:
+    y = x.clone()
+    y.view(-1)[3] = y.view(-1)[3] + 1
+    return y
+
+
+def test_all_that_a_method_may_see_decides_the_captures_key() -> None:
+    capture = a_capture()
+    poses, lens = capture.trajectory, capture.camera
+    assert poses is not None
+    variants = [
+        capture,
+        replace(capture, images=changed(capture.images)),
+        replace(capture, masks=changed(capture.masks)),
+        replace(capture, camera=replace(lens, fx_fy_cx_cy=changed(lens.fx_fy_cx_cy))),
+        replace(capture, trajectory=None),
+        replace(
+            capture, trajectory=replace(poses, T_cam_obj=replace(poses.T_cam_obj, xyz=changed(poses.T_cam_obj.xyz)))
+        ),
+        replace(capture, light="object", trajectory=replace(poses, light="object")),
+        replace(capture, names=("0.png", "2.png")),
+        replace(capture, focal_guessed=True),
+    ]
+    keys = [run.capture_key(variant) for variant in variants]
+    assert len(set(keys)) == len(keys)
+    assert run.capture_key(a_capture()) == keys[0]
+
+
+def test_truth_never_enters_the_captures_key(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(1, 255, (6, 8, 3), dtype=np.uint8)
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    for n in range(2):
+        files.write_png(tmp_path / "images" / f"{n}.png", pixels)
+        files.write_png(tmp_path / "masks" / f"{n}.png", np.full((6, 8, 1), 255, np.uint8))
+    files.write_exr(tmp_path / "truth" / "albedo" / "1.exr", np.full((6, 8, 3), 0.5, np.float32))
+    frames = [
+        _capture_folder.training_frame("0.png", pose.tolist()),
+        _capture_folder.evaluation_frame("1.png", pose.tolist(), "shared", maps=("albedo",), lights=()),
+    ]
+    document = _capture_folder.document(
+        Camera.from_fov(0.5, 6, 8), "camera", frames, setting="handheld", with_light=False
+    )
+    files.write_json(tmp_path / "transforms.json", document)
+    before = run.capture_key(datasets_folder.load(tmp_path))
+    shutil.rmtree(tmp_path / "truth")
+    assert run.capture_key(datasets_folder.load(tmp_path)) == before
+    files.write_png(tmp_path / "images" / "1.png", 255 - pixels)
+    assert run.capture_key(datasets_folder.load(tmp_path)) == before, "evaluation views are truth"
+    files.write_png(tmp_path / "images" / "0.png", 255 - pixels)
+    assert run.capture_key(datasets_folder.load(tmp_path)) != before

@@ -1,0 +1,138 @@
+"""Textures against the material that the Gaussians were given."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from tests.surfaces import GAMMA, sphere
+from tumble.export import bake, mesh
+from tumble.export.bake import Textures
+from tumble.export.mesh import Unwrapped
+from tumble.maths.images import linear_from_srgb
+from tumble.maths.se3 import SE3
+from tumble.scene.asset import Asset
+from tumble.scene.camera import Camera
+from tumble.scene.environment import Environment
+from tumble.scene.gaussians import Gaussians
+from tumble.scene.material import TEMPERATURE, Material
+from tumble.scene.trajectory import Trajectory
+
+RADIUS = 0.8
+
+
+def colour(x: torch.Tensor) -> torch.Tensor:
+    """Linear base colour by position: different along every axis and both ways."""
+    return (0.4 + torch.tensor([0.35, 0.25, -0.3]) * x / RADIUS).clamp(0.02, 0.98)
+
+
+def rough(x: torch.Tensor) -> torch.Tensor:
+    return 0.5 + 0.2 * x[..., 1] / RADIUS
+
+
+def painted(gaussians: Gaussians) -> Asset:
+    """An asset whose corners have the colour of their own positions, under an uneven light, seen three times."""
+    signs = torch.tensor([[-1.0, -1], [1, -1], [-1, 1], [1, 1]])
+    # Corners of a Gaussian's plane lie sqrt(3) standard deviations out.
+    plane = gaussians.R_obj_local[..., :2] * gaussians.scales[:, None, :2] * 3**0.5
+    corners = gaussians.means[:, None] + torch.einsum("nij,cj->nci", plane, signs)
+    material = Material(
+        TEMPERATURE * torch.logit(colour(corners)),
+        TEMPERATURE * torch.logit(rough(corners)),
+        torch.zeros_like(corners),
+        torch.tensor(0.3),
+    )
+    light = Environment.from_radiance(0.5 + torch.linspace(0, 1, 8 * 16 * 3).reshape(8, 16, 3))
+    T_cam_obj = SE3.exp(torch.tensor([[0.1, 0, 4, 0.2, 0, 0], [0, 0.2, 4, 0, 0.7, 0.1], [0, 0, 5, 1, 2, 0.5]]))
+    return Asset(gaussians, GAMMA, material, light, Trajectory(T_cam_obj, "camera"), Camera.from_fov(0.6, 24, 32))
+
+
+@pytest.fixture(scope="module")
+def asset() -> Asset:
+    return painted(sphere(3000, radius=RADIUS))
+
+
+@pytest.fixture(scope="module")
+def ball() -> Unwrapped:
+    axis = np.linspace(-mesh.REACH, mesh.REACH, 33)
+    values = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - RADIUS
+    made = mesh.simplified(mesh.march(values, -mesh.REACH, 2 * mesh.REACH / 32), 1500)
+    return mesh.unwrapped(made, 192, 8)
+
+
+def baked(asset: Asset, ball: Unwrapped) -> Textures:
+    return bake.bake(asset, ball, resolution=192, views=24, pixels=160)
+
+
+def at(values: np.ndarray, spots: bake.Texels) -> torch.Tensor:
+    return torch.from_numpy(values[spots.rows.numpy(), spots.columns.numpy()]).float() / 255
+
+
+def test_texels_lie_on_the_mesh_and_know_their_frame(ball: Unwrapped) -> None:
+    spots = bake.texels(ball, 192)
+    assert len(spots.rows) > 0.3 * 192**2
+    # Chords of 1500 triangles lie up to 0.6 % below the sphere.
+    assert (spots.points.norm(dim=-1) - RADIUS).abs().quantile(0.99) < 0.01
+    assert (normalize(spots.points, dim=-1) * spots.normals).sum(-1).quantile(0.01) > 0.99
+
+
+def test_colours_and_roughness_are_those_of_the_place(asset: Asset, ball: Unwrapped) -> None:
+    """A flip of u, v or of an axis would be off by up to 0.6."""
+    spots, textures = bake.texels(ball, 192), baked(asset, ball)
+    error = (linear_from_srgb(at(textures.base_color, spots)) - colour(spots.points)).abs()
+    # A Gaussian is 0.04 wide, over which the colour changes by 0.02; 8 bits are 0.008 of a bright linear value.
+    assert error.mean() < 0.01
+    assert error.max() < 0.06
+    assert (at(textures.roughness, spots) - rough(spots.points)).abs().max() < 0.05
+
+
+def test_values_of_gaussians_lie_where_they_are(asset: Asset, ball: Unwrapped) -> None:
+    spots = bake.texels(ball, 96)
+    height = 0.5 + 0.5 * asset.gaussians.means[:, 1] / RADIUS
+    found = at(bake.spread(height, asset, ball, resolution=96), spots)
+    # 3000 Gaussians lie 0.05 apart.
+    assert (found - 0.5 - 0.5 * spots.points[:, 1] / RADIUS).abs().max() < 0.05
+
+
+def test_a_smooth_sphere_has_a_flat_normal_map(asset: Asset, ball: Unwrapped) -> None:
+    spots, textures = bake.texels(ball, 192), baked(asset, ball)
+    z = 2 * at(textures.normal, spots)[:, 2] - 1
+    assert z.quantile(0.01) > 0.98
+
+
+def test_normal_detail_comes_back_through_the_tangent_frame(asset: Asset, ball: Unwrapped) -> None:
+    """A tilt in a known object direction, decoded as a viewer does: n = x t + y b + z n, b = w cross(n, t)."""
+    tilt = torch.tensor([0.3, -0.15, 0.25])
+    material = asset.material
+    assert material is not None
+    offset = material.normal_offset + tilt
+    spots = bake.texels(ball, 192)
+    textures = baked(replace(asset, material=replace(material, normal_offset=offset)), ball)
+    x, y, z = (2 * at(textures.normal, spots) - 1).split(1, -1)
+    bitangents = torch.linalg.cross(spots.normals, spots.tangents) * spots.signs
+    shown = normalize(x * spots.tangents + y * bitangents + z * spots.normals, dim=-1)
+    expected = normalize(normalize(spots.points, dim=-1) + tilt, dim=-1)
+    # Facets, and tangents that are not quite at right angles between vertices: two degrees; a wrong sign is twenty.
+    assert (shown * expected).sum(-1).quantile(0.05) > 0.998
+
+
+def test_padding_repeats_the_nearest_texel() -> None:
+    covered = np.zeros((24, 24), bool)
+    covered[3:8, 4:9] = covered[15:20, 12:20] = True
+    picture = np.random.default_rng(0).integers(1, 255, (24, 24, 3)).astype(np.uint8)
+    filled = bake.padded(picture * covered[..., None], covered)
+    assert (filled[covered] == picture[covered]).all()
+    places = np.argwhere(covered)
+    for row, column in np.argwhere(~covered):
+        distance = np.hypot(*(places - (row, column)).T)
+        # The 5 x 5 mask measures distances to 2 %.
+        near = picture[tuple(places[distance <= 1.03 * distance.min()].T)]
+        assert (near == filled[row, column]).all(1).any()
+
+
+def test_what_no_view_sees_takes_the_nearest_gaussian(asset: Asset) -> None:
+    points = torch.tensor([[0.2, 0.1, 0.0], [-0.1, 0.0, 0.3]])
+    values = bake._beside(asset, points, normalize(points, dim=-1))
+    assert (values[:, :3] - colour(RADIUS * normalize(points, dim=-1))).abs().max() < 0.03

@@ -1,0 +1,44 @@
+"""Stage 3: how the product of albedo and light is shared out. Whole runs are tested with the loop that drives them."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.surfaces import sphere
+from tumble.inverse_rendering import decompose
+from tumble.scene.environment import Environment
+from tumble.scene.material import DIELECTRIC, Material
+
+
+def params(log_tint: Tensor) -> decompose.Params:
+    gaussians = sphere(20)
+    material = Material.constant(20, torch.tensor([0.6, 0.3, 0.05]), 0.5)
+    light = Environment.from_radiance(torch.tensor([1.0, 2.0, 0.5]).expand(8, 16, 3))
+    return decompose.Params(gaussians, torch.tensor(30.0), material, light, torch.zeros(1, 6), log_tint)
+
+
+def colours(p: decompose.Params) -> tuple[Tensor, Tensor]:
+    """What the diffuse lobe and what the highlight is made of."""
+    light = p.environment.radiance[0, 0]
+    return p.material.albedo[0, 0] * light, p.material.f0 * p.log_tint.exp() * light
+
+
+def test_the_colour_of_the_highlight_goes_to_the_light() -> None:
+    """A grey highlight asks for a light that is three times as bright in green and half as bright again in red."""
+    before = params(torch.tensor([1.5, 3.0, 0.5]).log())
+    after = decompose.shared_out(before)
+    for old, new in zip(colours(before), colours(after), strict=True):
+        torch.testing.assert_close(new, old, rtol=1e-5, atol=0)
+    assert after.material.f0.item() == pytest.approx(DIELECTRIC)
+    torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.4, 0.1, 0.1]), rtol=1e-5, atol=0)
+
+
+def test_an_object_without_a_highlight_keeps_an_albedo_below_one() -> None:
+    before = params(torch.full((3,), math.log(0.01)))
+    after = decompose.shared_out(before)
+    torch.testing.assert_close(colours(after)[0], colours(before)[0], rtol=1e-5, atol=0)
+    # The tint is too faint to say anything about colour: still 0.6, 0.3, 0.05, made as bright as may be.
+    torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.9, 0.45, 0.075]), rtol=1e-5, atol=0)
+    assert after.material.f0.item() < 0.1 * DIELECTRIC

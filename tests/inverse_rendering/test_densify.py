@@ -1,0 +1,54 @@
+"""Splitting and dropping as a gather."""
+
+import torch
+
+from tumble.inverse_rendering import densify
+from tumble.scene.gaussians import Gaussians
+
+
+def test_the_most_important_split_the_useless_go_and_the_rest_stay() -> None:
+    importance = torch.tensor([0.0, 9.0, 5.0, 7.0, 1.0])
+    drop = torch.tensor([True, False, False, False, False])
+    plan = densify.plan(importance, drop, threshold=2.0, fraction=0.4, limit=100)
+    assert plan.index.tolist() == [2, 4, 1, 3, 1, 3]
+    assert plan.fresh.tolist() == [False, False, True, True, True, True]
+
+
+def test_the_limit_holds() -> None:
+    importance = torch.arange(10.0) + 5
+    plan = densify.plan(importance, torch.zeros(10, dtype=torch.bool), threshold=0.0, fraction=1.0, limit=12)
+    assert len(plan.index) == 12
+    assert plan.index[plan.fresh].unique().tolist() == [8, 9]
+
+
+def test_what_is_dropped_never_splits() -> None:
+    importance = torch.tensor([9.0, 1.0])
+    plan = densify.plan(importance, torch.tensor([True, False]), threshold=0.5, fraction=0.5, limit=10)
+    assert plan.index.tolist() == [1, 1]
+
+
+def test_children_lie_on_both_sides_along_the_longer_axis() -> None:
+    half = 0.5**0.5
+    gaussians = Gaussians(
+        means=torch.zeros(3, 3),
+        quats=torch.tensor([[1.0, 0, 0, 0], [half, 0, 0, half], [half, 0, 0, half]]),  # a quarter turn about z
+        log_scales=torch.tensor([[0.1, 0.2, 0.01], [0.4, 0.2, 0.01], [0.4, 0.2, 0.01]]).log(),
+        sdf=torch.zeros(3),
+        sh=torch.zeros(3, 1, 3),
+    )
+    plan = densify.Plan(torch.tensor([0, 1, 1]), torch.tensor([False, True, True]), 1)
+    densify.place_children(gaussians, plan)
+    expected = torch.tensor([[0.0, 0, 0], [0, 0.2, 0], [0, -0.2, 0]])
+    torch.testing.assert_close(gaussians.means, expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(gaussians.log_scales[1:].exp(), torch.tensor([[0.25, 0.2, 0.01]] * 2))
+    torch.testing.assert_close(gaussians.log_scales[0].exp(), torch.tensor([0.1, 0.2, 0.01]))
+
+
+def test_a_nearly_perfect_picture_has_no_bad_pixels() -> None:
+    error, mask = torch.full((4, 4), 0.01), torch.ones(4, 4)
+    error[0, 0] = 0.015
+    assert densify.bad_pixels(error, mask, relative=0.1, absolute=0.02).sum() == 0
+    error[0, 0] = 0.5
+    assert densify.bad_pixels(error, mask, relative=0.1, absolute=0.02).sum() == 1
+    mask[0, 0] = 0
+    assert densify.bad_pixels(error, mask, relative=0.1, absolute=0.02).sum() == 0

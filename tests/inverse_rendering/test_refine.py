@@ -1,0 +1,139 @@
+"""Stage 2: what one step computes."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from tumble.engine.loop import State
+from tumble.inverse_rendering import losses, refine
+from tumble.inverse_rendering.refine import Config, Params, Points
+from tumble.inverse_rendering.sh_lighting import CoarseLight
+from tumble.maths.images import srgb_from_linear
+from tumble.maths.se3 import SE3, SO3, angle_between
+from tumble.recipes import SMOKE
+from tumble.rendering.buffers import Buffers
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.gaussians import Gaussians, constant_sh, facing
+from tumble.scene.photograph import Frame
+from tumble.scene.trajectory import Trajectory
+
+GAMMA = torch.tensor(30.0)
+
+
+def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkeypatch) -> None:
+    """A ball off the middle, rendered a little to the left of where it was photographed; mask and gradients too."""
+    h, w, n = 60, 70, 12
+    rng = torch.Generator().manual_seed(0)
+    like = {"generator": rng, "dtype": torch.float64}
+    row, column = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    rendered, mask = (((row - 25) ** 2 + (column - x) ** 2 < 100).double() for x in (38, 40))
+    images = [(rendered * torch.rand(h, w, **like)).requires_grad_() for _ in range(3)]
+    normal, rgb = ((rendered[..., None] * torch.rand(h, w, 3, **like)).requires_grad_() for _ in range(2))
+    nothing = torch.zeros(n)
+    view = Buffers(*images, normal, rgb, {}, nothing + 1, nothing.int(), torch.zeros(h, w, dtype=torch.int32))
+    truth = Frame(mask[..., None] * torch.rand(h, w, 3, **like), mask, torch.ones(h, w, 1, dtype=torch.float64))
+    means = 0.1 * torch.randn(n, 3, **like)
+    gaussians = Gaussians(means, torch.randn(n, 4, **like), means - 2, means[:, 0], means[:, None])
+    params = Params(Points(gaussians, means), torch.tensor(30.0), CoarseLight.constant(0.4, means), torch.zeros(1, 6))
+    T_cam_obj = SE3.from_rotation(SO3.exp(0.3 * means[0]), torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64))
+    arguments = (Config(), params, view, truth, Camera.from_fov(math.radians(40), h, w), T_cam_obj, 0.5)
+
+    def terms_and_gradients() -> list[torch.Tensor]:
+        terms = refine._terms(*arguments)
+        gradients = torch.autograd.grad(torch.stack(list(terms.values())).sum(), [*images, normal, rgb])
+        # The rasterizer has nothing to differentiate where nothing is.
+        return [*terms.values(), *(x[rendered > 0] for x in gradients)]
+
+    cut, _, _, share = refine._window(view, truth, arguments[4])
+    assert cut.alpha.shape == (19 + 2 * losses.SSIM_MARGIN, 21 + 2 * losses.SSIM_MARGIN)
+    assert share == cut.alpha.numel() / (h * w)
+    found = terms_and_gradients()
+    monkeypatch.setattr(refine, "_window", lambda view, truth, camera: (view, truth, camera, 1.0))
+    torch.testing.assert_close(found, terms_and_gradients())
+
+
+def test_a_picture_with_nothing_in_it_has_losses_too() -> None:
+    black, none = torch.zeros(20, 20), torch.zeros(0)
+    coloured = torch.zeros(20, 20, 3)
+    view = Buffers(black, black, black, coloured, coloured, {}, none, none.int(), black.int())
+    truth, camera = Frame(coloured, black, torch.ones(20, 20, 1)), Camera.from_fov(1.0, 20, 20)
+    assert refine._window(view, truth, camera) == (view, truth, camera, 1.0)
+
+
+def ball() -> tuple[Points, SE3, Capture]:
+    """A ball with a pattern, four poses and what was photographed in them."""
+    rng = torch.Generator().manual_seed(1)
+    means = torch.nn.functional.normalize(torch.randn(600, 3, generator=rng), dim=-1)
+    flat = torch.tensor([-2.4, -2.4, -4.6]).expand(600, 3)
+    gaussians = Gaussians(means, facing(means), flat, torch.zeros(600), constant_sh(means * 0))
+    points = Points(gaussians, 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]])))
+    axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])
+    true = SE3.from_rotation(SO3.exp(axes), torch.tensor([0.02, 0.05, 4.0]).expand(4, 3).contiguous())
+    light, camera = CoarseLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
+    views = [refine.render(points, GAMMA, light, true[k], Trajectory(true, "camera"), camera) for k in range(4)]
+    images = torch.stack([(srgb_from_linear(v.rgb).clamp(0, 1) * 255).round().to(torch.uint8) for v in views])
+    masks = torch.stack([torch.where(v.alpha > 0.5, OBJECT, BACKGROUND) for v in views]).to(torch.uint8)
+    return points, true, Capture(images, masks, camera, tuple("abcd"), "camera")
+
+
+def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
+    """Two of four photographs were taken half a degree and two degrees from where the run believes."""
+    points, true, capture = ball()
+    turns = torch.tensor([[0.0, 0, 0], [0.0087, 0, 0], [0.0, 0, 0], [0.02, -0.02, 0.02]])
+    base = Trajectory(SE3.from_rotation(SO3.exp(turns) @ true.rotation, true.xyz), "camera")
+    params = Params(points, GAMMA, CoarseLight.constant(0.4, turns), torch.zeros(4, 6))
+    inputs = refine.Inputs(capture, base)
+    for _ in range(4):
+        refine._realign(inputs, State(0, params, None, torch.Generator(), {}))
+    found = torch.stack([refine.pose(params, inputs, k).rotation.wxyz for k in range(4)])
+    errors = np.degrees(angle_between(SO3(found), true.rotation).numpy())
+    # A tenth of a pixel: the pictures are quantized, the masks hard.
+    assert errors.max() < 0.25, errors
+
+
+def test_what_no_frame_has_shown_since_the_last_densification_is_dropped() -> None:
+    _, true, capture = ball()
+    cfg = replace(SMOKE.refine, points=600, limit=600, importance=math.inf, every=1000)
+    inputs = refine.Inputs(capture, Trajectory(true, "camera"))
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+    shown = []
+    for state.step in range(1, 5):
+        refine.step(cfg, inputs, state)
+        shown.append(state.memory["shown"] > cfg.least_weight)
+    # What any frame shows stays shown, and every frame hides the ball's other side.
+    assert all((before <= after).all() for before, after in pairwise(shown))
+    assert 0.2 < shown[0].float().mean() < 0.8 * shown[3].float().mean()
+    state.memory["shown"][::3] = 0.9 * cfg.least_weight
+    # One view is scored; what it hides stays all the same.
+    refine._densify(replace(cfg, views=1), inputs, state)
+    left = len(state.params.points.albedo_logits)
+    assert left == (shown[3] & (torch.arange(600) % 3 > 0)).sum()
+    assert torch.equal(state.memory["shown"], torch.zeros(left))
+
+
+def test_colours_turn_normals_by_a_share_of_their_gradient(monkeypatch) -> None:
+    """A Gaussian seen face to face under a light from the side: only its colour tells its normal."""
+    means = torch.zeros(1, 3)
+    gaussians = Gaussians(
+        means, torch.tensor([[1.0, 0.2, 0.1, 0.0]]), torch.full((1, 3), -1.5), torch.zeros(1), constant_sh(means)
+    )
+    light = CoarseLight.constant(0.4, means)
+    light.coefficients[3] = -0.8
+    T_cam_obj = SE3(torch.tensor([0.0, 1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
+    trajectory = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), "camera")
+    camera = Camera.from_fov(0.6, 24, 24)
+
+    def turned(share: float) -> torch.Tensor:
+        monkeypatch.setattr(refine, "HINT", share)
+        quats = gaussians.quats.clone().requires_grad_()
+        points = Points(Gaussians(means, quats, gaussians.log_scales, gaussians.sdf, gaussians.sh), means)
+        view = refine.render(points, GAMMA, light, T_cam_obj, trajectory, camera)
+        return torch.autograd.grad(view.rgb.sum(), quats)[0]
+
+    none, some, all_of_it = (turned(share) for share in (0.0, 0.3, 1.0))
+    assert (all_of_it - none).norm() > 1e-3
+    torch.testing.assert_close(some, none + 0.3 * (all_of_it - none), atol=1e-5, rtol=1e-3)

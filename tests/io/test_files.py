@@ -1,0 +1,109 @@
+"""Pictures on disk: what is written comes back, and what is broken is refused with the file, the rule and the fix."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tumble.io import files
+from tumble.io.files import BadFile
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_png_keeps_every_code_value(tmp_path: Path, channels: int) -> None:
+    values = RNG.integers(0, 256, (5, 7, channels), dtype=np.uint8)
+    files.write_png(tmp_path / "a" / "x.png", values)
+    assert np.array_equal(files.read_picture(tmp_path / "a" / "x.png"), values)
+    assert files.picture_size(tmp_path / "a" / "x.png") == (5, 7)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("half", [True, False])
+def test_exr_keeps_linear_values(tmp_path: Path, channels: int, half: bool) -> None:
+    values = RNG.gamma(1.0, 3.0, (5, 7, channels)).astype(np.float32)
+    files.write_exr(tmp_path / "x.exr", values, half=half)
+    # Half precision has 11 significant bits.
+    np.testing.assert_allclose(files.read_radiance(tmp_path / "x.exr"), values, rtol=2**-11 if half else 0)
+
+
+def test_hdr_keeps_eight_bits_of_the_brightest_channel(tmp_path: Path) -> None:
+    values = (RNG.random((5, 8, 3)) * [1.0, 10.0, 1000.0]).astype(np.float32)
+    files.write_hdr(tmp_path / "x.hdr", values)
+    brightest = values.max(-1, keepdims=True)
+    assert (np.abs(files.read_radiance(tmp_path / "x.hdr") - values) / brightest).max() < 1 / 128
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
+    def fail(partial: Path) -> None:
+        partial.write_bytes(b"half of it")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        files.write_whole(tmp_path / "x.png", fail)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_has_no_nan_in_either_direction(tmp_path: Path) -> None:
+    files.write_json(tmp_path / "x.json", {"a": float("nan"), "b": [1.5, float("inf")]})
+    assert files.read_json(tmp_path / "x.json") == {"a": None, "b": [1.5, None]}
+    (tmp_path / "y.json").write_text('{"a": NaN}')
+    with pytest.raises(BadFile, match=r"y\.json: holds NaN"):
+        files.read_json(tmp_path / "y.json")
+
+
+@pytest.mark.parametrize("name", ["x.exr", "x.hdr", "x.png", "x.json"])
+def test_junk_and_missing_files_are_named(tmp_path: Path, name: str) -> None:
+    read = {".png": files.read_picture, ".json": files.read_json}.get(Path(name).suffix, files.read_radiance)
+    with pytest.raises(BadFile, match=f"{name}: is missing"):
+        read(tmp_path / name)
+    (tmp_path / name).write_bytes(b"\x00junk" * 50)
+    with pytest.raises(BadFile, match=name):
+        read(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["x.exr", "x.hdr", "x.png"])
+def test_a_file_cut_off_in_the_middle_is_refused(tmp_path: Path, name: str) -> None:
+    values = RNG.random((64, 64, 3)).astype(np.float32)
+    {".exr": files.write_exr, ".hdr": files.write_hdr}.get(
+        Path(name).suffix, lambda path, v: files.write_png(path, (v * 255).astype(np.uint8))
+    )(tmp_path / name, values)
+    whole = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+    read = files.read_picture if name.endswith("png") else files.read_radiance
+    with pytest.raises(BadFile, match=name):
+        read(tmp_path / name)
+
+
+def test_pictures_too_large_are_refused_before_they_are_decoded(tmp_path: Path) -> None:
+    (tmp_path / "x.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 200000\n")
+    with pytest.raises(BadFile, match="over the limit"):
+        files.read_radiance(tmp_path / "x.hdr")
+
+
+def test_non_finite_pixels_are_refused(tmp_path: Path) -> None:
+    files.write_exr(tmp_path / "x.exr", np.full((2, 2, 1), np.nan, np.float32))
+    with pytest.raises(BadFile, match="NaN"):
+        files.read_radiance(tmp_path / "x.exr")
+
+
+def test_sixteen_bit_pictures_are_refused_with_the_fix(tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(np.zeros((2, 2), np.uint16)).save(tmp_path / "x.png")
+    with pytest.raises(BadFile, match="8-bit sRGB"):
+        files.read_picture(tmp_path / "x.png")
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x"])
+def test_no_path_leaves_the_folder(tmp_path: Path, name: str) -> None:
+    with pytest.raises(BadFile, match="leaves the folder"):
+        files.inside(tmp_path, name)
+
+
+def test_no_link_leaves_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "link").symlink_to(tmp_path)
+    with pytest.raises(BadFile, match="leaves the folder"):
+        files.inside(tmp_path / "in", "link/x.png")

@@ -1,0 +1,88 @@
+"""Trees of tensors: names, maps, and the way to disk and back."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from tumble.io import plugins, tree
+from tumble.maths.se3 import SE3
+from tumble.scene.asset import Asset
+from tumble.scene.camera import Camera
+from tumble.scene.environment import Environment
+from tumble.scene.gaussians import Gaussians
+from tumble.scene.material import Material
+from tumble.scene.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Leafy:
+    x: Tensor
+    more: dict[str, Tensor]
+    word: str
+    sizes: tuple[int, ...]
+    nothing: Tensor | None
+
+
+def an_asset(material: bool = True) -> Asset:
+    torch.manual_seed(0)
+    gaussians = Gaussians(torch.randn(5, 3), torch.randn(5, 4), torch.randn(5, 3), torch.randn(5), torch.randn(5, 4, 3))
+    return Asset(
+        gaussians=gaussians,
+        gamma=torch.tensor(7.0),
+        material=Material.constant(5, torch.tensor([0.2, 0.5, 0.7]), 0.3) if material else None,
+        environment=Environment.from_radiance(torch.rand(4, 8, 3)),
+        trajectory=Trajectory(SE3.exp(torch.randn(3, 6)), "camera"),
+        camera=Camera.from_fov(0.5, 6, 8),
+    )
+
+
+@pytest.mark.parametrize("material", [True, False])
+def test_an_asset_comes_back_from_disk_bit_for_bit(tmp_path: Path, material: bool) -> None:
+    asset = an_asset(material)
+    tree.save(asset, tmp_path / "asset.safetensors")
+    again = tree.load(Asset, tmp_path / "asset.safetensors")
+    before, after = tree.named_tensors(asset), tree.named_tensors(again)
+    assert list(before) == list(after)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert again.trajectory.light == "camera"
+    assert (again.camera.height, again.camera.width) == (6, 8)
+    assert (again.material is None) == (not material)
+    assert [p.name for p in tmp_path.iterdir()] == ["asset.safetensors"]
+
+
+def test_facts_dicts_and_absent_parts_survive_the_disk(tmp_path: Path) -> None:
+    leafy = Leafy(torch.arange(3), {"a": torch.ones(2), "b": torch.zeros(1)}, "word", (1, 2), None)
+    tree.save(leafy, tmp_path / "leafy")
+    again = tree.load(Leafy, tmp_path / "leafy")
+    assert (again.word, again.sizes, again.nothing) == ("word", (1, 2), None)
+    assert list(again.more) == ["a", "b"]
+    assert torch.equal(again.x, leafy.x)
+
+
+def test_views_of_one_storage_can_be_saved(tmp_path: Path) -> None:
+    whole = torch.arange(6.0)
+    tree.save(Leafy(whole[:3], {"tail": whole[3:]}, "", (), None), tmp_path / "views")
+    assert tree.load(Leafy, tmp_path / "views").more["tail"].tolist() == [3, 4, 5]
+
+
+def test_a_file_of_another_class_is_refused_by_name(tmp_path: Path) -> None:
+    tree.save(Camera.from_fov(0.5, 2, 2), tmp_path / "camera")
+    with pytest.raises(ValueError, match="holds a Camera, not a Asset"):
+        tree.load(Asset, tmp_path / "camera")
+
+
+def test_map_reaches_every_tensor_and_leaves_facts_alone() -> None:
+    doubled = tree.map(lambda x: 2 * x, an_asset())
+    assert torch.equal(doubled.gaussians.means, 2 * an_asset().gaussians.means)
+    assert doubled.trajectory.light == "camera"
+    assert tree.named_tensors(doubled)["trajectory.T_cam_obj.xyz"].shape == (3, 3)
+    assert not tree.detach(tree.map(lambda x: x.requires_grad_(), an_asset())).gamma.requires_grad
+
+
+def test_a_plugin_is_found_by_its_file_name_and_an_unknown_one_lists_the_known() -> None:
+    assert hasattr(plugins.named("datasets", "folder"), "load")
+    with pytest.raises(ValueError, match=r"no 'nope' in tumble/datasets; there are: .*folder"):
+        plugins.named("datasets", "nope")

@@ -1,0 +1,47 @@
+"""The paper's route with the graph route's outcome."""
+
+import math
+import sys
+
+import torch
+
+from tests.lopsided import truth, tumbling
+from tests.poses.progressive.test_tracker import INPUTS, SMOKE, TRUTH
+from tumble import recipes
+from tumble.engine.loop import Stage, drive
+from tumble.maths.se3 import angle_between
+from tumble.poses.progressive import lift, tracker
+from tumble.poses.progressive import stage as progressive
+from tumble.poses.sfm import stage as graph
+
+
+def test_true_poses_are_judged_good() -> None:
+    """In another unit and frame, but the same motion."""
+    scene = tumbling(24, points=200)
+    rng = torch.Generator().manual_seed(0)
+    some = [scene.match(t - k, t, rng, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
+    found = graph.judged(graph.gather(scene.capture, some), truth(scene))
+    assert found.health.verdict == "good"
+    assert math.degrees(found.health.uncertainty) < 1
+    between = found.trajectory.T_cam_obj.rotation.inverse() @ truth(scene).T_cam_obj.rotation
+    assert angle_between(between[1:], between[:-1]).max() < 1e-3
+
+
+def test_it_finds_what_track_finds() -> None:
+    """Five frames of a painted ball: too few steps to be right, the same ones as those of the stage alone."""
+    inputs = progressive.gather(INPUTS.capture, INPUTS.matches)
+    assert isinstance(sys.modules["tumble.poses.progressive.stage"], Stage)
+    assert progressive.length(SMOKE, inputs) == tracker.length(SMOKE, inputs.track)
+    both = drive(progressive, SMOKE, inputs, seed=1)
+    alone = drive(tracker, SMOKE, inputs.track, seed=1)
+    lifted = lift.lift(alone.aim, alone.T_aim_obj, "camera").T_cam_obj
+    between = both.trajectory.T_cam_obj.rotation.inverse() @ lifted.rotation
+    assert angle_between(between[1:], between[:-1]).max() < 1e-3
+    assert len(both.health) == len(TRUTH.xyz)
+
+
+def test_the_recipe_names_the_route() -> None:
+    quick, paper = (recipes.progressive_poses(r).track for r in (recipes.DRAFT, recipes.PAPER))
+    assert isinstance(quick, tracker.Config)
+    assert paper == tracker.Config()
+    assert quick.pose_steps < 100

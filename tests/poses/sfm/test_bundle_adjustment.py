@@ -1,0 +1,235 @@
+"""Adjustment against derivatives by difference, and against poses and points that are known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tumble.maths.se3 import SO3
+from tumble.poses.sfm import bundle_adjustment
+from tumble.poses.sfm.bundle_adjustment import Problem, Scene
+from tumble.poses.sfm.tracks import Tracks
+from tumble.scene.camera import Camera
+
+CAMERA = Camera(torch.tensor([240.0, 250.0, 64.0, 60.0]), 128, 128)
+
+
+def scene(groups: int, frames: int, points: int, seed: int = 0) -> Scene:
+    """Random tumbles of random points about (0, 0, 1)."""
+    rng = torch.Generator().manual_seed(seed)
+    like = {"generator": rng, "dtype": torch.float64}
+    steps = 0.2 * torch.randn(groups, 1, 3, **like) + 0.05 * torch.randn(groups, frames, 3, **like)
+    R = [torch.eye(3, dtype=torch.float64).repeat(groups, 1, 1)]
+    for k in range(1, frames):
+        R.append(SO3.exp(steps[:, k]).matrix() @ R[-1])
+    t = torch.tensor([0.0, 0.0, 1.0]).double() + 0.02 * torch.randn(groups, frames, 3, **like)
+    return Scene(torch.stack(R, 1), t, 0.12 * torch.randn(groups * points, 3, **like))
+
+
+def seen(truth: Scene, noise: float = 0.0, seed: int = 5) -> Problem:
+    """Every point in every frame of its group."""
+    g, f = truth.t.shape[:2]
+    n = len(truth.X)
+    group = torch.arange(n) // (n // g)
+    point = torch.arange(n).repeat_interleave(f)
+    frame = group[point] * f + torch.arange(f).repeat(n)
+    tracks = Tracks(frame, point, torch.zeros(n * f, 2, dtype=torch.float64))
+    problem = Problem(
+        CAMERA,
+        tracks,
+        group,
+        torch.ones(n * f, dtype=torch.float64),
+        torch.tensor([64.0, 60.0]).double().expand(g, f, 2),
+        torch.full((g, f), 20.0).double(),
+        0.2,
+        0.3,
+    )
+    uv, _ = bundle_adjustment.residuals(problem, truth)
+    rng = torch.Generator().manual_seed(seed)
+    uv = uv + noise * torch.randn(uv.shape, generator=rng, dtype=torch.float64)
+    return replace(problem, tracks=replace(tracks, uv=uv))
+
+
+def shaken(truth: Scene, turn: float, seed: int = 7) -> Scene:
+    rng = torch.Generator().manual_seed(seed)
+    like = {"generator": rng, "dtype": torch.float64}
+    R = SO3.exp(turn * torch.randn(*truth.t.shape, **like)).matrix() @ truth.R
+    shift, moved = (0.02 * torch.randn(*x.shape, **like) for x in (truth.t, truth.X))
+    return Scene(R, truth.t + shift, truth.X + moved)
+
+
+def guessing(truth: Scene, problem: Problem, factor: float) -> tuple[Problem, Scene]:
+    """The same pixels through a camera whose focal length is the true one times a factor, and where that begins."""
+    g = len(truth.R)
+    shrink = torch.tensor([1 / factor, 1 / factor, 1.0]).double()
+    start = Scene(truth.R, shrink * truth.t, truth.X / factor, torch.zeros(g, dtype=torch.float64))
+    return replace(problem, camera=CAMERA.zoomed(factor), reach=problem.reach / factor), start
+
+
+def relative_errors(found: Scene, truth: Scene) -> Tensor:
+    """Angles between the found and true motions from the first frame of each group [radians]."""
+    a, b = (s.R @ s.R[:, :1].mT for s in (found, truth))
+    return SO3.from_matrix(a @ b.mT).angle()
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    """By central differences, for cameras and points, with Cauchy's loss and priors in place."""
+    truth = scene(2, 3, 5)
+    problem, at = seen(truth, noise=1.0), shaken(truth, 0.05)
+    system = bundle_adjustment._linearise(problem, at, 1.5)
+    h = 1e-6
+
+    def cost(d_cam: Tensor, d_point: Tensor) -> Tensor:
+        return bundle_adjustment._linearise(problem, bundle_adjustment._moved(at, d_cam, d_point), 1.5).cost.sum()
+
+    cameras, points = torch.zeros(6, 6).double(), torch.zeros(10, 3).double()
+    for index in range(36):
+        d = torch.zeros(36).double().index_fill(0, torch.tensor([index]), h).reshape(6, 6)
+        slope = (cost(d, points) - cost(-d, points)) / (2 * h)
+        # The loss is half of what its gradient is written for: r^2 has the derivative 2 r.
+        assert float(slope) == pytest.approx(2 * float(system.g_cam.flatten()[index]), rel=1e-4, abs=1e-3)
+    for index in range(30):
+        d = torch.zeros(30).double().index_fill(0, torch.tensor([index]), h).reshape(10, 3)
+        slope = (cost(cameras, d) - cost(cameras, -d)) / (2 * h)
+        assert float(slope) == pytest.approx(2 * float(system.g_point.flatten()[index]), rel=1e-4, abs=1e-3)
+
+
+def test_the_derivatives_by_the_focal_length_are_those_of_the_cost() -> None:
+    """Two groups, each with its own: by central differences, priors in place. Of the second derivatives those by
+    cameras and points, without the loss that forgives, against differences of the gradient where residuals vanish
+    (those of points beyond any reach nearly do)."""
+    truth = scene(2, 3, 5)
+    problem, at = guessing(truth, seen(truth, noise=1.0), 1.1)
+    h = 1e-6
+
+    def at_focal(
+        d: Tensor, problem: Problem = problem, at: Scene = at, scale: float = 1.5
+    ) -> bundle_adjustment._System:
+        return bundle_adjustment._linearise(problem, replace(at, log_focal=d), scale)
+
+    system = at_focal(torch.full((2,), 0.02).double(), replace(problem, guess=-0.1))
+    for group in range(2):
+        d = torch.zeros(2).double().index_fill(0, torch.tensor([group]), h)
+        a, b = (at_focal(0.02 + s * d, replace(problem, guess=-0.1)).cost.sum() for s in (1, -1))
+        assert system.border is not None
+        assert float((a - b) / (2 * h)) == pytest.approx(2 * float(system.border.g[group]), rel=1e-5)
+    places = CAMERA.project(truth.t).double()
+    exact, where = replace(seen(truth), centre=places, reach=1e3), replace(truth, log_focal=torch.zeros(2).double())
+    border = at_focal(torch.zeros(2).double(), exact, where, 1e9).border
+    a, b = (at_focal(torch.full((2,), s * h).double(), exact, where, 1e9) for s in (1, -1))
+    assert border is not None
+    torch.testing.assert_close((a.g_point - b.g_point) / (2 * h), border.point, rtol=1e-5, atol=1e-2)
+    torch.testing.assert_close((a.g_cam - b.g_cam) / (2 * h), border.cam, rtol=1e-5, atol=1e-2)
+
+
+@pytest.mark.parametrize("factor", [None, 1.1])
+@pytest.mark.parametrize("short", [0, 3])
+def test_elimination_solves_the_whole_system(short: int, factor: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One group: the step equals that of the dense normal equations, whichever way points are summed, with and without
+    a focal length to find."""
+    monkeypatch.setattr(bundle_adjustment, "SHORT", short)
+    truth = scene(1, 3, 6)
+    problem, at = seen(truth, noise=0.5), shaken(truth, 0.02)
+    if factor is not None:
+        problem, at = guessing(at, problem, factor)
+    system = bundle_adjustment._linearise(problem, at, 2.0)
+    damping = torch.tensor([0.01]).double()
+    d_cam, d_point, d_focal = bundle_adjustment._solve(problem, at, system, damping, bundle_adjustment._layout(problem))
+    H = torch.zeros(36, 36).double()
+    for c in range(3):
+        H[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] = system.U[c]
+    for p in range(6):
+        H[18 + 3 * p : 21 + 3 * p, 18 + 3 * p : 21 + 3 * p] = system.V[p]
+    for o, (c, p) in enumerate(zip(problem.tracks.frame.tolist(), problem.tracks.point.tolist(), strict=True)):
+        H[6 * c : 6 * c + 6, 18 + 3 * p : 21 + 3 * p] += system.W[o]
+        H[18 + 3 * p : 21 + 3 * p, 6 * c : 6 * c + 6] += system.W[o].T
+    g = torch.cat([system.g_cam.flatten(), system.g_point.flatten()])
+    found = torch.cat([d_cam.flatten(), d_point.flatten()])
+    if system.border is not None:
+        assert d_focal is not None
+        side = torch.cat([system.border.cam.flatten(), system.border.point.flatten()])[:, None]
+        H = torch.cat([torch.cat([H, side], 1), torch.cat([side.T, system.border.H[:, None]], 1)])
+        g, found = torch.cat([g, system.border.g]), torch.cat([found, d_focal])
+    assert (system.border is None) == (d_focal is None) == (factor is None)
+    H = H + torch.diag(0.01 * H.diagonal() + 1e-9)
+    torch.testing.assert_close(found, torch.linalg.solve(H, -g), rtol=1e-6, atol=1e-9)
+
+
+def test_exact_pixels_give_exact_motions() -> None:
+    """Ten degrees of error per frame vanish; what the priors pull is below a hundredth of a degree."""
+    truth = scene(3, 6, 30)
+    found, cost = bundle_adjustment.adjust(seen(truth), shaken(truth, 0.1), steps=60, scale=3.0, tolerance=0.0)
+    assert relative_errors(found, truth).max() < 2e-3
+    assert bundle_adjustment.residuals(seen(truth), found)[0].abs().max() < 0.1
+    # What is left is the priors': a few of the truth's own sigmas, NOISE^2 each.
+    assert (cost < 3).all()
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_a_guessed_focal_length_is_found(factor: float) -> None:
+    """Pixels of 0.2 noise, two groups: by the inverse of the normal equations at the truth one sigma of the focal
+    length is below a hundredth, and the prior pulls by less."""
+    truth = scene(2, 12, 60)
+    problem, start = guessing(truth, seen(truth, noise=0.2), factor)
+    for scale in (3.0, 1.0, 1.0):
+        start, _ = bundle_adjustment.adjust(problem, start, steps=30, scale=scale, tolerance=0.0)
+    assert start.log_focal is not None
+    torch.testing.assert_close(start.log_focal.exp() * factor, torch.ones(2).double(), atol=0.03, rtol=0)
+    assert relative_errors(start, truth).rad2deg().max() < 0.5
+
+
+def test_a_known_focal_length_stays_as_it_is() -> None:
+    """Even a wrong one: the scene has none of its own, and the poses are those that fit it best."""
+    truth = scene(1, 8, 30)
+    problem, start = guessing(truth, seen(truth), 0.8)
+    kept, cost = bundle_adjustment.adjust(problem, replace(start, log_focal=None), steps=30, scale=3.0)
+    found, least = bundle_adjustment.adjust(problem, start, steps=30, scale=3.0)
+    assert kept.log_focal is None
+    assert found.log_focal is not None
+    assert least < cost
+
+
+def test_outliers_are_forgiven() -> None:
+    truth = scene(1, 8, 60)
+    problem = seen(truth, noise=0.2)
+    rng = torch.Generator().manual_seed(0)
+    astray = torch.rand(len(problem.tracks), generator=rng) < 0.15
+    uv = problem.tracks.uv + astray[:, None] * 15 * torch.randn(len(astray), 2, generator=rng, dtype=torch.float64)
+    problem = replace(problem, tracks=replace(problem.tracks, uv=uv))
+    rough, _ = bundle_adjustment.adjust(problem, shaken(truth, 0.05), steps=30, scale=3.0)
+    found, _ = bundle_adjustment.adjust(problem, rough, steps=30, scale=0.5)
+    # 0.2 pixels over 50 good points of 30 pixels' spread: a tenth of a degree, more along the viewing rays.
+    assert relative_errors(found, truth).rad2deg().max() < 1.0
+
+
+def test_groups_do_not_know_of_each_other() -> None:
+    """Two groups side by side end where each ends alone."""
+    truth = scene(2, 4, 12)
+    problem, start = seen(truth, noise=0.3), shaken(truth, 0.05)
+    both, _ = bundle_adjustment.adjust(problem, start, steps=15, scale=1.0, tolerance=0.0)
+    for g in range(2):
+        mine = problem.group == g
+        tracks = problem.tracks.select(mine[problem.tracks.point])
+        alone = Problem(
+            CAMERA,
+            replace(tracks, frame=tracks.frame - 4 * g),
+            torch.zeros(12, dtype=torch.long),
+            torch.ones(len(tracks)).double(),
+            problem.centre[g : g + 1],
+            problem.centre_sigma[g : g + 1],
+            problem.depth_sigma,
+            problem.reach,
+        )
+        one, _ = bundle_adjustment.adjust(
+            alone, Scene(start.R[g : g + 1], start.t[g : g + 1], start.X[mine]), steps=15, scale=1.0, tolerance=0.0
+        )
+        torch.testing.assert_close(one.R[0], both.R[g], atol=1e-6, rtol=0)
+
+
+def test_points_are_where_their_rays_meet() -> None:
+    """Six views over a wide turn; the belief in the ball's front pulls by a thousandth of its radius."""
+    truth = scene(1, 6, 20)
+    problem = seen(truth)
+    X = bundle_adjustment.triangulate(problem.tracks, truth.R[0], truth.t[0], CAMERA, torch.full((6,), 0.2).double())
+    assert (X - truth.X).norm(dim=-1).median() < 0.01

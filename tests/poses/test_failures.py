@@ -1,0 +1,126 @@
+"""Captures that cannot be tracked end with a plain verdict, and faulty ones are tracked all the same."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.lopsided import Tumble, truth, tumbling
+from tumble import matching
+from tumble.engine.loop import drive
+from tumble.evaluation import metrics
+from tumble.maths.se3 import SE3, SO3
+from tumble.poses.frame_pairs import neighbours
+from tumble.poses.sfm import stage
+from tumble.poses.sfm.finalize import Tracked
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.match import Match
+
+SIZE, DISTANCE = 96, 4.4
+QUICK = stage.Config(windows=(6,), schedule=(3.0, 1.0, 0.5), rounds=(3.0, 2.0, 1.0, 0.7, 0.5), relocations=0)
+
+
+def photographed(T_cam_obj: SE3, half_height: float | None) -> Capture:
+    """A grey ball, or a can of that half height along the object's y axis, in light from above; no texture at all."""
+    camera = Camera.from_fov(math.radians(30), SIZE, SIZE)
+    directions = torch.nn.functional.normalize(camera.directions().double(), dim=-1).flatten(0, 1)
+    images, masks = [], []
+    for k in range(len(T_cam_obj.xyz)):
+        T_obj_cam = T_cam_obj[k].inverse()
+        o, d = T_obj_cam.xyz, T_obj_cam.rotation @ directions
+        depth = torch.linspace(DISTANCE - 1, DISTANCE + 1, 400, dtype=torch.float64)
+        x = o + d[:, None] * depth[:, None]
+        if half_height is None:
+            inside = x.norm(dim=-1) < 0.8
+        else:
+            inside = (x[..., [0, 2]].norm(dim=-1) < 0.5) & (x[..., 1].abs() < half_height)
+        hit, first = inside.any(1), inside.float().argmax(1)
+        p = x[torch.arange(len(x)), first]
+        normal = p if half_height is None else p * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+        if half_height is not None:
+            cap = p[:, 1].abs() > half_height - 0.01
+            normal = torch.where(cap[:, None], p * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), normal)
+        up = (T_cam_obj.rotation[k] @ torch.nn.functional.normalize(normal, dim=-1)) @ torch.tensor(
+            [0.2, -0.8, -0.5]
+        ).double()
+        code = torch.where(hit, 60 + 150 * up.clamp_min(0), 0.0).reshape(SIZE, SIZE)
+        images.append(code.round().to(torch.uint8)[..., None].expand(-1, -1, 3))
+        masks.append(torch.where(hit, OBJECT, BACKGROUND).to(torch.uint8).reshape(SIZE, SIZE))
+    names = tuple(f"{k}.png" for k in range(len(images)))
+    return Capture(torch.stack(images), torch.stack(masks), camera, names, "camera")
+
+
+def turning(n: int, rock: float) -> SE3:
+    """Ten degrees a frame about the object's axis, which rocks before the camera."""
+    spin = torch.arange(n, dtype=torch.float64)[:, None] * math.radians(10) * torch.tensor([0.0, 1.0, 0.0])
+    phase = torch.arange(n, dtype=torch.float64) * 0.35
+    tilt = rock * torch.stack([phase.sin(), 0 * phase, (0.7 * phase).cos()], -1)
+    at = torch.tensor([0.0, 0.0, DISTANCE], dtype=torch.float64).expand(n, 3)
+    return SE3.from_rotation(SO3.exp(tilt) @ SO3.exp(spin), at)
+
+
+def tracked(capture: Capture) -> Tracked:
+    matches = matching.match_pairs(matching.views_of(capture), neighbours(len(capture), (1, 2)), "mixed")
+    return drive(stage, QUICK, stage.gather(capture, matches), seed=0)
+
+
+def test_a_plain_ball() -> None:
+    health = tracked(photographed(turning(12, 0.0), None)).health
+    assert health.verdict == "bad"
+    assert "not observable" in health.sentence
+
+
+@pytest.mark.slow
+def test_a_can_without_a_label() -> None:
+    """Its axis rocks by 40 degrees, which outlines show; its spin nobody can see."""
+    T_cam_obj = turning(16, 0.7)
+    health = tracked(photographed(T_cam_obj, 0.8)).health
+    assert health.verdict == "bad"
+    assert health.sentence.startswith("Rotation about axis (")
+    axis = T_cam_obj.rotation[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    seen = torch.nn.functional.normalize(axis[:2], dim=0)
+    # Silhouettes of 96 pixels.
+    assert abs(float(health.observability.axis[:2].double() @ seen)) > 0.99
+
+
+@pytest.fixture(scope="module")
+def scene() -> Tumble:
+    return tumbling(24, points=200)
+
+
+def matches(scene: Tumble) -> list[Match]:
+    rng = torch.Generator().manual_seed(0)
+    return [scene.match(i, j, rng) for i, j in neighbours(len(scene.capture), (1, 2))]
+
+
+def test_another_object_halfway(scene: Tumble) -> None:
+    """From frame 12 on the silhouettes are a small box's: what matches go across is gone."""
+    masks = scene.capture.masks.clone()
+    masks[12:] = BACKGROUND
+    for k in range(12, 24):
+        half = 14 + 2 * (k % 3)
+        masks[k, 64 - half : 64 + half, 50:78] = OBJECT
+    some = [m for m in matches(scene) if m.j < 12]
+    health = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), some), seed=0).health
+    assert health.verdict == "bad"
+
+
+def test_some_wrong_masks_do_no_harm(scene: Tumble) -> None:
+    """One silhouette in ten is cut in half, the matches there with it."""
+    masks = scene.capture.masks.clone()
+    for k in (5, 15):
+        masks[k, :, 64:] = BACKGROUND
+    kept = []
+    for m in matches(scene):
+        here = torch.ones(len(m), dtype=torch.bool)
+        for k, uv in ((m.i, m.uv_i), (m.j, m.uv_j)):
+            if k in (5, 15):
+                here &= uv[:, 0] < 62
+        kept.append(m.select(here))
+    found = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), kept), seed=0)
+    others = [k for k in range(24) if k not in (5, 15)]
+    scores = metrics.rotation_scores(found.trajectory.select(others), truth(scene).select(others))
+    assert scores["rotation_median_degrees"] < 2
+    assert scores["rotation_below_10_percent"] > 99

@@ -1,0 +1,35 @@
+"""Which frames are matched: counted by hand, and on turns whose way round is known."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from tumble.poses.frame_pairs import best, neighbours
+
+
+def test_neighbours_are_counted_by_hand() -> None:
+    assert neighbours(4, (1, 2)) == [(0, 1), (1, 2), (0, 2), (2, 3), (1, 3)]
+    assert neighbours(1) == []
+    # 200 frames: 199 + 198 + 196.
+    assert len(neighbours(200)) == 593
+
+
+def alike() -> Tensor:
+    """36 frames in steps of 11 degrees, cosines of the angles between them: frame 33 is back at 3 degrees."""
+    angle = math.radians(11) * torch.arange(36)
+    return (angle[:, None] - angle).cos()
+
+
+def test_a_full_turn_closes_where_it_began() -> None:
+    assert best(alike(), count=5, gap=16, least=math.cos(math.radians(5)), spread=2) == [(0, 33)]
+    wide = best(alike(), count=50, gap=16, least=math.cos(math.radians(9)), spread=0)
+    # 33 steps are 3 degrees too far, 32 are 8 too few: pairs (t, t + 33) and (t, t + 32).
+    assert sorted(wide) == sorted([(t, t + 33) for t in range(3)] + [(t, t + 32) for t in range(4)])
+    assert wide[0] in [(0, 33), (1, 34), (2, 35)], "the best first"
+
+
+def test_no_more_than_asked_for_and_none_that_the_neighbours_see() -> None:
+    least = math.cos(math.radians(9))
+    assert len(best(alike(), count=1, gap=16, least=least, spread=0)) == 1
+    assert best(alike(), count=9, gap=33, least=least, spread=0) == []

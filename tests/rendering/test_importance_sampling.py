@@ -1,0 +1,148 @@
+"""The estimator of final pictures: its samples against their density, its sums against quadrature."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.rendering.test_shade import CAMERA, F0, ball, grey, lamp, rms, seen_by_all, uniform
+from tests.surfaces import GAMMA, look_at, sphere, torus
+from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_solid_angles
+from tumble.rendering import importance_sampling, shade
+from tumble.rendering.prefilter import prefilter
+from tumble.rendering.rasterize import rasterize
+from tumble.rendering.shade import Bounce
+from tumble.rendering.trace import build, open_sky
+from tumble.scene.environment import Environment
+from tumble.scene.gaussians import Gaussians
+
+NOBODY = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
+
+
+def one_texel() -> Environment:
+    radiance = torch.zeros(16, 32, 3)
+    radiance[5, 20] = 500.0
+    return Environment.from_radiance(radiance)
+
+
+def quadrature(seen: shade.Surface, roughness: float, environment: Environment, R_env_obj: Tensor) -> Tensor:
+    """Both lobes over 2^17 even directions, nothing in the way."""
+    total, n = torch.zeros_like(seen.points), 1 << 17
+    for directions in fibonacci_sphere(n).split(1 << 14):
+        sky = open_sky(directions, len(seen.pixels))
+        part = shade.shade(seen, *grey(seen, 0.5, roughness), environment, R_env_obj, sky, f0=F0)
+        total += len(directions) / n * part
+    return total
+
+
+def relit(seen: shade.Surface, roughness: float, environment: Environment, R: Tensor, n: int, seed: int = 0) -> Tensor:
+    light, generator = importance_sampling.light_sampler(environment), torch.Generator().manual_seed(seed)
+    counts = {"n_brdf": n, "n_light": n}
+    material = grey(seen, 0.5, roughness)
+    return importance_sampling.relight_surface(
+        seen, *material, light, R, build(NOBODY, GAMMA), f0=F0, generator=generator, **counts
+    )
+
+
+@pytest.mark.parametrize("environment", [one_texel(), lamp([0.1, 0.9, -0.3]), uniform()])
+def test_the_density_is_one_in_all_and_that_of_the_samples(environment: Environment) -> None:
+    sampler = importance_sampling.light_sampler(environment)
+    area = texel_solid_angles(*sampler.density.shape)
+    assert math.isclose((sampler.density * area).sum().item(), 1, rel_tol=1e-4)
+    u = torch.rand(1 << 16, 2, generator=torch.Generator().manual_seed(0))
+    d = sampler.sample(u)
+    # Means of smooth functions, by samples and by the density: 65536 samples leave 0.4 % of the unit vectors.
+    for axis in range(3):
+        by_cell = fibonacci_sphere(1 << 18)
+        expected = 4 * math.pi * (sampler.pdf(by_cell)[:, 0] * by_cell[:, axis]).mean()
+        assert abs(d[:, axis].mean() - expected) < 0.012
+
+
+def test_a_fine_map_is_sampled_by_means_of_its_texels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One bright texel of a map four times as fine as cells may be: where it shines, they see it."""
+    monkeypatch.setattr(importance_sampling, "CELL_ROWS", 32)
+    radiance = torch.zeros(128, 256, 3)
+    radiance[41, 55] = 1e6
+    sampler = importance_sampling.light_sampler(Environment.from_radiance(radiance))
+    assert sampler.density.shape == (64, 128)
+    d = sampler.sample(torch.rand(1 << 14, 2, generator=torch.Generator().manual_seed(0)))
+    integral = sampler.environment.integral()
+    # It fills a thirtieth of the cells that can see it: 16384 samples leave 5 %.
+    torch.testing.assert_close((sampler.environment.lookup(d) / sampler.pdf(d)).mean(0), integral, rtol=0.1, atol=0)
+
+
+def test_samples_of_a_light_measure_its_integral() -> None:
+    environment = lamp([0.1, 0.9, -0.3])
+    sampler = importance_sampling.light_sampler(environment)
+    d = sampler.sample(torch.rand(1 << 14, 2, generator=torch.Generator().manual_seed(0)))
+    # Radiance over density varies by 5 % within cells, so the mean of 16384 is good to 0.1 %.
+    torch.testing.assert_close(
+        (environment.lookup(d) / sampler.pdf(d)).mean(0), environment.integral(), rtol=2e-3, atol=0
+    )
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.8])
+@pytest.mark.parametrize("name", ["one texel", "lamp", "uniform"])
+def test_the_estimator_converges_to_quadrature(name: str, roughness: float) -> None:
+    environment = {"one texel": one_texel(), "lamp": lamp([0.3, 0.5, 0.8]), "uniform": uniform()}[name]
+    seen, R = ball(128), random_rotation(torch.Generator().manual_seed(5))
+    truth = quadrature(seen, roughness, environment, R)
+    few, many = (relit(seen, roughness, environment, R, n) for n in (64, 512))
+    assert rms(many - truth) < 0.02 * rms(truth)
+    # Eight times the samples: an even pattern gains more than the root of 8, noise of the quadrature aside.
+    assert rms(many - truth) < 0.6 * rms(few - truth) + 0.004 * rms(truth)
+    # Unbiased: the mean over points, each with its own shift of the pattern, is closer than any of them.
+    assert abs((many - truth).mean()) < 0.005 * truth.mean()
+
+
+def test_a_single_bright_texel_needs_few_samples() -> None:
+    """A sun that one shared direction in a hundred meets."""
+    seen, R = ball(128), torch.eye(3)
+    truth = quadrature(seen, 0.5, one_texel(), R)
+    assert rms(relit(seen, 0.5, one_texel(), R, 32) - truth) < 0.05 * rms(truth)
+
+
+def test_shading_in_chunks_is_shading_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, R = ball(128), torch.eye(3)
+    whole = relit(seen, 0.5, one_texel(), R, 32)
+    monkeypatch.setattr(importance_sampling, "RAYS", 640)
+    torch.testing.assert_close(relit(seen, 0.5, one_texel(), R, 32), whole)
+
+
+def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_back() -> None:
+    """A white torus in a white furnace: one bounce, lit from everywhere, is as bright as the light it hides."""
+    gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
+    seen = shade.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
+    light, tracer = importance_sampling.light_sampler(uniform()), build(gaussians, GAMMA)
+    # Specular light on top of white would be more than the furnace holds: no f0.
+    rough = torch.ones(1000, 1)
+    diffuse = Bounce(torch.ones(1000, 3), seen_by_all(gaussians))
+    bounce = importance_sampling.GlossyBounce(diffuse, rough, prefilter(uniform()))
+    found = [
+        importance_sampling.relight_surface(
+            seen,
+            *grey(seen, 1.0, 1.0),
+            light,
+            torch.eye(3),
+            tracer,
+            f0=0.0,
+            generator=torch.Generator().manual_seed(0),
+            n_brdf=64,
+            n_light=64,
+            bounce=b,
+        )
+        for b in (None, bounce)
+    ]
+    assert found[0].min() < 0.7
+    assert found[0].mean() < 0.97
+    # 128 samples leave 3 %.
+    assert (found[1] - 1).abs().mean() < 0.04
+
+
+def test_a_pattern_is_even_in_all_three_numbers() -> None:
+    pattern = importance_sampling._lattice(512)
+    for axis in range(3):
+        counts = torch.histc(pattern[:, axis], 16, 0, 1)
+        # Random numbers would leave 32 +- 5.6, and so some bin of 16 beyond 42.
+        assert (counts - 32).abs().max() <= 8

@@ -1,0 +1,342 @@
+"""The report is complete in itself, tells what was measured, and its live view works in a browser without a network."""
+
+import base64
+import dataclasses
+import html
+import json
+import math
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests import devtools
+from tests.export.test_bake import RADIUS, painted
+from tests.surfaces import sphere
+from tumble.export import asset as export
+from tumble.export import confidence
+from tumble.io.files import BadFile
+from tumble.maths.images import linear_from_srgb, photograph, srgb_from_linear
+from tumble.maths.se3 import SE3
+from tumble.poses.result import Health, Observability
+from tumble.report import health_card, preset_lights, svg, training_views
+from tumble.report import page as report
+from tumble.scene.asset import Asset
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.environment import Environment
+from tumble.scene.trajectory import Trajectory
+from tumble.synthetic import trajectories
+
+SMALL = export.Preset(triangles=800, texture=64, cells=24, views=12, pixels=64)
+N, SIDE = 10, 40
+RECORDS = [
+    {"name": "refine", "event": "start"},
+    {"name": "refine", "step": 1, "of": 200, "seconds": 1.0, "metrics": {"render": 0.5}},
+    {"name": "refine", "step": 200, "of": 200, "seconds": 9.0, "metrics": {"render": 0.1}},
+    {"name": "refine", "event": "done", "seconds": 9.375},
+    {"name": "decompose", "event": "start"},
+    {"name": "decompose", "event": "done", "seconds": 201.0},
+]
+RECIPE = {"refine": {"steps": 200, "weights": {"mask": 0.125}}, "decompose": {"bounce": "none"}, "seed": 7}
+FOCAL = float(Camera.from_fov(math.radians(30), SIDE, SIDE).fx_fy_cx_cy[0])
+STORY = report.Story("a <mug> & more", RECORDS, RECIPE, FOCAL)
+
+
+@pytest.fixture(scope="module")
+def asset() -> Asset:
+    """A painted ball seen from all around, under a sky brighter to one side."""
+    ball = painted(sphere(1500, radius=RADIUS))
+    T = trajectories.handheld(N, trajectories.distance_for(math.radians(30)), seed=1)
+    radiance = 0.4 + torch.linspace(0, 2, 16)[None, :, None].expand(8, 16, 3)
+    return dataclasses.replace(
+        ball,
+        environment=Environment.from_radiance(radiance),
+        trajectory=Trajectory(SE3(T.wxyz.float(), T.xyz.float()), "camera"),
+        camera=Camera.from_fov(math.radians(30), SIDE, SIDE),
+    )
+
+
+@pytest.fixture(scope="module")
+def capture(asset: Asset) -> Capture:
+    """Photographs that are the asset's own renders."""
+    scene = training_views.scene(asset)
+    images, masks = [], []
+    for number in range(N):
+        linear, view = training_views.render(scene, number, asset.camera)
+        images.append(photograph(linear))
+        masks.append(torch.where(view.alpha >= 0.5, OBJECT, BACKGROUND).to(torch.uint8))
+    names = tuple(f"{i:04}.png" for i in range(N))
+    return Capture(torch.stack(images), torch.stack(masks), asset.camera, names, "camera", asset.trajectory)
+
+
+@pytest.fixture(scope="module")
+def page(asset: Asset, capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    export.glb(asset, export.surface(asset, SMALL), SMALL, 1.0, folder / "asset.glb")
+    report.build(asset, capture, folder / "asset.glb", STORY, None, folder / "report.html")
+    return folder / "report.html"
+
+
+def embedded(page: Path, name: str) -> bytes:
+    found = re.search(rf'<script type="text/plain" id="{name}">([^<]*)</script>', page.read_text("utf-8"))
+    assert found is not None, name
+    return base64.b64decode(found[1], validate=True)
+
+
+def text(page: Path) -> str:
+    """What a reader sees, without marks."""
+    body = re.sub(r"<(script|style|title)\b.*?</\1>", "", page.read_text("utf-8"), flags=re.S)
+    return html.unescape(re.sub(r"<[^>]+>", " ", body))
+
+
+def test_the_page_loads_nothing(page: Path) -> None:
+    """Every address is embedded or in the page; what remains of the web is the name of an XML namespace."""
+    source = page.read_text("utf-8")
+    markup = re.sub(r"<script\b.*?</script>", "", source, flags=re.S)
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', markup)
+    assert len(addresses) > 30
+    assert all(a.startswith(("data:image/", "#")) or a == "data:," for a in addresses)
+    assert not re.search(r"@import|url\(", markup)
+    assert set(re.findall(r"https?://[\w./#-]+", source)) <= {"http://www.w3.org/1999/xhtml"}
+    assert "default-src 'none'" in source
+    assert "{{" not in markup
+
+
+def test_a_guessed_focal_length_is_called_one(page: Path, asset: Asset, capture: Capture) -> None:
+    """Half the width over the tangent of half the field of view."""
+    focal = f"{0.5 * SIDE / math.tan(math.radians(15)):.0f} pixels"
+    assert f"{focal}, a guess" in text(page)
+    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(STORY, guess=None))
+    better = report._facts(asset, capture, dataclasses.replace(STORY, guess=60.0))
+    assert f"{focal} (estimated; the guess was 60)<" in better
+
+
+def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:
+    assert embedded(page, "glb")[:4] == b"glTF"
+    assert asset.environment is not None
+    for name, light in {
+        "recovered": asset.environment,
+        "studio": preset_lights.studio(),
+        "overcast": preset_lights.overcast(),
+        "sunset": preset_lights.sunset(),
+    }.items():
+        data = embedded(page, name)
+        assert data.startswith(b"#?RADIANCE")
+        read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
+        # A shared exponent leaves the largest channel eight bits.
+        true = light.radiance.numpy()
+        assert (np.abs(read - true) <= true.max(-1, keepdims=True) / 128).all()
+    for data in re.findall(r'src="data:image/webp;base64,([^"]*)"', page.read_text("utf-8")):
+        assert cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED) is not None
+
+
+def test_times_and_settings_are_those_of_the_log(page: Path) -> None:
+    words = " ".join(text(page).split())
+    assert "refine 200 9.4 s" in words
+    assert "decompose - 3.4 min" in words
+    assert "all 3.5 min" in words
+    assert "weights.mask 0.125" in words
+    assert 'bounce "none"' in words
+    assert "seed 7" in words
+
+
+def test_without_xatlas_there_is_a_page_without_a_mesh(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.warns(UserWarning, match="xatlas.*the report shows no mesh"):
+        assert report.model(asset, tmp_path) is None
+
+
+def test_a_name_is_text_and_not_markup(page: Path) -> None:
+    assert "a <mug> & more" in text(page)
+    assert "<mug>" not in page.read_text("utf-8")
+
+
+def test_the_start_of_the_live_view_is_the_pose_of_a_frame(page: Path, asset: Asset) -> None:
+    """The quaternion, by its textbook matrix, is the rotation from object to OpenGL camera axes of some frame."""
+    found = re.search(r'id="about">(.*?)</script>', page.read_text("utf-8"))
+    assert found is not None
+    about = json.loads(found[1])
+    assert about["fov"] == pytest.approx(30, abs=1e-4)
+    x, y, z, w = about["object_to_camera"]
+    R = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    # Under light "camera" that rotation is R_env_obj.
+    assert (asset.trajectory.R_env_obj - R).flatten(1).norm(dim=1).min() < 1e-5
+
+
+def test_renders_of_photographs_that_are_renders_are_the_same(asset: Asset, capture: Capture) -> None:
+    frames = list(training_views.frames(training_views.scene(asset), capture))
+    assert [frame.name for frame in frames] == list(capture.names)
+    # Code values are rounded: an error of at most half of 1 / 255, with a uniform spread 10.8 dB above 1 / 255.
+    assert min(frame.psnr for frame in frames) > 55
+    assert all(frame.iou == 1 for frame in frames)
+    assert max(abs(frame.stops) for frame in frames) < 0.02
+    rows = health_card.card(frames, None, confidence.confidence(asset, asset.camera))
+    assert [row.verdict for row in rows[:5]] == ["good", "good", "good", "none", "none"]
+
+
+def test_the_card_names_drift_lost_frames_and_outliers(asset: Asset, capture: Capture) -> None:
+    images = capture.images.clone()
+    half = srgb_from_linear(0.5 * linear_from_srgb(images[: N // 2].float() / 255))
+    images[: N // 2] = (255 * half).round().to(torch.uint8)
+    masks = capture.masks.clone()
+    masks[N - 1] = masks[N - 1].roll(SIDE // 4, 0)
+    spoilt = dataclasses.replace(capture, images=images, masks=masks)
+    lost = torch.zeros(N, dtype=torch.bool)
+    lost[3] = True
+    ones = torch.ones(N)
+    sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
+    health = Health(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), sight)
+    frames = list(training_views.frames(training_views.scene(asset), spoilt))
+    fit, outline, exposure, away, match, _ = health_card.card(
+        frames, health, confidence.confidence(asset, asset.camera)
+    )
+    assert fit.marks[0] == "bad" or fit.verdict != "good"
+    # One frame's mask is shifted by a quarter of the picture.
+    assert outline.verdict == "good"
+    assert "0009.png" in outline.sentence
+    assert outline.marks[-1] == "bad"
+    # Half of the frames are one stop darker.
+    assert exposure.verdict == "bad"
+    assert float(exposure.value.split()[0]) == pytest.approx(1.0, abs=0.05)
+    assert (away.value, away.verdict) == ("1 of 10", "warn")
+    assert (match.value, match.verdict) == ("4.00 px", "bad")
+    assert health_card.overall([fit, outline, exposure, away, match])[0] == "bad"
+
+
+def test_matches_that_agree_do_not_hide_a_drift() -> None:
+    ones = torch.ones(N)
+    sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
+    health = Health(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), sight)
+    row = health_card._match(health)
+    assert row.verdict == "bad"
+    assert "28.6 degrees" in row.sentence
+
+
+def test_light_that_turns_with_the_object_comes_from_few_sides(asset: Asset) -> None:
+    """At most one cell per lamp; under light that stands still, more."""
+    still = confidence.confidence(asset, asset.camera)
+    turned = dataclasses.replace(asset, trajectory=dataclasses.replace(asset.trajectory, light="object"))
+    static = confidence.confidence(turned, asset.camera)
+    assert static.lights.max() <= confidence.LAMPS < health_card.FEW_LIGHTS
+    seen = still.views > 0
+    assert torch.equal(seen, static.views > 0)
+    assert still.lights[seen].mean() > 2 * static.lights[seen].mean()
+    assert (still.views >= 0).all()
+    assert (still.views <= 1).all()
+
+
+def test_lamps_are_found_where_they_are() -> None:
+    radiance = torch.full((32, 64, 3), 0.1)
+    radiance[14:18, 46:50] = 50.0  # right quarter: +x
+    found = confidence.lamps(Environment.from_radiance(radiance))
+    assert found[0][0] > math.cos(math.radians(10))
+    apart = (found @ found.T).clamp(-1, 1).acos() + 9 * torch.eye(len(found))
+    assert apart.min() > confidence.APART - 1e-4
+
+
+def test_a_window_is_a_square_around_the_object_inside_the_picture() -> None:
+    mask = torch.zeros(50, 80, dtype=torch.bool)
+    mask[2:12, 70:79] = True
+    top, left, height, width = training_views.window(mask)
+    assert height == width == 14
+    assert 0 <= top <= 2
+    assert top + height >= 12
+    assert left <= 70
+    assert 79 <= left + width <= 80
+    assert training_views.window(torch.zeros(50, 80, dtype=torch.bool)) == (0, 0, 50, 80)
+
+
+def test_bars_skip_what_is_not_known() -> None:
+    drawn = svg.bars([1.0, math.nan, 2.0], ["good", "none", "bad"])
+    assert re.findall(r'class="b-(\w+)" x="([\d.]+)" y="([\d.]+)"', drawn) == [
+        ("good", "0.1", "50.00"),
+        ("bad", "2.1", "0.00"),
+    ]
+    assert svg.bars([math.nan], ["none"]) == ""
+
+
+def test_another_capture_is_refused(asset: Asset, capture: Capture) -> None:
+    with pytest.raises(BadFile, match=r"mug: is not the capture of this run \(say which it is: --capture\)"):
+        report.of_run(capture, asset, ["0000.png", "elsewhere.png"], Path("mug"))
+
+
+def test_without_a_surface_the_live_view_is_left_out(asset: Asset, capture: Capture, tmp_path: Path) -> None:
+    report.build(asset, capture, None, STORY, None, tmp_path / "report.html")
+    source = (tmp_path / "report.html").read_text("utf-8")
+    assert "<script" not in source
+    assert "#relight" not in re.sub(r"<style>.*?</style>", "", source, flags=re.S)
+
+
+# In a browser ---------------------------------------------------------------------------------------------------------
+
+LOOK = """(() => {
+  const copy = Object.assign(document.createElement("canvas"), { width: 32, height: 32 }).getContext("2d");
+  copy.drawImage(document.getElementById("view"), 0, 0, 32, 32);
+  return [...copy.getImageData(0, 0, 32, 32).data];
+})()"""
+"""What the live view shows, as 32 x 32 code values with coverage."""
+DROP = """(() => {
+  const files = new DataTransfer();
+  const bytes = Uint8Array.from(atob(TEXT), (c) => c.charCodeAt(0));
+  files.items.add(new File([bytes], NAME));
+  dispatchEvent(new DragEvent("drop", { dataTransfer: files, cancelable: true }));
+})()"""
+SETTLED = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
+"""Two frames of the screen later."""
+
+
+def look(tab: devtools.Page) -> np.ndarray:
+    tab.value(SETTLED)
+    return np.array(tab.value(LOOK)).reshape(32, 32, 4)
+
+
+def drop(tab: devtools.Page, name: str, text: str) -> None:
+    tab.value(DROP.replace("TEXT", text).replace("NAME", json.dumps(name)))
+
+
+def complaints(tab: devtools.Page) -> list[str]:
+    """What the console holds. The software renderer warns of its own slowness, which is no fault of the page."""
+    said = [str(event) for event in tab.events if event["method"] in ("Runtime.consoleAPICalled", "Log.entryAdded")]
+    said += [str(event) for event in tab.events if event["method"] == "Runtime.exceptionThrown"]
+    return [words for words in said if "GL Driver Message" not in words]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(devtools.browser() is None, reason=f"needs one of {devtools.BROWSERS}")
+@pytest.mark.parametrize("width", [500, 1400])
+def test_the_live_view_draws_and_takes_a_dropped_light(page: Path, tmp_path: Path, width: int) -> None:
+    with devtools.opened(page.as_uri(), tmp_path, width, 900) as tab:
+        tab.until("document.documentElement.dataset.panel")
+        assert tab.value("document.documentElement.dataset.panel") == "drawn"
+        assert tab.value("document.documentElement.scrollWidth - innerWidth") <= 0, "wider than the window"
+        recovered = look(tab)
+        drop(tab, "mine.hdr", 'document.getElementById("sunset").textContent')
+        tab.until('document.documentElement.dataset.light === "mine.hdr"')
+        dropped = look(tab)
+        drop(tab, "mine.jpg", '"AAAA"')
+        tab.until('document.getElementById("note").textContent.includes("mine.jpg")')
+        assert tab.value('document.getElementById("note").textContent').endswith("a light is a Radiance .hdr file here")
+        assert tab.value("document.documentElement.dataset.light") == "mine.hdr"
+        tab.value('document.getElementById("view").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }))')
+        turned = look(tab)
+        assert complaints(tab) == []
+    # The ball covers the middle of the picture and not its corners.
+    assert recovered[16, 16, 3] == 255
+    assert recovered[0, 0, 3] == 0
+    solid = recovered[..., 3] == 255
+    assert recovered[solid][:, :3].mean() > 20
+    assert np.abs(recovered - dropped)[solid].mean() > 5
+    assert np.abs(dropped - turned)[solid].mean() > 0.5

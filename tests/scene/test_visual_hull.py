@@ -1,0 +1,91 @@
+"""The visual hull of an ellipsoid that is seen from all around is that ellipsoid, nearly."""
+
+import math
+
+import pytest
+import torch
+
+from tumble.maths.se3 import SE3
+from tumble.scene import visual_hull
+from tumble.scene.camera import Camera
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
+from tumble.scene.trajectory import Trajectory
+from tumble.synthetic import trajectories
+
+AXES = torch.tensor([0.8, 0.5, 0.35])
+CENTER = torch.tensor([0.1, -0.05, 0.15])
+DISTANCE = trajectories.distance_for(math.radians(30))
+
+
+def silhouettes(n: int = 40, size: int = 64) -> tuple[Capture, Trajectory]:
+    """Masks of a lopsided ellipsoid, by the discriminant of each pixel's ray."""
+    camera = Camera.from_fov(math.radians(30), size, size)
+    T = trajectories.handheld(n, DISTANCE, seed=1)
+    T_cam_obj = SE3(T.wxyz.float(), T.xyz.float())
+    masks = []
+    for i in range(n):
+        T_obj_cam = T_cam_obj[i].inverse()
+        o = (T_obj_cam.xyz - CENTER) / AXES
+        d = (T_obj_cam.rotation @ camera.directions()) / AXES
+        a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum() - 1
+        masks.append(torch.where(b * b > a * c, OBJECT, BACKGROUND).to(torch.uint8))
+    images = torch.zeros(n, size, size, 3, dtype=torch.uint8)
+    trajectory = Trajectory(T_cam_obj, "camera")
+    names = tuple(f"{i}.png" for i in range(n))
+    return Capture(images, torch.stack(masks), camera, names, "camera", trajectory), trajectory
+
+
+@pytest.fixture(scope="module")
+def carved() -> torch.Tensor:
+    return visual_hull.carve(*silhouettes(), resolution=64)
+
+
+def test_the_hull_is_the_ellipsoid(carved: torch.Tensor) -> None:
+    ticks = (torch.arange(64) + 0.5) / 64 * 2 - 1
+    x = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1)
+    level = ((x - CENTER) / AXES).norm(dim=-1)
+    # A pixel is 0.07 object radii wide, and forty silhouettes leave a little more than the convex body.
+    assert (carved[level < 0.85] > 0.5).all()
+    assert (carved[level > 1.35] < 0.5).all()
+
+
+def test_points_lie_on_the_surface_with_outward_normals(carved: torch.Tensor) -> None:
+    points = visual_hull.surface(carved, 1500, torch.Generator().manual_seed(0))
+    level = (points.positions - CENTER) / AXES
+    assert level.norm(dim=-1).median() == pytest.approx(1.0, abs=0.05)
+    true = torch.nn.functional.normalize(level / AXES, dim=-1)
+    cosine = (points.normals * true).sum(-1)
+    assert cosine.median() > math.cos(math.radians(10))
+    assert cosine.min() > 0, "no normal points inwards"
+    # Evenly spread: as many points per area on the flat sides as on the ends. A grid's own bias would be up to sqrt(3).
+    brute = torch.cdist(points.positions, points.positions).fill_diagonal_(9).sort().values[:, :3].mean(-1)
+    torch.testing.assert_close(points.spacing, brute, atol=1e-5, rtol=0)
+
+
+def test_unknown_pixels_carve_nothing() -> None:
+    capture, trajectory = silhouettes(6)
+    unknown = Capture(
+        capture.images, torch.full_like(capture.masks, UNKNOWN), capture.camera, capture.names, "camera", trajectory
+    )
+    carved = visual_hull.carve(unknown, trajectory, resolution=8)
+    ticks = (torch.arange(8) + 0.5) / 8 * 2 - 1
+    ball = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).norm(dim=-1) <= 1
+    torch.testing.assert_close(carved, ball.float())
+
+
+def test_contradicting_silhouettes_are_named() -> None:
+    capture, trajectory = silhouettes(6)
+    nothing = torch.full_like(capture.masks, BACKGROUND)
+    empty = Capture(capture.images, nothing, capture.camera, capture.names, "camera", trajectory)
+    with pytest.raises(ValueError, match="leave nothing standing"):
+        visual_hull.surface(visual_hull.carve(empty, trajectory, resolution=16), 100, torch.Generator().manual_seed(0))
+
+
+def test_a_speck_of_one_cell_does_no_harm() -> None:
+    """It gets emptier on all sides alike, so its middle has no normal."""
+    inside = torch.zeros(40, 40, 40)
+    inside[5:13, 5:13, 5:13] = 1.0
+    inside[30, 30, 30] = 1.0
+    points = visual_hull.surface(inside, 100, torch.Generator().manual_seed(0))
+    assert len(points.positions) == 100
+    torch.testing.assert_close(points.normals.norm(dim=-1), torch.ones(100))

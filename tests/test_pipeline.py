@@ -1,0 +1,403 @@
+"""All stages on a few small frames: interrupted equals whole, truth is never read, scores come out."""
+
+import dataclasses
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.lopsided import truth, tumbling
+from tests.poses.sfm.test_stage import QUICK, matches
+from tests.scene.test_visual_hull import silhouettes
+from tumble import matching, pipeline, recipes
+from tumble.datasets import _capture_folder, folder
+from tumble.engine import loop
+from tumble.engine import run as runs
+from tumble.evaluation import evaluate
+from tumble.inverse_rendering import decompose, mean_colour_baseline, refine, specular_fit
+from tumble.io import files, tree, video
+from tumble.io.files import BadFile
+from tumble.rendering import gbuffer
+from tumble.scene.asset import Asset
+from tumble.scene.capture import OBJECT, UNKNOWN, Capture, Truth, no_views
+from tumble.scene.environment import Environment
+
+RECIPE = dataclasses.replace(recipes.SMOKE, seed=3)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A grey ellipsoid with a bright half, as a capture of eight frames and two evaluation views."""
+    torch.manual_seed(0)
+    frames, trajectory = silhouettes(10, 32)
+    shade = torch.linspace(60, 220, 32).to(torch.uint8)[None, None, :, None]
+    images = torch.where(frames.masks[..., None] == OBJECT, shade, 0).to(torch.uint8).repeat(1, 1, 1, 3)
+    train, views = list(range(8)), [8, 9]
+    taken = Capture(
+        images[train], frames.masks[train], frames.camera, frames.names[:8], "camera", trajectory.select(train)
+    )
+    truth = Truth(
+        images=images[views],
+        masks=frames.masks[views],
+        names=frames.names[8:],
+        regions=("shared", "sphere"),
+        trajectory=trajectory.select(views),
+        albedo=torch.rand(2, 32, 32, 3) * (frames.masks[views] == OBJECT)[..., None],
+        normals=torch.nn.functional.normalize(torch.randn(2, 32, 32, 3), dim=-1),
+        relit={"sun": images[views]},
+        light=Environment.from_radiance(torch.rand(8, 16, 3)),
+        lights={"sun": Environment.from_radiance(torch.rand(8, 16, 3))},
+        poses=trajectory.select(train),
+    )
+    path = tmp_path_factory.mktemp("capture") / "c"
+    _capture_folder.save(path, taken, truth, setting="handheld")
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Asset]:
+    out = tmp_path_factory.mktemp("runs") / "r"
+    return out, pipeline.reconstruct(capture, out, RECIPE)
+
+
+def assert_same(a: Asset, b: Asset) -> None:
+    one, other = tree.named_tensors(a), tree.named_tensors(b)
+    assert list(one) == list(other)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_run_leaves_an_asset_a_light_and_poses(finished: tuple[Path, Asset], capture: Path) -> None:
+    out, asset = finished
+    assert_same(tree.load(Asset, out / "asset.safetensors"), asset)
+    assert all(torch.isfinite(x).all() for x in tree.named_tensors(asset).values())
+    assert Environment.read(out / "light.exr").log_radiance.shape == asset.environment.log_radiance.shape
+    poses = folder.read_poses(out / "poses.json", folder.load(capture).names)
+    torch.testing.assert_close(poses, folder.load(capture).trajectory.camera_to_object(), atol=1e-5, rtol=0)
+    assert len(asset.gaussians) > 50
+
+
+def test_a_run_without_truth_makes_the_same_asset(finished: tuple[Path, Asset], capture: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare)
+    shutil.rmtree(bare / "truth")
+    assert_same(pipeline.reconstruct(bare, tmp_path / "run", RECIPE), finished[1])
+
+
+def test_an_interrupted_run_ends_the_same(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in the middle of stage 2, after a densification; then the same command again."""
+    step = refine.step
+
+    def interrupted(cfg, inputs, state):
+        result = step(cfg, inputs, state)
+        if state.step == 17:
+            import signal
+
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(refine, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.reconstruct(capture, tmp_path / "run", RECIPE)
+    monkeypatch.setattr(refine, "step", step)
+    assert_same(pipeline.reconstruct(capture, tmp_path / "run", RECIPE), finished[1])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("stage", [refine, decompose])
+def test_steps_on_a_gpu_are_those_of_the_cpu(capture: Path, finished: tuple[Path, Asset], stage: Any) -> None:
+    """The first steps of a stage, term by term: sums in another order, and what Adam makes of their rounding."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    taken = folder.load(capture)
+    cfg = recipes.known_poses(RECIPE)
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / runs.OUT)
+    second, third = refine.Inputs(taken, taken.trajectory), decompose.Inputs(taken, refined)
+    inputs, settings = (second, cfg.refine) if stage is refine else (third, cfg.decompose)
+
+    def terms(device: str) -> list[dict[str, float]]:
+        there = type(inputs)(*(tree.to(x, device) for x in vars(inputs).values()))
+        state, seen = stage.init(settings, there, torch.Generator().manual_seed(0)), []
+        for _ in range(8):
+            seen.append({name: float(value) for name, value in stage.step(settings, there, state).items()})
+            state.step += 1
+        return seen
+
+    for here, there in zip(terms("cpu"), terms("cuda"), strict=True):
+        assert there == pytest.approx(here, rel=2e-2, abs=1e-4)
+
+
+@pytest.mark.gpu
+def test_a_run_on_a_gpu_makes_an_asset(capture: Path, finished: tuple[Path, Asset], tmp_path: Path) -> None:
+    """Densification decides by thresholds, so the number of Gaussians may differ a little."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    asset = pipeline.reconstruct(capture, tmp_path / "run", RECIPE, device="cuda")
+    assert all(torch.isfinite(x).all() and x.device.type == "cpu" for x in tree.named_tensors(asset).values())
+    assert len(asset.gaussians) == pytest.approx(len(finished[1].gaussians), rel=0.1)
+    here, there = (float(x.environment.radiance.mean()) for x in (finished[1], asset))
+    assert there == pytest.approx(here, rel=0.1)
+
+
+def test_finished_stages_are_not_run_again(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("ran again")
+
+    monkeypatch.setattr(refine, "step", never)
+    assert_same(pipeline.reconstruct(capture, finished[0], RECIPE), finished[1])
+
+
+def test_a_run_is_scored_with_known_poses_as_they_are(finished: tuple[Path, Asset], capture: Path) -> None:
+    prediction = pipeline.predict_run(finished[0], capture)
+    report = evaluate.run(prediction, capture, finished[0])
+    assert set(report["regions"]) == {"shared", "sphere"}
+    shared = report["regions"]["shared"]
+    for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_full_srgb", "normal.mean_fg_degrees"):
+        assert math.isfinite(shared[key])
+    assert report["poses"]["poses.rotation_mean_degrees"] < 0.01
+    assert (finished[0] / "sheet.png").is_file()
+
+
+def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same run against the same truth, with and without given poses: its trajectory is the true one, nearly."""
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare)
+    document = files.read_json(bare / folder.TRANSFORMS)
+    for frame in document["frames"]:
+        if frame["split"] == "train":
+            del frame["transform_matrix"]
+    files.write_json(bare / folder.TRANSFORMS, document)
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    loads: list[Path] = []
+    load = folder.load
+    monkeypatch.setattr(folder, "load", lambda path: loads.append(path) or load(path))
+    free = pipeline.evaluate_run(run, bare, run)
+    assert loads == [bare], "a capture is read once"
+    given = pipeline.evaluate_run(run, capture, run)
+    assert "rotation alone" in free["notes"][0]
+    assert "poses were given" in given["notes"][0]
+    (run / "1-track").mkdir()
+    found = pipeline.evaluate_run(run, capture, run)
+    assert "rotation alone" in found["notes"][0], "a run that estimated poses has a frame of its own"
+    for region, scores in given["regions"].items():
+        for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_fg_srgb"):
+            # Rays are drawn anew.
+            assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.3), key
+        key = "normal.mean_fg_degrees"
+        assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.5)
+
+
+def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A capture whose focal length is a guess, a fifth too short, and its twin with the true one, to score against."""
+    scene = tumbling(16, size=96, points=150)
+    true = scene.capture.camera
+    guess = dataclasses.replace(scene.capture, camera=true.zoomed(0.8), focal_guessed=True)
+    _capture_folder.save(tmp_path / "guess", guess)
+    _capture_folder.save(tmp_path / "true", scene.capture, dataclasses.replace(no_views(true), poses=truth(scene)))
+    monkeypatch.setattr(matching, "match_pairs", lambda *_, **__: matches(scene))
+    recipe = dataclasses.replace(RECIPE, track=QUICK)
+    run = tmp_path / "run"
+    asset = pipeline.reconstruct(tmp_path / "guess", run, recipe, poses="estimate")
+    focal = float(asset.camera.fx_fy_cx_cy[0])
+    assert focal == pytest.approx(float(true.fx_fy_cx_cy[0]), rel=0.1)
+    said = [record["said"] for record in runs.records(run) if record.get("event") == "focal"]
+    begun = float(guess.camera.fx_fy_cx_cy[0])
+    assert said == [f"focal length {focal:.0f} pixels (estimated; the guess was {begun:.0f})"]
+    assert_same(pipeline.reconstruct(tmp_path / "guess", run, recipe, poses="estimate"), asset)
+    # Scored through the true camera: a folder, a film, a window of a film, a film whose lens is known.
+    ratio = float(true.fx_fy_cx_cy[0]) / focal
+    report = pipeline.evaluate_run(run, tmp_path / "true", run)
+    assert f"depths times {ratio:.4g}" in report["notes"][0]
+    note = {"focal_source": "guess", "window_top_left_height_width": [0, 0, 192, 192], "frames": []}
+    assert pipeline._lens(run, asset, guess) == pytest.approx(begun / focal)
+    files.write_json(run / "capture" / "ingest.json", note)
+    assert pipeline._lens(run, asset, scene.capture) == pytest.approx(ratio)
+    window = dataclasses.replace(asset, camera=asset.camera.resized(192, 192).cropped(20, 30, 120, 100).resized(60, 50))
+    files.write_json(run / "capture" / "ingest.json", note | {"window_top_left_height_width": [20, 30, 120, 100]})
+    assert pipeline._lens(run, window, scene.capture) == pytest.approx(ratio)
+    files.write_json(run / "capture" / "ingest.json", note | {"focal_source": "given"})
+    assert pipeline._lens(run, asset, scene.capture) == 1
+
+
+def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Path, tmp_path: Path) -> None:
+    """A film of eight frames of which the second to last and the third were kept, and one that the capture lacks."""
+    kept = {"0000.png": 6, "0001.png": 2, "0002.png": 8}
+    files.write_json(tmp_path / pipeline.POSES, kept)
+    known = folder.load(capture)
+    assert pipeline.source_names(tmp_path, known) == tuple(kept)
+    said = [{"name": name, "source_frame": number} for name, number in kept.items()]
+    files.write_json(tmp_path / "capture" / "ingest.json", {"frames": said})
+    assert pipeline.source_names(tmp_path, known) == (known.names[6], known.names[2], "0002.png")
+    # Pictures with a model have names, not numbers.
+    files.write_json(tmp_path / "capture" / "ingest.json", {"frames": [{"name": "0000.png", "source": "a.jpg"}]})
+    assert pipeline.source_names(tmp_path, known) == tuple(kept)
+
+
+def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = folder.load(capture)
+    few = taken.select([0, 1, 2])
+    _capture_folder.save(tmp_path / "few", few)
+    with pytest.raises(BadFile, match="has 3 frames: too few"):
+        pipeline.reconstruct(tmp_path / "few", tmp_path / "run", RECIPE, poses="estimate")
+    stage = runs.stage
+
+    def loses_one(*arguments: Any) -> Any:
+        tracked = stage(*arguments)
+        lost = torch.arange(len(tracked.health.lost)) == 5
+        return dataclasses.replace(tracked, health=dataclasses.replace(tracked.health, lost=lost))
+
+    monkeypatch.setattr(runs, "stage", loses_one)
+    with pytest.raises(BadFile, match="could not be tracked: 1 of 8 frames"):
+        pipeline.reconstruct(capture, tmp_path / "lost", RECIPE, poses="estimate")
+    with pytest.raises(BadFile, match="finish the run first"):
+        pipeline.predict_run(tmp_path / "nowhere", capture)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_run_can_be_put_under_another_light(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, fast: bool
+) -> None:
+    pipeline.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
+    pictures = [files.read_picture(path) for path in sorted(tmp_path.iterdir())]
+    assert len(pictures) == 8
+    assert all(0 < picture.mean() < 255 for picture in pictures)
+
+
+def test_a_turning_object_is_in_the_middle_of_its_film(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of a run whose pictures are a window beside the middle of a film."""
+    monkeypatch.setattr(pipeline, "FILM_FRAMES", 2)
+    monkeypatch.setattr(pipeline, "FILM_SIDE", 64)
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    beside = finished[1].camera.cropped(0, 40, finished[1].camera.height, finished[1].camera.width)
+    tree.save(dataclasses.replace(finished[1], camera=beside), out / pipeline.ASSET)
+    light = capture / "truth" / "lights" / "sun.hdr"
+    for number, run in enumerate((finished[0], out)):
+        pipeline.film_run(run, light, tmp_path / f"{number}.mp4", fast=True)
+    films = [np.stack(list(video.read_clip(tmp_path / f"{number}.mp4"))) for number in range(2)]
+    assert films[0].max() > 60
+    assert (films[0] == films[1]).all()
+
+
+def test_the_third_axis_is_the_smallest_after_training(finished: tuple[Path, Asset]) -> None:
+    """Our normal is the third axis by construction; the paper's is that of the smallest scale."""
+    scales = finished[1].gaussians.scales
+    assert (scales.argmin(-1) == 2).double().mean() > 0.99
+
+
+def test_visibility_is_traced_again_only_when_geometry_has_moved(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = folder.load(capture)
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(taken, refined)
+    cfg = dataclasses.replace(RECIPE.decompose, warmup=0)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    looks: list[int] = []
+    monkeypatch.setattr(decompose, "_look_around", lambda cfg, inputs, state: looks.append(state.step))
+    decompose._look_again(cfg, inputs, state)
+    assert looks == []
+    with torch.no_grad():
+        state.params.gaussians.means.add_(0.5 * state.params.gaussians.scales.amax(-1, keepdim=True))
+    decompose._look_again(cfg, inputs, state)
+    assert looks == [0]
+    state.step = 7
+    decompose._look_again(cfg, inputs, state)
+    assert looks == [0], "looked at every LOOK_EVERY steps"
+
+
+def test_averaging_finds_the_colour_that_every_frame_shows(finished: tuple[Path, Asset], capture: Path) -> None:
+    """A surface that looks the same in all frames has that look as its albedo."""
+    taken = folder.load(capture)
+    grey = torch.where(taken.masks[..., None] == OBJECT, 128, 0).to(torch.uint8).repeat(1, 1, 1, 3)
+    flat = dataclasses.replace(taken, images=grey)
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    asset = loop.drive(mean_colour_baseline, mean_colour_baseline.Config(), decompose.Inputs(flat, refined), seed=0)
+    found = gbuffer.buffers_of(asset, refined.trajectory.T_cam_obj[0], taken.camera)
+    # The linear value of code 128; an eighth of a frame's colour may come from its soft edge.
+    inside = found.alpha > 0.99
+    assert inside.sum() > 20
+    torch.testing.assert_close(found.features["albedo"][inside].median(), torch.tensor(0.2159), atol=0.01, rtol=0)
+
+
+def test_without_corners_a_gaussian_has_one_material(finished: tuple[Path, Asset], capture: Path) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    cfg = dataclasses.replace(RECIPE.decompose, corners=False)
+    asset = loop.drive(decompose, cfg, decompose.Inputs(folder.load(capture), refined), seed=0)
+    albedo = asset.material.albedo
+    assert torch.equal(albedo, albedo[:, :1].expand_as(albedo))
+    assert finished[1].material.albedo.std(1).max() > 1e-3
+
+
+def test_a_frame_that_hides_the_object_does_not_end_a_run(finished: tuple[Path, Asset], capture: Path) -> None:
+    """All that its mask says for sure is one pixel, beside the object."""
+    taken = folder.load(capture).select([0])
+    masks = torch.full_like(taken.masks, UNKNOWN)
+    masks[0, 0, 0] = OBJECT
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    refined = dataclasses.replace(refined, trajectory=refined.trajectory.select([0]))
+    inputs = decompose.Inputs(dataclasses.replace(taken, masks=masks), refined)
+    cfg = dataclasses.replace(RECIPE.decompose, warmup=0)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    for state.step in range(3):
+        terms = decompose.step(cfg, inputs, state)
+        assert terms["render"] == 0
+    assert all(x.isfinite().all() for x in tree.named_tensors(state.params).values())
+
+
+def test_without_visibility_nothing_is_lit_by_another_part(finished: tuple[Path, Asset], capture: Path) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(folder.load(capture), refined)
+    cfg = dataclasses.replace(RECIPE.decompose, visibility=False)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    assert math.isfinite(float(decompose.step(cfg, inputs, state)["render"]))
+
+
+def test_a_highlight_that_a_trial_found_has_no_price(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    inputs = decompose.Inputs(folder.load(capture), refined)
+    cfg = dataclasses.replace(RECIPE.decompose, fitted=True)
+
+    def price(found: specular_fit.Fit | None) -> float:
+        monkeypatch.setattr(specular_fit, "fit", lambda *samples: found)
+        state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+        decompose.fit_highlight(cfg, inputs, state)
+        return float(state.memory["price"])
+
+    n = len(refined.albedo)
+    assert price(None) == pytest.approx(cfg.weights.highlight)
+    assert price(specular_fit.Fit(1, 0.7, torch.zeros(5, n, 3))) == 0
+
+
+@pytest.mark.parametrize(("strength", "tried"), [(1.0, True), (0.9, True), (0.8, False), (0.1, False)])
+def test_only_a_highlight_like_that_of_glass_is_tried(
+    finished: tuple[Path, Asset], capture: Path, monkeypatch: pytest.MonkeyPatch, strength: float, tried: bool
+) -> None:
+    refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
+    light = dataclasses.replace(refined.light, log_highlight=torch.tensor(strength).log())
+    asked: list[int] = []
+    monkeypatch.setattr(specular_fit, "fit", lambda *samples: asked.append(1))
+    inputs = decompose.Inputs(folder.load(capture), dataclasses.replace(refined, light=light))
+    decompose.init(dataclasses.replace(RECIPE.decompose, fitted=True), inputs, torch.Generator().manual_seed(0))
+    assert bool(asked) == tried
+
+
+def test_given_poses_stay_in_every_stage() -> None:
+    loose = dataclasses.replace(RECIPE.decompose, rates=dataclasses.replace(RECIPE.decompose.rates, poses=1e-2))
+    known = recipes.known_poses(dataclasses.replace(RECIPE, decompose=loose))
+    assert (known.refine.rates.poses, known.refine.realignments, known.decompose.rates.poses) == (0, 0, 0)
+    assert recipes.known_poses(recipes.averaging(RECIPE)).decompose == mean_colour_baseline.Config()

@@ -1,0 +1,102 @@
+"""Writing capture folders (docs/format.md): the entries of transforms.json, and whole captures.
+
+File names: a frame `0007.png` has its photograph in `images/`, its mask in `masks/`, its truth as
+`truth/albedo/0007.exr`, ..., `truth/relit/<light>/0007.png`. `transforms.json` is written last: a folder without it is
+not a capture yet.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.scene.camera import Camera
+from tumble.scene.capture import Capture, Truth
+
+MAPS = ("albedo", "roughness", "normal", "depth")
+"""Truth maps of an evaluation view, as folders of truth/ and as keys `<map>_path` of its frame."""
+
+
+def document(
+    camera: Camera, light: str, frames: list[dict[str, Any]], *, setting: str | None, with_light: bool
+) -> dict[str, Any]:
+    """A transforms.json.
+
+    Args:
+        light: What the light stands still with.
+        frames: From `training_frame` and `evaluation_frame`.
+        with_light: Whether there is a truth/light.hdr.
+    """
+    fx, fy, cx, cy = camera.fx_fy_cx_cy.tolist()
+    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    label = {} if setting is None else {"setting": setting}
+    path = {"light_path": "truth/light.hdr"} if with_light else {}
+    head = {"camera_model": "OPENCV", **intrinsics, "light": light, **label, **path, "units": "arbitrary"}
+    return head | {"frames": frames}
+
+
+def training_frame(name: str, matrix: list[list[float]] | None) -> dict[str, Any]:
+    """The entry of a training frame; `matrix` is camera to object in OpenGL axes, None when unknown."""
+    entry: dict[str, Any] = {"file_path": f"images/{name}", "mask_path": f"masks/{name}", "split": "train"}
+    return entry if matrix is None else entry | {"transform_matrix": matrix}
+
+
+def evaluation_frame(
+    name: str, matrix: list[list[float]], region: str, *, maps: Iterable[str], lights: Iterable[str]
+) -> dict[str, Any]:
+    """The entry of an evaluation view that has truth maps, and relit pictures under some lights."""
+    entry = training_frame(name, matrix) | {"split": "eval", "region": region}
+    entry |= {f"{kind}_path": f"truth/{kind}/{Path(name).stem}.exr" for kind in maps}
+    return entry | {"relit": {light: f"truth/relit/{light}/{name}" for light in lights}}
+
+
+def save(path: Path, capture: Capture, truth: Truth | None = None, *, setting: str | None = None) -> None:
+    """Write a capture, and what is true about it, as a new folder.
+
+    Raises:
+        BadFile: `path` exists and is not an empty folder.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise BadFile(path, "is there already", "choose a new folder")
+    for name, image, mask in zip(capture.names, capture.images, capture.masks, strict=True):
+        _save_photograph(path, name, image, mask)
+    matrices = [None] * len(capture) if capture.trajectory is None else capture.trajectory.camera_to_object().tolist()
+    frames = [training_frame(name, matrix) for name, matrix in zip(capture.names, matrices, strict=True)]
+    if truth is not None:
+        frames += _save_truth(path, capture, truth)
+    with_light = truth is not None and truth.light is not None
+    fields = document(capture.camera, capture.light, frames, setting=setting, with_light=with_light)
+    files.write_json(path / "transforms.json", fields | ({"focal_source": "guess"} if capture.focal_guessed else {}))
+
+
+def _save_photograph(path: Path, name: str, image: Tensor, mask: Tensor) -> None:
+    files.write_png(path / "images" / name, image.cpu().numpy())
+    files.write_png(path / "masks" / name, mask.cpu().numpy()[..., None])
+
+
+def _save_truth(path: Path, capture: Capture, truth: Truth) -> list[dict[str, Any]]:
+    if truth.light is not None:
+        truth.light.write(path / "truth" / "light.hdr")
+    for light, environment in truth.lights.items():
+        environment.write(path / "truth" / "lights" / f"{light}.hdr")
+    if truth.poses is not None:
+        poses = dict(zip(capture.names, truth.poses.camera_to_object().tolist(), strict=True))
+        files.write_json(path / "truth" / "poses.json", poses)
+    if truth.trajectory is None:
+        return []
+    values = {"albedo": truth.albedo, "roughness": truth.roughness, "normal": truth.normals, "depth": truth.depth}
+    maps = {kind: images.cpu().numpy() for kind, images in values.items() if images is not None}
+    frames = []
+    for i, (name, matrix) in enumerate(zip(truth.names, truth.trajectory.camera_to_object().tolist(), strict=True)):
+        _save_photograph(path, name, truth.images[i], truth.masks[i])
+        for kind, images in maps.items():
+            pixels = images[i] if images[i].ndim == 3 else images[i][..., np.newaxis]
+            files.write_exr(path / "truth" / kind / f"{Path(name).stem}.exr", pixels)
+        for light, relit in truth.relit.items():
+            files.write_png(path / "truth" / "relit" / light / name, relit[i].cpu().numpy())
+        frames.append(evaluation_frame(name, matrix, truth.regions[i], maps=maps, lights=truth.relit))
+    return frames

@@ -1,0 +1,213 @@
+"""What a method says about a capture, as a folder that `tumble evaluate` scores; the contract is docs/prediction.md.
+
+A *view* is an evaluation view of the capture, in the order of its transforms.json; files are numbered by it: the
+fourth view's albedo is albedo/0003.exr. Every part is optional. Maps are of the capture's size and 0 off the object.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from tumble.datasets.folder import read_poses
+from tumble.io import files
+from tumble.io.files import BadFile
+from tumble.scene.capture import Capture, Truth
+from tumble.scene.environment import Environment
+from tumble.scene.trajectory import Trajectory
+
+PARTS = ("albedo", "normal", "roughness", "mask", "image", "relit", "light.exr", "poses.json")
+"""Everything that a prediction folder may hold under a name of ours."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One method's answer for one capture; None, or empty, where it has none."""
+
+    albedo: Float[Tensor, "v h w 3"] | None = None
+    """Linear base colour as estimated: not multiplied by the scale that evaluation finds."""
+    normals: Float[Tensor, "v h w 3"] | None = None
+    """Shading normals, true object frame."""
+    roughness: Float[Tensor, "v h w"] | None = None
+    """Perceptual roughness."""
+    masks: Bool[Tensor, "v h w"] | None = None
+    """Silhouettes; without them, where the albedo is not black."""
+    images: UInt8[Tensor, "v h w 3"] | None = None
+    """The views under the capture's own light, sRGB code values over black."""
+    relit: dict[str, UInt8[Tensor, "v h w 3"]] = field(default_factory=dict)
+    """The views under other lights, by the light's name, from the scaled albedo; sRGB code values over black."""
+    light: Environment | None = None
+    """The light of the capture, env frame of the capture, not divided by the albedo's scale."""
+    poses: Trajectory | None = None
+    """Estimated poses of training frames, in any object frame and unit."""
+    pose_names: tuple[str, ...] = ()
+    """Names of the training frames that `poses` belong to, in the capture's order."""
+
+    def __post_init__(self) -> None:
+        views = [self.albedo, self.normals, self.roughness, self.masks, self.images, *self.relit.values()]
+        shapes = {tuple(view.shape[:3]) for view in views if view is not None}
+        assert len(shapes) <= 1, f"all parts have the same views, of the same size, not {shapes}"
+        assert len(self.pose_names) == (0 if self.poses is None else len(self.poses)), "one name per pose"
+
+    @property
+    def silhouettes(self) -> Bool[Tensor, "v h w"] | None:
+        """Where the method says that the object is."""
+        if self.masks is not None or self.albedo is None:
+            return self.masks
+        return (self.albedo > 0).any(-1)
+
+    def write(self, path: Path) -> None:
+        """The prediction as a folder; parts of an earlier one there are replaced, or removed when absent here.
+
+        Each part is written beside its place first, so that none is ever half there; other files are left alone.
+        """
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=path) as partial:
+            _write_parts(self, Path(partial))
+            for part in PARTS:
+                old, new = path / part, Path(partial) / part
+                shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
+                if new.exists():
+                    new.rename(old)
+
+    @staticmethod
+    def read(path: Path, capture: Capture, truth: Truth) -> "Prediction":
+        """The prediction in a folder, for a capture and its evaluation views.
+
+        Raises:
+            BadFile: The folder breaks a rule of docs/prediction.md.
+        """
+        if not path.is_dir():
+            raise BadFile(path, "is not a folder", "a prediction is a folder, see docs/prediction.md")
+        if not any((path / part).exists() for part in PARTS):
+            raise BadFile(path, f"holds no part of a prediction, none of: {', '.join(PARTS)}")
+        views = _Views(len(truth), capture.camera.height, capture.camera.width)
+        roughness = views.read(path / "roughness", ".exr", _roughness)
+        masks = views.read(path / "mask", ".png", _mask)
+        names, poses = _read_poses(path / "poses.json", capture)
+        relit = sorted(p for p in (path / "relit").iterdir() if p.is_dir()) if (path / "relit").is_dir() else []
+        return Prediction(
+            albedo=views.read(path / "albedo", ".exr", _albedo),
+            normals=views.read(path / "normal", ".exr", _normal),
+            roughness=None if roughness is None else roughness[..., 0],
+            masks=None if masks is None else masks[..., 0] >= 128,
+            images=views.read(path / "image", ".png", _picture),
+            relit={
+                light.name: pixels for light in relit if (pixels := views.read(light, ".png", _picture)) is not None
+            },
+            light=Environment.read(path / "light.exr") if (path / "light.exr").exists() else None,
+            poses=poses,
+            pose_names=names,
+        )
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def _write_parts(prediction: Prediction, root: Path) -> None:
+    for path, pixels in _maps(prediction):
+        write = files.write_png if path.suffix == ".png" else files.write_exr
+        write(root / path, pixels)
+    if prediction.light is not None:
+        prediction.light.write(root / "light.exr")
+    if prediction.poses is not None:
+        matrices = prediction.poses.camera_to_object().detach().cpu().tolist()
+        files.write_json(root / "poses.json", dict(zip(prediction.pose_names, matrices, strict=True)))
+
+
+def _maps(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
+    """Every picture of a prediction with the file it belongs to."""
+    masks, roughness = prediction.masks, prediction.roughness
+    parts = {
+        ("albedo", "exr"): prediction.albedo,
+        ("normal", "exr"): prediction.normals,
+        ("roughness", "exr"): None if roughness is None else roughness[..., None],
+        ("mask", "png"): None if masks is None else 255 * masks[..., None].to(torch.uint8),
+        ("image", "png"): prediction.images,
+        **{(f"relit/{light}", "png"): pixels for light, pixels in prediction.relit.items()},
+    }
+    for (folder, suffix), views in parts.items():
+        for i, pixels in enumerate([] if views is None else views.detach().cpu().numpy()):
+            yield Path(folder) / f"{i:04}.{suffix}", pixels
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Views:
+    """How many pictures a part has, and of which size."""
+
+    count: int
+    height: int
+    width: int
+
+    def read(self, folder: Path, ending: str, read: Callable[[Path], np.ndarray]) -> Tensor | None:
+        """All views of a part, `[v h w c]`; None when the folder is not there."""
+        if not folder.exists():
+            return None
+        wanted = [folder / f"{i:04}{ending}" for i in range(self.count)]
+        if surplus := sorted(set(folder.glob(f"*{ending}")) - set(wanted)):
+            rule = f"is not one of the {self.count} evaluation views"
+            raise BadFile(surplus[0], rule, f"files are numbered from 0000{ending} in the capture's order")
+        if not wanted:
+            return None
+        return torch.from_numpy(np.stack([self._sized(path, read(path)) for path in wanted]))
+
+    def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
+        if pixels.shape[:2] != (self.height, self.width):
+            found = f"{pixels.shape[1]} x {pixels.shape[0]}"
+            raise BadFile(path, f"is {found} pixels, the capture is {self.width} x {self.height}")
+        return pixels
+
+
+def _channels(path: Path, pixels: np.ndarray, wanted: int) -> np.ndarray:
+    if pixels.shape[2] != wanted:
+        raise BadFile(path, f"has {pixels.shape[2]} channels, {path.parent.name} has {wanted}")
+    return pixels
+
+
+def _albedo(path: Path) -> np.ndarray:
+    pixels = _channels(path, files.read_radiance(path), 3)
+    if pixels.min() < 0:
+        raise BadFile(path, f"holds a negative albedo, {pixels.min():.3g}", "linear albedo is 0 or more: clamp it")
+    return pixels
+
+
+def _normal(path: Path) -> np.ndarray:
+    return _channels(path, files.read_radiance(path), 3)
+
+
+def _roughness(path: Path) -> np.ndarray:
+    pixels = _channels(path, files.read_radiance(path), 1)
+    # Half floats round 1 to 1, but a sum of blending weights may pass it by a few units in the last place.
+    if pixels.min() < 0 or pixels.max() > 1.001:
+        raise BadFile(path, f"holds roughness from {pixels.min():.3g} to {pixels.max():.3g}", "it lies in [0, 1]")
+    return pixels
+
+
+def _mask(path: Path) -> np.ndarray:
+    return _channels(path, files.read_picture(path), 1)
+
+
+def _picture(path: Path) -> np.ndarray:
+    return _channels(path, files.read_picture(path), 3)
+
+
+def _read_poses(path: Path, capture: Capture) -> tuple[tuple[str, ...], Trajectory | None]:
+    if not path.exists():
+        return (), None
+    document: Any = files.read_json(path)
+    if not isinstance(document, dict) or not document:
+        raise BadFile(path, 'is not of the form {"0000.png": 4 x 4 matrix, ...}')
+    if unknown := sorted(set(document) - set(capture.names)):
+        raise BadFile(path, f"has a pose for {unknown[0]}, which is not a training frame of the capture")
+    names = tuple(name for name in capture.names if name in document)
+    return names, Trajectory.from_camera_to_object(read_poses(path, names), capture.light)

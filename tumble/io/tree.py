@@ -1,0 +1,130 @@
+"""Dataclasses of tensors as trees: map over them, name their leaves, move them, keep them on disk.
+
+A *tree* is a frozen dataclass whose fields are tensors, other trees, dicts of tensors, or plain *facts* (numbers,
+strings, tuples of those, None). A leaf's *name* is its path of field names joined by dots: `trajectory.T_cam_obj.wxyz`.
+On disk a tree is one safetensors file: leaves by name, facts as JSON in the header. Nothing is ever pickled.
+"""
+
+import dataclasses
+import json
+import types
+import typing
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from tumble import __version__
+from tumble.io import files
+from tumble.io.files import BadFile
+
+T = TypeVar("T")
+REMEDY = "remove it, and give the command that made it again"
+
+
+def map(fn: Callable[[Tensor], Tensor], tree: T) -> T:
+    """Apply `fn` to every tensor of a tree; facts stay as they are."""
+    if isinstance(tree, Tensor):
+        return typing.cast(T, fn(tree))
+    if isinstance(tree, dict):
+        return typing.cast(T, {key: map(fn, value) for key, value in tree.items()})
+    if not dataclasses.is_dataclass(tree):
+        return tree
+    return dataclasses.replace(typing.cast(Any, tree), **{k: map(fn, v) for k, v in _fields(tree).items()})
+
+
+def named_tensors(tree: object) -> dict[str, Tensor]:
+    """Every tensor of a tree under its dotted name, in field order."""
+    return dict(_walk(tree, ""))
+
+
+def to(tree: T, device: torch.device | str) -> T:
+    """The tree with every tensor on `device`."""
+    return map(lambda x: x.to(device), tree)
+
+
+def detach(tree: T) -> T:
+    """The tree cut off from the autograd graph, sharing storage."""
+    return map(torch.Tensor.detach, tree)
+
+
+def save(tree: object, path: Path) -> None:
+    """Write a tree as one safetensors file; the file appears whole or not at all."""
+    # Leaves may share storage (views of one parameter); safetensors wants each to own its bytes.
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in named_tensors(tree).items()}
+    header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_facts(tree))}
+    files.write_whole(path, lambda partial: safetensors.torch.save_file(tensors, partial, metadata=header))
+
+
+def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
+    """Read a tree of class `cls`.
+
+    Raises:
+        BadFile: The file is damaged, holds another class, or lacks a field; the message names both.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
+            header = file.metadata() or {}
+            if header.get("type") != cls.__name__:
+                rule = f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}"
+                raise BadFile(path, rule, REMEDY)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        return _build(cls, tensors, json.loads(header["facts"]), "")
+    except safetensors.SafetensorError as error:
+        raise BadFile(path, f"is damaged: {error}", REMEDY) from None
+    except KeyError as missing:
+        rule = f"lacks {missing}, a field of {cls.__name__}; written by another version?"
+        raise BadFile(path, rule, REMEDY) from None
+
+
+def _fields(tree: object) -> dict[str, Any]:
+    return {f.name: getattr(tree, f.name) for f in dataclasses.fields(typing.cast(Any, tree))}
+
+
+def _walk(tree: object, prefix: str) -> Iterator[tuple[str, Tensor]]:
+    if isinstance(tree, Tensor):
+        yield prefix, tree
+        return
+    if dataclasses.is_dataclass(tree):
+        tree = _fields(tree)
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from _walk(value, f"{prefix}.{key}" if prefix else str(key))
+
+
+def _facts(tree: object) -> dict[str, Any]:
+    """What is not a tensor, nested as the tree is; a tensor's place holds the word "tensor"."""
+    facts: dict[str, Any] = {}
+    for name, value in (tree if isinstance(tree, dict) else _fields(tree)).items():
+        if isinstance(value, Tensor):
+            facts[name] = "tensor"
+        elif isinstance(value, dict) or dataclasses.is_dataclass(value):
+            facts[name] = {"tree": _facts(value)}
+        else:
+            facts[name] = {"fact": value}
+    return facts
+
+
+def _build(cls: Any, tensors: dict[str, Tensor], facts: dict[str, Any], prefix: str) -> Any:
+    hints = {} if cls is dict else typing.get_type_hints(cls)
+    values: dict[str, Any] = {}
+    for name in facts if cls is dict else hints:
+        place, fact = prefix + name, facts[name]
+        if fact == "tensor":
+            values[name] = tensors[place]
+        elif "tree" in fact:
+            values[name] = _build(_tree_class(hints.get(name, dict)), tensors, fact["tree"], place + ".")
+        else:
+            values[name] = tuple(fact["fact"]) if isinstance(fact["fact"], list) else fact["fact"]
+    return values if cls is dict else cls(**values)
+
+
+def _tree_class(hint: Any) -> Any:
+    """The dataclass (or dict) that a field's annotation allows: `Material` for `Material | None`."""
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        hint = next(option for option in typing.get_args(hint) if option is not type(None))
+    return dict if typing.get_origin(hint) is dict else hint

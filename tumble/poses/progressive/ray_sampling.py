@@ -1,0 +1,83 @@
+"""Pixels of one frame as rays of its virtual camera, with the colours that the photograph has there.
+
+The photograph itself is never resampled: turning the camera about its centre turns rays (`virtual_camera`).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from tumble.maths.images import Box, crop_box
+from tumble.poses.progressive.virtual_camera import Aim
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Rays and what they should see."""
+
+    directions: Float[Tensor, "r 3"]
+    """Aim frame, unit length."""
+    rgb: Float[Tensor, "r 3"]
+    """sRGB in [0, 1]."""
+    mask: Float[Tensor, " r"]
+    """Share of the object."""
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+    def __add__(self, other: "Pixels") -> "Pixels":
+        """Both, one after the other."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("directions", "rgb", "mask"))
+        return Pixels(*(torch.cat(pair) for pair in pairs))
+
+
+def around(capture: Capture, frame: int, margin: float) -> Box:
+    """The window of a frame's silhouette and `margin` more [picture widths]; the whole frame when it shows nothing."""
+    mask = capture.masks[frame] != BACKGROUND
+    if not bool(mask.any()):
+        return 0, 0, mask.shape[0], mask.shape[1]
+    return crop_box(mask, round(margin * mask.shape[1]))
+
+
+def draw(capture: Capture, aim: Aim, frame: int, n: int, *, box: Box, block: int, rng: torch.Generator) -> Pixels:
+    """Up to `n` pixels at random places of a window; those with an unknown part are left out.
+
+    Args:
+        block: Side of the square of pixels that is averaged into one; its ray goes through the middle.
+    """
+    top, left, height, width = box
+    block = min(block, height, width)
+    size = torch.tensor([height - block + 1, width - block + 1])
+    corner = torch.tensor([top, left]) + (torch.rand(n, 2, generator=rng) * size).long()
+    return _averaged(capture, aim, frame, corner.to(capture.masks.device), block)
+
+
+def at(capture: Capture, aim: Aim, frame: int, uv: Float[Tensor, "m 2"]) -> Pixels:
+    """Rays through given positions [pixels, centres at +0.5], with the colours of the pixels there.
+
+    They count as object whatever the mask says: correspondences lie on it.
+    """
+    limit = torch.tensor([capture.camera.width - 1, capture.camera.height - 1]).to(uv)
+    column, row = torch.minimum(uv.floor().clamp_min(0), limit).long().unbind(-1)
+    rgb = capture.images[frame, row, column].to(uv) / 255
+    return Pixels(_directions(capture, aim, frame, uv), rgb, torch.ones_like(uv[:, 0]))
+
+
+def _averaged(capture: Capture, aim: Aim, frame: int, corner: Int64[Tensor, "n 2"], block: int) -> Pixels:
+    like = capture.camera.fx_fy_cx_cy
+    within = torch.arange(block, device=corner.device)
+    row, column = corner[:, :1, None] + within[:, None], corner[:, 1:, None] + within
+    mask = capture.masks[frame, row, column].flatten(1)
+    known = (mask != UNKNOWN).all(1)
+    rgb = capture.images[frame, row, column].to(like).flatten(1, 2).mean(1)[known] / 255
+    uv = corner.flip(-1)[known].to(like) + 0.5 * block
+    return Pixels(_directions(capture, aim, frame, uv), rgb, (mask == OBJECT)[known].to(like).mean(1))
+
+
+def _directions(capture: Capture, aim: Aim, frame: int, uv: Tensor) -> Float[Tensor, "m 3"]:
+    x_cam = capture.camera.unproject(uv, torch.ones_like(uv[:, 0]))
+    return normalize(aim.R_cam_aim[frame].inverse() @ x_cam, dim=-1)

@@ -1,0 +1,63 @@
+"""What a camera sees of the Gaussians, before light: the one place where nouns become the tensors of a backend.
+
+*Features* are whatever varies over a Gaussian's plane, given at its four corners (`material`): callers name them and
+get images of the same names back.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tumble import backends
+from tumble.maths.se3 import SE3
+from tumble.rendering.buffers import Buffers
+from tumble.scene.camera import Camera
+from tumble.scene.gaussians import Gaussians, opacity
+
+
+def rasterize(
+    gaussians: Gaussians,
+    gamma: Float[Tensor, ""],
+    T_cam_obj: SE3,
+    camera: Camera,
+    features: dict[str, Float[Tensor, "n 4 _"]],
+    mask: Float[Tensor, "h w"] | None = None,
+) -> Buffers:
+    """One view of the Gaussians (paper section 4.2); differentiable in all of them, in `gamma`, features and pose.
+
+    Not differentiable: the camera (intrinsics are known), the mask, and `weight`, `touched`, `dominant`.
+
+    Args:
+        gamma: Sharpness of the opacity [1 / object radius].
+        T_cam_obj: One pose, without batch axes.
+        features: Values at the corners of every Gaussian's plane, by name; may be empty.
+        mask: Pixels that count in `Buffers.touched`, where > 0.5; all when None.
+    """
+    means = gaussians.means
+    corners = torch.cat([*features.values(), means.new_zeros(len(gaussians), 4, 0)], -1)
+    view = backends.choose(means.device, means.dtype).rasterize(
+        means,
+        gaussians.quats,
+        gaussians.scales,
+        opacity(gaussians.sdf, gamma),
+        gaussians.sh,
+        corners,
+        T_cam_obj.rotation.matrix(),
+        T_cam_obj.translation,
+        camera.fx_fy_cx_cy.to(means),
+        camera.height,
+        camera.width,
+        means.new_ones(1, 1) if mask is None else mask,
+    )
+    images = view.features.split([values.shape[-1] for values in features.values()], -1)
+    return Buffers(
+        alpha=view.alpha,
+        depth=view.depth,
+        depth_var=view.depth_var,
+        normal=view.normal,
+        rgb=view.rgb,
+        features=dict(zip(features, images, strict=True)),
+        weight=view.weight,
+        touched=view.touched,
+        dominant=view.dominant,
+    )

@@ -1,0 +1,72 @@
+"""How the object moved before the camera, and with whom the light stands still.
+
+Frames: `obj` (the object, inside the unit ball), `cam` (OpenCV), `env` (where the light map does not move). With
+`light == "camera"` the env frame is the camera in OpenGL axes (x right, y up, z backwards), so that the map's top is up
+in the picture; with `light == "object"` it is the object frame (format.md).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tumble.maths.se3 import SE3
+
+Light = Literal["camera", "object"]
+LIGHTS: tuple[str, ...] = get_args(Light)
+
+
+def opengl_from_opencv(like: Tensor) -> Float[Tensor, "3 3"]:
+    """Rotation from OpenCV to OpenGL camera axes, and its own inverse."""
+    return torch.diag(like.new_tensor([1.0, -1.0, -1.0]))
+
+
+def env_from_obj(T_cam_obj: SE3, light: Light) -> Float[Tensor, "*b 3 3"]:
+    """`R_env_obj` of any poses: what the word `light` means; rotation only, because the light is far away (eq. 3)."""
+    R_cam_obj = T_cam_obj.rotation.matrix()
+    if light == "camera":
+        return opengl_from_opencv(R_cam_obj) @ R_cam_obj
+    return torch.eye(3, dtype=R_cam_obj.dtype, device=R_cam_obj.device).expand_as(R_cam_obj)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Object pose per frame, and the frame in which the environment does not move."""
+
+    T_cam_obj: SE3
+    """Object to camera (OpenCV axes), one per frame [object radius]."""
+    light: Light
+    """Hand-held and turntable captures: "camera". Static dome: "object"."""
+
+    @staticmethod
+    def from_camera_to_object(matrices: Float[Tensor, "t 4 4"], light: Light) -> "Trajectory":
+        """From the `transform_matrix` of format.md: camera to object, OpenGL camera axes."""
+        T_obj_gl = SE3.from_matrix(matrices)
+        T_gl_cam = SE3.from_rotation_matrix(opengl_from_opencv(matrices))
+        return Trajectory((T_obj_gl @ T_gl_cam).inverse(), light)
+
+    def camera_to_object(self) -> Float[Tensor, "t 4 4"]:
+        """The `transform_matrix` of format.md: camera to object, OpenGL camera axes."""
+        T_cam_gl = SE3.from_rotation_matrix(opengl_from_opencv(self.T_cam_obj.xyz))
+        return (self.T_cam_obj.inverse() @ T_cam_gl).matrix()
+
+    @property
+    def R_env_obj(self) -> Float[Tensor, "t 3 3"]:
+        """Object to environment; rotation only, because the light is far away (eq. 3)."""
+        return env_from_obj(self.T_cam_obj, self.light)
+
+    @property
+    def camera_positions(self) -> Float[Tensor, "t 3"]:
+        """Where the camera stands, object frame [object radius]."""
+        return self.T_cam_obj.inverse().xyz
+
+    def __len__(self) -> int:
+        return self.T_cam_obj.xyz.shape[0]
+
+    def select(self, frames: Sequence[int] | Tensor) -> "Trajectory":
+        """The poses of some frames, in the order given."""
+        index = torch.as_tensor(frames, dtype=torch.long, device=self.T_cam_obj.xyz.device)
+        return Trajectory(self.T_cam_obj[index], self.light)
