@@ -15,18 +15,16 @@ from jaxtyping import Float
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from tumble import pipeline
+from tumble.actions import finished
 from tumble.datasets import which
-from tumble.engine.run import source
+from tumble.engine import run as runs
 from tumble.evaluation import metrics
-from tumble.export.confidence import confidence
+from tumble.export import confidence_of
 from tumble.io import files
-from tumble.maths.images import srgb_from_linear
-from tumble.rendering.gbuffer import buffers_of
-from tumble.rendering.rasterize import rasterize
-from tumble.report import figures
-from tumble.scene.asset import Asset
-from tumble.scene.capture import OBJECT, Truth
+from tumble.maths import srgb_from_linear
+from tumble.rendering import buffers_of, rasterize
+from tumble.report import small_camera
+from tumble.scene import OBJECT, Asset, Truth
 
 COUNTS = ("views", "lights", "halves")
 """Fields of `Confidence`."""
@@ -41,8 +39,8 @@ def main() -> None:
     for run, capture in zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True):
         truth = which(capture).load_truth(capture)
         assert truth is not None, f"{capture} has no truth"
-        assert source(run).name == capture.name, "another capture's run"
-        pixels.append(counted(pipeline.finished(run), truth))
+        assert runs.source(run).name == capture.name, "another capture's run"
+        pixels.append(counted(finished(run), truth))
         rows.append({"capture": capture.name, **correlations(pixels[-1])})
         print(rows[-1], flush=True)
     if len(pixels) > 1:
@@ -56,7 +54,7 @@ def counted(asset: Asset, truth: Truth) -> Float[Tensor, "m 4"]:
     """Per pixel that both cover: the error of the albedo, and the counts."""
     assert truth.albedo is not None, "a capture with true albedo"
     assert truth.trajectory is not None, "a capture with evaluation views"
-    seen, n = confidence(asset, figures.small(asset.camera)), len(asset.gaussians)
+    seen, n = confidence_of(asset, small_camera(asset.camera)), len(asset.gaussians)
     counts = torch.stack([getattr(seen, name) for name in COUNTS], -1)[:, None].expand(n, 4, len(COUNTS))
     albedo, rendered, solid = [], [], []
     for i in range(len(truth)):

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels import machine
-from tumble.engine.run import records
+from tumble.actions import evaluate_run
+from tumble.engine import run as runs
 from tumble.io import files
-from tumble.pipeline import evaluate_run, reconstruct
+from tumble.pipeline import reconstruct
 from tumble.recipes import ABLATIONS, QUALITIES, Recipe
-from tumble.synthetic.synthesize import NOTE
+from tumble.synthetic import NOTE
 
 KEPT = (
     "albedo.psnr_fg_srgb",
@@ -73,9 +74,9 @@ def changed(recipe: Any, name: str, value: object) -> Any:
 def measure(capture: Path, run: Path, recipe: Recipe, about: dict[str, Any]) -> dict[str, Any]:
     """One row: reconstruct if need be, predict, score."""
     reconstruct(capture, run, recipe)
-    seconds = sum({r["name"]: r["seconds"] for r in records(run) if r.get("event") == "done"}.values())
+    seconds = sum({r["name"]: r["seconds"] for r in runs.records(run) if r.get("event") == "done"}.values())
     begun = time.perf_counter()
-    report = evaluate_run(run, capture, run)
+    report = evaluate_run(run, capture)
     note = files.read_json(capture / NOTE)
     regions = {
         region: {key: round(scores[key], 4) for key in KEPT if key in scores}

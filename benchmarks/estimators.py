@@ -16,11 +16,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tumble.maths.directions import fibonacci_sphere, random_rotation
-from tumble.rendering.prefilter import prefilter
-from tumble.rendering.shade import Surface, shade, shade_split
-from tumble.rendering.trace import open_sky
-from tumble.scene.environment import Environment
+from tumble.maths import fibonacci_sphere, random_rotation
+from tumble.rendering import Surface, open_sky, prefilter, shade, shade_split
+from tumble.scene import Environment
 
 ROUGHNESS = (0.1, 0.2, 0.3, 0.5, 0.8)
 DIRECTIONS, TURNS, POINTS = 256, 32, 800

@@ -19,14 +19,12 @@ from benchmarks.kernels import machine
 from benchmarks.pose_captures import OTHERS, TEXTURED, Case, load
 from benchmarks.poses import against, table
 from tumble import matching
-from tumble.engine.loop import drive
+from tumble.engine import drive
 from tumble.io import files
-from tumble.poses.frame_pairs import neighbours
-from tumble.poses.sfm import observations, stage
+from tumble.poses import neighbours
+from tumble.poses.sfm import stage
 from tumble.recipes import DRAFT
-from tumble.scene.capture import Capture
-from tumble.scene.match import Match
-from tumble.scene.trajectory import Trajectory
+from tumble.scene import Capture, Match, Trajectory
 
 COMMAND = "python -m benchmarks.focal FOLDER"
 CASES = (Case(TEXTURED[1]), Case(TEXTURED[0]), Case(OTHERS[0]))
@@ -73,7 +71,7 @@ def measure(
 ) -> Row:
     """Stage 1 with the true focal length times a factor, which stays as it is unless it is called a guess."""
     told = replace(capture, camera=capture.camera.zoomed(factor), focal_guessed=guess)
-    tracked = drive(stage, POSES, stage.gather(told, matches), seed=0)
+    tracked = drive(stage, POSES, stage.gather(told, matches, "mixed"), seed=0)
     scores = {} if truth is None else against(tracked.trajectory, truth)
     return {
         "capture": case.name,
@@ -82,27 +80,27 @@ def measure(
         "found": round(float(tracked.camera.fx_fy_cx_cy[0] / capture.camera.fx_fy_cx_cy[0]), 3),
         "median [deg]": round(scores["rotation_median_degrees"], 2) if scores else "",
         "AUC_ATE [%]": round(scores["auc_percent"], 1) if scores else "",
-        "health says [deg]": round(float(torch.rad2deg(torch.tensor(tracked.health.uncertainty))), 2),
-        "verdict": tracked.health.verdict,
+        "health says [deg]": round(float(torch.rad2deg(torch.tensor(tracked.quality.uncertainty))), 2),
+        "verdict": tracked.quality.verdict,
     }
 
 
 @torch.no_grad()
 def curve(case: Case, capture: Capture, matches: Sequence[Match]) -> Row:
     """The loss per observation of all frames adjusted anew at other focal lengths [pixels^2]."""
-    inputs = stage.gather(capture, matches)
+    inputs = stage.gather(capture, matches, "mixed")
     state = stage.init(POSES, inputs, torch.Generator().manual_seed(0))
     for state.step in range(stage.length(POSES, inputs)):
         stage.step(POSES, inputs, state)
     row: Row = {"capture": case.name}
     found = state.params
     for factor in CURVE:
-        seen = observations.through(inputs, torch.tensor(factor).log())
+        seen = stage.through(inputs, torch.tensor(factor).log())
         t = found.t / torch.tensor([factor, factor, 1.0])
         alone = stage.State(0, replace(found, t=t), None, torch.Generator(), state.memory)
         for scale in SETTLING:
             alone.rng.manual_seed(0)
-            alone.params, said = stage._whole(POSES, seen, alone, scale)
+            alone.params, said = stage.adjust_all(POSES, seen, alone, scale)
         row[str(factor)] = round(float(said["loss"]), 4)
     return row
 

@@ -29,15 +29,14 @@ import torch
 
 from benchmarks import kernels
 from tumble import backends, demo
-from tumble.datasets import _capture_folder, folder
+from tumble.datasets import folder, save_capture
 from tumble.engine import loop, run
-from tumble.evaluation import evaluate, render_prediction
+from tumble.evaluation import align_views, predict_views, read_subject, score
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files, tree
 from tumble.pipeline import reconstruct
 from tumble.recipes import DRAFT, STANDARD, Recipe, known_poses
-from tumble.scene.asset import Asset
-from tumble.scene.capture import Capture, Truth
+from tumble.scene import Asset, Capture, Truth
 
 GPU = torch.device("cuda")
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (100_000, 256), (100_000, 512), (100_000, 1024)]
@@ -153,13 +152,13 @@ def measured(path: Path, out: Path, recipe: Recipe, device: torch.device | str) 
 
 def scored(path: Path, asset: Asset, where: Path, recipe: Recipe) -> dict[str, float]:
     """Scores of the views of region shared; pictures are drawn on the GPU."""
-    known = evaluate.subject(path)
+    known = read_subject(path)
     there = tree.to(asset, GPU)
     capture, truth = tree.to(known.capture, GPU), tree.to(known.truth, GPU)
-    alignment, _ = render_prediction.aligned(there.trajectory, capture.names, capture, truth, given=True)
-    answer = render_prediction.predict(recipe.relight, there, capture, truth, alignment, names=capture.names)
+    alignment, _ = align_views(there.trajectory, capture.names, capture, truth, given=True)
+    answer = predict_views(recipe.relight, there, capture, truth, alignment, names=capture.names)
     tree.to(answer, "cpu").write(where)
-    scores = evaluate.run(where, known, where)["regions"]["shared"]
+    scores = score(where, known, where)["regions"]["shared"]
     return {key: round(scores[key], 3) for key in SCORES if scores.get(key) is not None}
 
 
@@ -235,7 +234,7 @@ def posed_clip(out: Path) -> Path:
         bare = demo.unpack(out.with_name("bare"))
         capture, truth = folder.load(bare), folder.load_truth(bare)
         assert truth is not None
-        _capture_folder.save(out, with_poses(capture, truth), truth, setting="handheld")
+        save_capture(out, with_poses(capture, truth), truth, setting="handheld")
     return out
 
 

@@ -21,12 +21,13 @@ import numpy as np
 
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import DATA
-from tumble import pipeline
 from tumble.datasets import folder
+from tumble.engine import run as runs
 from tumble.io import files
-from tumble.preprocess.survey import Options as FilmOptions
-from tumble.scene.capture import OBJECT
-from tumble.synthetic.synthesize import Options, synthesize
+from tumble.poses import PoseResult
+from tumble.preprocess import FootageOptions
+from tumble.scene import OBJECT
+from tumble.synthetic import SynthOptions, render_capture
 
 OBJECTS = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "chess_Knight")
 LIGHT, OTHERS = "immenstadter_horn", ("forest_slope", "studio_small_03")
@@ -67,7 +68,7 @@ def main() -> None:
 
 def filmed(model: str, root: Path, smoke: bool) -> Path:
     """A pose-free capture with its clip; rendered where it is not there yet."""
-    options = Options(
+    options = SynthOptions(
         env=hdri(LIGHT),
         relight=tuple(map(hdri, OTHERS)),
         views=48 if smoke else 120,
@@ -80,7 +81,7 @@ def filmed(model: str, root: Path, smoke: bool) -> Path:
         pose_free=True,
         video=True,
     )
-    return synthesize(DATA / "meshes" / f"{model}.glb", root / model, options)
+    return render_capture(DATA / "meshes" / f"{model}.glb", root / model, options)
 
 
 def hdri(name: str) -> str:
@@ -97,22 +98,22 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
     row |= {"check": "GO" if checked["exit"] == 0 else "NO-GO", "check_seconds": checked["seconds"]}
     made = tumble("run", *clip, "-o", str(run), "--quality", quality)
     row |= {"run_exit": made["exit"], "run_seconds": made["seconds"], "run_memory_MiB": made["memory_MiB"]}
-    health = pipeline.health(run)
-    if health is not None:
-        row |= {"verdict": health.verdict, "verdict_sentence": health.sentence}
+    tracked = runs.output(run, runs.TRACK, PoseResult)
+    if tracked is not None:
+        row |= {"verdict": tracked.quality.verdict, "verdict_sentence": tracked.quality.sentence}
     if made["exit"] != 0:
         row["said"] = made["said"].replace(str(run), "RUN")
     else:
         scored = tumble("evaluate", str(run), str(capture))
         row |= {"score_exit": scored["exit"], "score_seconds": scored["seconds"]}
         found = files.read_json(run / "report.json") if scored["exit"] == 0 else {"regions": {}, "poses": {}}
-        row |= {"kept": len(files.read_json(run / pipeline.POSES)), **found["regions"], "poses": found["poses"]}
+        row |= {"kept": len(files.read_json(run / runs.POSES)), **found["regions"], "poses": found["poses"]}
     return row
 
 
 def box(capture: Path) -> list[int]:
     """What a person would draw on the first frame: left, top, width, height."""
-    shown = folder.load(capture).masks[FilmOptions().at].numpy() == OBJECT
+    shown = folder.load(capture).masks[FootageOptions().at].numpy() == OBJECT
     rows, columns = np.nonzero(shown)
     low = max(int(columns.min()) - ROOM, 0), max(int(rows.min()) - ROOM, 0)
     high = min(int(columns.max()) + 1 + ROOM, shown.shape[1]), min(int(rows.max()) + 1 + ROOM, shown.shape[0])

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble import backends
-from tumble.backends import Backend, _native
+from tumble.backends import Backend
 from tumble.inverse_rendering import losses
 
 RUNS = 9
@@ -188,7 +188,7 @@ def machine() -> dict[str, Any]:
     """What a number depends on."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
     return {
-        "class": f"{os.cpu_count()}-core {platform.machine()} CPU, {32 * _native.library().lanes()}-bit vectors",
+        "class": f"{os.cpu_count()}-core {platform.machine()} CPU, {backends.vector_bits()}-bit vectors",
         "torch": torch.__version__,
         "load": round(load, 1),
         "peak_memory_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,

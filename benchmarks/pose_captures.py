@@ -14,10 +14,9 @@ import torch
 
 from tumble.datasets import folder
 from tumble.io import files
-from tumble.maths.images import linear_from_srgb, srgb_from_linear
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
-from tumble.scene.trajectory import Trajectory
-from tumble.synthetic.synthesize import Options, synthesize
+from tumble.maths import linear_from_srgb, srgb_from_linear
+from tumble.scene import BACKGROUND, OBJECT, Capture, Trajectory
+from tumble.synthetic import SynthOptions, render_capture
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TEXTURED = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "ycb_005_tomato_soup_can")
@@ -72,7 +71,7 @@ def made(case: Case, root: Path) -> Path:
         model = root / f"{case.model}.glb"
         if not model.exists():
             files.write_whole(model, lambda partial: partial.write_bytes(bare(case.model)))
-    options = Options(
+    options = SynthOptions(
         env=str(DATA / "hdri" / f"{case.light}_1k.hdr"),
         setting=case.setting,  # type: ignore[arg-type]
         views=FRAMES,
@@ -85,7 +84,7 @@ def made(case: Case, root: Path) -> Path:
         pose_free=True,
         seed=case.seed,
     )
-    return synthesize(model, root / case.folder, options)
+    return render_capture(model, root / case.folder, options)
 
 
 # What is odd ----------------------------------------------------------------------------------------------------------

@@ -19,17 +19,15 @@ from typing import Any
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import COMPARED, FRAMES, LARGE, ODD, OTHERS, PLAIN, TEXTURED, Case, load
 from tumble import matching
-from tumble.engine.loop import drive
+from tumble.engine import drive
 from tumble.evaluation import metrics
 from tumble.inverse_rendering import refine
 from tumble.io import files
-from tumble.poses.frame_pairs import neighbours
+from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as graph
-from tumble.poses.sfm.finalize import Tracked
 from tumble.recipes import DRAFT, progressive_poses
-from tumble.scene.capture import Capture
-from tumble.scene.trajectory import Trajectory
+from tumble.scene import Capture, Trajectory
 
 COMMAND = "python -m benchmarks.poses FOLDER [--only WORD..., --route progressive, --refined]"
 TOLERANCE = 0.1
@@ -85,12 +83,12 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     matches = matching.match_pairs(matching.views_of(capture), neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()
     if route == "graph":
-        tracked = drive(graph, DRAFT.track, graph.gather(capture, matches), seed=0)
+        tracked = drive(graph, DRAFT.track, graph.gather(capture, matches, "mixed"), seed=0)
     else:
         recipe = progressive_poses(DRAFT)
         tracked = drive(progressive, recipe.track, progressive.gather(capture, matches), seed=0)
     seconds = time.perf_counter() - begun
-    health = tracked.health
+    health = tracked.quality
     return {
         "name": case.name,
         "route": route,
@@ -107,21 +105,21 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     }
 
 
-def scores(tracked: Tracked, truth: Trajectory) -> dict[str, float]:
+def scores(tracked: PoseResult, truth: Trajectory) -> dict[str, float]:
     """Against the true poses, of all frames, and of those that are not lost."""
     found = tracked.trajectory
     values = against(found, truth)
-    kept = (~tracked.health.lost).nonzero()[:, 0]
+    kept = (~tracked.quality.lost).nonzero()[:, 0]
     if len(kept):
         those = metrics.rotation_scores(found.select(kept), truth.select(kept))
         values |= {f"kept_{name}": value for name, value in those.items()}
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def after_stage_2(tracked: Tracked, capture: Capture, truth: Trajectory) -> dict[str, float]:
+def after_stage_2(tracked: PoseResult, capture: Capture, truth: Trajectory) -> dict[str, float]:
     """The same of the poses that the draft recipe's stage 2 makes of these, of the frames that are not lost."""
     begun = time.perf_counter()
-    kept = (~tracked.health.lost).nonzero()[:, 0]
+    kept = (~tracked.quality.lost).nonzero()[:, 0]
     inputs = refine.Inputs(capture.select(kept.tolist()), tracked.trajectory.select(kept))
     found = drive(refine, DRAFT.refine, inputs, seed=0).trajectory
     values = against(found, truth.select(kept)) | {"seconds": time.perf_counter() - begun}

@@ -21,19 +21,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tests import devtools
-from tumble import pipeline
-from tumble.engine.run import RECIPE
+from tumble.actions import finished
+from tumble.engine import run as runs
 from tumble.evaluation import metrics
 from tumble.io import files
-from tumble.maths.directions import texel_directions
-from tumble.maths.images import srgb_from_linear
-from tumble.maths.se3 import SE3, SO3
-from tumble.rendering import relight
-from tumble.rendering.gbuffer import buffers_of
-from tumble.scene.asset import Asset
-from tumble.scene.camera import Camera
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import Trajectory, opengl_from_opencv
+from tumble.maths import SE3, SO3, srgb_from_linear, texel_directions
+from tumble.rendering import buffers_of, relight
+from tumble.scene import Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
 SPOT = (0.8, 0.5, 0.4)
 """Camera axes: x right, y up, z to the viewer."""
@@ -55,8 +49,8 @@ def main() -> None:
     lights = {name: read_light(part(page, name)) for name in ("recovered", "studio", "overcast", "sunset")}
     lights["spot"] = spot()
     shown = panel(arguments.run / "report.html", lights["spot"])
-    asset = pipeline.finished(arguments.run)
-    cfg = relight.Config(**files.read_json(arguments.run / RECIPE)["recipe"]["relight"])
+    asset = finished(arguments.run)
+    cfg = relight.Config(**runs.recipe(arguments.run)["relight"])
     reference, rows = strength(lights["recovered"]), {}
     for name, picture in shown.items():
         trajectory, camera = start_view(page, *picture.shape[:2])

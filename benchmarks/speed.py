@@ -23,15 +23,14 @@ from torch import Tensor
 from benchmarks.kernels import machine
 from benchmarks.swap import albedo_psnr
 from tumble.datasets import folder
-from tumble.engine import optim
-from tumble.engine.loop import State
+from tumble.engine import State, optim
 from tumble.evaluation import metrics
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files
-from tumble.maths.images import srgb_from_linear
+from tumble.maths import srgb_from_linear
 from tumble.recipes import DRAFT, known_poses
-from tumble.rendering.rasterize import rasterize
-from tumble.scene.capture import Capture, Truth
+from tumble.rendering import rasterize
+from tumble.scene import Capture, Truth
 
 EVERY = 10.0
 """Seconds of work between two looks."""

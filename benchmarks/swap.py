@@ -27,20 +27,14 @@ from torch.nn.functional import normalize
 
 from benchmarks.kernels import machine
 from tumble.datasets import folder
-from tumble.engine import loop
-from tumble.engine.loop import State
+from tumble.engine import State, loop
 from tumble.evaluation import metrics
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files
-from tumble.maths.images import srgb_from_linear
+from tumble.maths import srgb_from_linear
 from tumble.recipes import DRAFT, known_poses
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.gbuffer import antialiased
-from tumble.scene import visual_hull
-from tumble.scene.asset import Asset
-from tumble.scene.capture import Capture
-from tumble.scene.environment import Environment
-from tumble.scene.material import TEMPERATURE
+from tumble.rendering import Buffers, antialiased
+from tumble.scene import TEMPERATURE, Asset, Capture, Environment, visual_hull
 
 GIVEN = ("nothing", "roughness", "light", "both", "geometry", "all")
 ROWS = 32
@@ -119,7 +113,8 @@ def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
 
     cfg = known_poses(DRAFT).refine
     rates = replace(cfg.rates, means=0.0, quats=0.0, sdf=0.0)
-    cfg = replace(cfg, points=cfg.limit, limit=cfg.limit, every=cfg.steps, rates=rates)
+    growth = cfg.densification
+    cfg = replace(cfg, points=growth.max_gaussians, densification=replace(growth, refine_every=cfg.steps), rates=rates)
     with patch.object(visual_hull, "surface", surface):
         return loop.drive(refine, cfg, refine.Inputs(capture, _known(capture)), seed=0)
 

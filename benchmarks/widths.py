@@ -13,7 +13,6 @@ import torch
 from benchmarks import of_runs
 from tumble.datasets import folder
 from tumble.inverse_rendering import decompose, refine, specular_fit
-from tumble.inverse_rendering.specular_fit import ROUGHNESS, STRENGTHS, Samples
 from tumble.io import tree
 from tumble.recipes import DRAFT
 
@@ -25,11 +24,11 @@ class Found(Exception):
 def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
     """What is left over at each width, and as stage 2 left it."""
 
-    def compare(samples: Samples, n: int, which: int, strength: float) -> None:
+    def compare(samples: specular_fit.Samples, n: int, which: int, strength: float) -> None:
         def left(width: int, strength: float) -> float:
             return round(1000 * float(specular_fit.left_over(samples, samples.specular[width], strength, n, 0.0)[0]), 3)
 
-        widths = {str(r): min(left(i, s) for s in STRENGTHS) for i, r in enumerate(ROUGHNESS)}
+        widths = {str(r): min(left(i, s) for s in specular_fit.STRENGTHS) for i, r in enumerate(specular_fit.ROUGHNESS)}
         raise Found({"as_stage_2": left(which, strength), "by_roughness": widths})
 
     refined = tree.load(refine.Refined, run / "2-refine" / "out.safetensors")

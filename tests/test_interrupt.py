@@ -25,18 +25,18 @@ import torch
 from tests.engine.test_loop import full_disk
 from tests.films import scene, written
 from tests.scene.test_visual_hull import silhouettes
-from tumble import pipeline, recipes
+from tumble import actions, pipeline, recipes
 from tumble.datasets import _capture_folder, folder
 from tumble.engine import run
 from tumble.io import files, video
 from tumble.io.files import BadFile
-from tumble.preprocess.survey import Options
+from tumble.preprocess.options import FootageOptions
 from tumble.scene.capture import OBJECT, Capture
 from tumble.scene.environment import Environment
 
 RECIPE = dataclasses.replace(recipes.SMOKE, seed=3)
 RANDOM = random.Random(0)
-FILM_OPTIONS = Options(box=scene().box(), focal=300.0, frames=16)
+FILM_OPTIONS = FootageOptions(box=scene().box(), focal=300.0, frames=16)
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.chmod", "tempfile.mkstemp", "tempfile.mkdtemp"}
 """Events of `sys.addaudithook` that come right before the file system changes; and "open" for writing."""
 
@@ -117,7 +117,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     images = torch.where(frames.masks[..., None] == OBJECT, shade, 0).to(torch.uint8).repeat(1, 1, 1, 3)
     taken = Capture(images, frames.masks, frames.camera, frames.names, "camera", trajectory)
     path = tmp_path_factory.mktemp("capture") / "c"
-    _capture_folder.save(path, taken)
+    _capture_folder.save_capture(path, taken)
     return path
 
 
@@ -233,7 +233,7 @@ def test_a_damaged_output_is_named_with_the_fix_and_the_fix_works(
     shutil.copytree(whole, out)
     with (out / name).open("r+b") as file:
         file.truncate((out / name).stat().st_size // 2)
-    read = (lambda: pipeline.finished(out)) if name == pipeline.ASSET else None
+    read = (lambda: actions.finished(out)) if name == run.ASSET else None
     with pytest.raises(BadFile, match=rf"{name}: is damaged: .*\(remove it, and give the command that made it again\)"):
         read() if read else pipeline.reconstruct(capture, out, RECIPE)
     (out / name).unlink()
@@ -258,10 +258,10 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
     Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
     before = finished_run(whole)
     with full_disk(100), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
-        pipeline.relight_run(whole, light, tmp_path / "pictures", fast=True)
+        actions.relight_run(whole, light, tmp_path / "pictures", fast=True)
     assert list((tmp_path / "pictures").iterdir()) == []
     with full_disk(3000), pytest.raises(OSError, match=r"asset\.ply: cannot be written"):
-        pipeline.export_run(whole, tmp_path / "export", "splat", None)
+        actions.export_run(whole, tmp_path / "export", "splat", None)
     for name, write in (("x.exr", files.write_exr), ("x.hdr", files.write_hdr)):
         with full_disk(100), pytest.raises(OSError, match=rf"{name}: cannot be written: .*(too large|full)"):
             write(tmp_path / name, torch.rand(8, 16, 3).numpy())
@@ -297,9 +297,9 @@ def test_a_folder_of_pictures_is_footage_unless_it_is_a_capture(capture: Path, t
     for i in range(6):
         alpha = np.where(scene().object[i], 255, 0).astype(np.uint8)
         files.write_png(tmp_path / "in" / f"{i}.png", np.dstack([scene().pictures[i], alpha]))
-    made = pipeline.ingested(tmp_path / "in", tmp_path / "run", Options(fov=40.0))
+    made = pipeline.ingested(tmp_path / "in", tmp_path / "run", FootageOptions(fov=40.0))
     assert len(folder.load(made)) == 6
-    assert pipeline.ingested(capture, tmp_path / "other", Options()) == capture
+    assert pipeline.ingested(capture, tmp_path / "other", FootageOptions()) == capture
     assert not (tmp_path / "other").exists()
 
 
@@ -309,9 +309,9 @@ def test_lights_of_the_same_name_get_folders_of_their_own(whole: Path, tmp_path:
     lights = [tmp_path / name / "studio.hdr" for name in ("a", "b")]
     for light in lights:
         Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
-    folders = [pipeline.relight_run(out, light, fast=True) for light in (*lights, lights[0])]
+    folders = [actions.relight_run(out, light, fast=True) for light in (*lights, lights[0])]
     assert [path.name for path in folders] == ["studio", "studio-2", "studio"]
     dark = files.read_picture(folders[0] / "0000.png").mean()
-    pipeline.relight_run(out, lights[0], fast=True, exposure=1.0)
+    actions.relight_run(out, lights[0], fast=True, exposure=1.0)
     bright = files.read_picture(folders[0] / "0000.png").mean()
     assert bright > 1.2 * dark

@@ -13,11 +13,10 @@ import torch
 from tests.lopsided import truth, tumbling
 from tests.poses.sfm.test_stage import QUICK, matches
 from tests.scene.test_visual_hull import silhouettes
-from tumble import matching, pipeline, recipes
+from tumble import actions, matching, pipeline, recipes
 from tumble.datasets import _capture_folder, folder
 from tumble.engine import loop
 from tumble.engine import run as runs
-from tumble.evaluation import evaluate
 from tumble.inverse_rendering import decompose, mean_colour_baseline, refine, specular_fit
 from tumble.io import files, tree, video
 from tumble.io.files import BadFile
@@ -54,7 +53,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
         poses=trajectory.select(train),
     )
     path = tmp_path_factory.mktemp("capture") / "c"
-    _capture_folder.save(path, taken, truth, setting="handheld")
+    _capture_folder.save_capture(path, taken, truth, setting="handheld")
     return path
 
 
@@ -116,7 +115,7 @@ def test_steps_on_a_gpu_are_those_of_the_cpu(capture: Path, finished: tuple[Path
         pytest.skip("needs an NVIDIA GPU")
     taken = folder.load(capture)
     cfg = recipes.known_poses(RECIPE)
-    refined = tree.load(refine.Refined, finished[0] / "2-refine" / runs.OUT)
+    refined = tree.load(refine.Refined, finished[0] / runs.REFINE / runs.OUT)
     second, third = refine.Inputs(taken, taken.trajectory), decompose.Inputs(taken, refined)
     inputs, settings = (second, cfg.refine) if stage is refine else (third, cfg.decompose)
 
@@ -155,8 +154,7 @@ def test_finished_stages_are_not_run_again(
 
 
 def test_a_run_is_scored_with_known_poses_as_they_are(finished: tuple[Path, Asset], capture: Path) -> None:
-    prediction = pipeline.predict_run(finished[0], capture)
-    report = evaluate.run(prediction, capture, finished[0])
+    report = actions.evaluate_run(finished[0], capture)
     assert set(report["regions"]) == {"shared", "sphere"}
     shared = report["regions"]["shared"]
     for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_full_srgb", "normal.mean_fg_degrees"):
@@ -181,13 +179,13 @@ def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
     loads: list[Path] = []
     load = folder.load
     monkeypatch.setattr(folder, "load", lambda path: loads.append(path) or load(path))
-    free = pipeline.evaluate_run(run, bare, run)
+    free = actions.evaluate_run(run, bare, run)
     assert loads == [bare], "a capture is read once"
-    given = pipeline.evaluate_run(run, capture, run)
+    given = actions.evaluate_run(run, capture, run)
     assert "rotation alone" in free["notes"][0]
     assert "poses were given" in given["notes"][0]
-    (run / "1-track").mkdir()
-    found = pipeline.evaluate_run(run, capture, run)
+    (run / runs.TRACK).mkdir()
+    found = actions.evaluate_run(run, capture, run)
     assert "rotation alone" in found["notes"][0], "a run that estimated poses has a frame of its own"
     for region, scores in given["regions"].items():
         for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_fg_srgb"):
@@ -202,8 +200,10 @@ def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monke
     scene = tumbling(16, size=96, points=150)
     true = scene.capture.camera
     guess = dataclasses.replace(scene.capture, camera=true.zoomed(0.8), focal_guessed=True)
-    _capture_folder.save(tmp_path / "guess", guess)
-    _capture_folder.save(tmp_path / "true", scene.capture, dataclasses.replace(no_views(true), poses=truth(scene)))
+    _capture_folder.save_capture(tmp_path / "guess", guess)
+    _capture_folder.save_capture(
+        tmp_path / "true", scene.capture, dataclasses.replace(no_views(true), poses=truth(scene))
+    )
     monkeypatch.setattr(matching, "match_pairs", lambda *_, **__: matches(scene))
     recipe = dataclasses.replace(RECIPE, track=QUICK)
     run = tmp_path / "run"
@@ -216,58 +216,59 @@ def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monke
     assert_same(pipeline.reconstruct(tmp_path / "guess", run, recipe, poses="estimate"), asset)
     # Scored through the true camera: a folder, a film, a window of a film, a film whose lens is known.
     ratio = float(true.fx_fy_cx_cy[0]) / focal
-    report = pipeline.evaluate_run(run, tmp_path / "true", run)
+    report = actions.evaluate_run(run, tmp_path / "true", run)
     assert f"depths times {ratio:.4g}" in report["notes"][0]
     note = {"focal_source": "guess", "window_top_left_height_width": [0, 0, 192, 192], "frames": []}
-    assert pipeline._lens(run, asset, guess) == pytest.approx(begun / focal)
+    assert actions._lens(run, asset, guess) == pytest.approx(begun / focal)
     files.write_json(run / "capture" / "ingest.json", note)
-    assert pipeline._lens(run, asset, scene.capture) == pytest.approx(ratio)
+    assert actions._lens(run, asset, scene.capture) == pytest.approx(ratio)
     window = dataclasses.replace(asset, camera=asset.camera.resized(192, 192).cropped(20, 30, 120, 100).resized(60, 50))
     files.write_json(run / "capture" / "ingest.json", note | {"window_top_left_height_width": [20, 30, 120, 100]})
-    assert pipeline._lens(run, window, scene.capture) == pytest.approx(ratio)
+    assert actions._lens(run, window, scene.capture) == pytest.approx(ratio)
     files.write_json(run / "capture" / "ingest.json", note | {"focal_source": "given"})
-    assert pipeline._lens(run, asset, scene.capture) == 1
+    assert actions._lens(run, asset, scene.capture) == 1
 
 
 def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Path, tmp_path: Path) -> None:
     """A film of eight frames of which the second to last and the third were kept, and one that the capture lacks."""
     kept = {"0000.png": 6, "0001.png": 2, "0002.png": 8}
-    files.write_json(tmp_path / pipeline.POSES, kept)
+    files.write_json(tmp_path / runs.POSES, kept)
     known = folder.load(capture)
-    assert pipeline.source_names(tmp_path, known) == tuple(kept)
+    assert actions.source_names(tmp_path, known) == tuple(kept)
     said = [{"name": name, "source_frame": number} for name, number in kept.items()]
     files.write_json(tmp_path / "capture" / "ingest.json", {"frames": said})
-    assert pipeline.source_names(tmp_path, known) == (known.names[6], known.names[2], "0002.png")
+    assert actions.source_names(tmp_path, known) == (known.names[6], known.names[2], "0002.png")
     # Pictures with a model have names, not numbers.
     files.write_json(tmp_path / "capture" / "ingest.json", {"frames": [{"name": "0000.png", "source": "a.jpg"}]})
-    assert pipeline.source_names(tmp_path, known) == tuple(kept)
+    assert actions.source_names(tmp_path, known) == tuple(kept)
 
 
 def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = folder.load(capture)
     few = taken.select([0, 1, 2])
-    _capture_folder.save(tmp_path / "few", few)
+    _capture_folder.save_capture(tmp_path / "few", few)
     with pytest.raises(BadFile, match="has 3 frames: too few"):
         pipeline.reconstruct(tmp_path / "few", tmp_path / "run", RECIPE, poses="estimate")
     stage = runs.stage
 
     def loses_one(*arguments: Any) -> Any:
-        tracked = stage(*arguments)
-        lost = torch.arange(len(tracked.health.lost)) == 5
-        return dataclasses.replace(tracked, health=dataclasses.replace(tracked.health, lost=lost))
+        tracked, key = stage(*arguments)
+        lost = torch.arange(len(tracked.quality.lost)) == 5
+        quality = dataclasses.replace(tracked.quality, lost=lost)
+        return dataclasses.replace(tracked, quality=quality), key
 
     monkeypatch.setattr(runs, "stage", loses_one)
     with pytest.raises(BadFile, match="could not be tracked: 1 of 8 frames"):
         pipeline.reconstruct(capture, tmp_path / "lost", RECIPE, poses="estimate")
     with pytest.raises(BadFile, match="finish the run first"):
-        pipeline.predict_run(tmp_path / "nowhere", capture)
+        actions.evaluate_run(tmp_path / "nowhere", capture)
 
 
 @pytest.mark.parametrize("fast", [True, False])
 def test_a_run_can_be_put_under_another_light(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, fast: bool
 ) -> None:
-    pipeline.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
+    actions.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
     pictures = [files.read_picture(path) for path in sorted(tmp_path.iterdir())]
     assert len(pictures) == 8
     assert all(0 < picture.mean() < 255 for picture in pictures)
@@ -277,15 +278,15 @@ def test_a_turning_object_is_in_the_middle_of_its_film(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also of a run whose pictures are a window beside the middle of a film."""
-    monkeypatch.setattr(pipeline, "FILM_FRAMES", 2)
-    monkeypatch.setattr(pipeline, "FILM_SIDE", 64)
+    monkeypatch.setattr(actions, "FILM_FRAMES", 2)
+    monkeypatch.setattr(actions, "FILM_SIDE", 64)
     out = tmp_path / "run"
     shutil.copytree(finished[0], out)
     beside = finished[1].camera.cropped(0, 40, finished[1].camera.height, finished[1].camera.width)
-    tree.save(dataclasses.replace(finished[1], camera=beside), out / pipeline.ASSET)
+    tree.save(dataclasses.replace(finished[1], camera=beside), out / runs.ASSET)
     light = capture / "truth" / "lights" / "sun.hdr"
     for number, run in enumerate((finished[0], out)):
-        pipeline.film_run(run, light, tmp_path / f"{number}.mp4", fast=True)
+        actions.film_run(run, light, tmp_path / f"{number}.mp4", fast=True)
     films = [np.stack(list(video.read_clip(tmp_path / f"{number}.mp4"))) for number in range(2)]
     assert films[0].max() > 60
     assert (films[0] == films[1]).all()

@@ -94,22 +94,22 @@ def test_the_log_becomes_a_line(tmp_path: Path) -> None:
 def test_without_viser_the_way_to_get_it_is_said(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ModuleNotFoundError, match=r"needs viser: pip install 'tumble\[view\]'"):
-        viewer.view(whole, "127.0.0.1", 0)
+        viewer.serve(whole, "127.0.0.1", 0)
 
 
 # With viser -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def window(whole: Path) -> Iterator[viewer.Window]:  # noqa: F811
+def window(whole: Path) -> Iterator[viewer.ViewerWindow]:  # noqa: F811
     pytest.importorskip("viser", reason="needs the extra `view`")
-    opened = viewer.Window(whole, "127.0.0.1", free_port())
+    opened = viewer.ViewerWindow(whole, "127.0.0.1", free_port())
     yield opened
     opened.server.stop()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_page_is_served_and_its_scene_holds_the_run(window: viewer.Window, whole: Path) -> None:  # noqa: F811
+def test_the_page_is_served_and_its_scene_holds_the_run(window: viewer.ViewerWindow, whole: Path) -> None:  # noqa: F811
     with urllib.request.urlopen(window.address) as page:
         assert b"<html" in page.read()
     asset, node = tree.load(Asset, whole / "asset.safetensors"), window.server.scene.get_handle_by_name
@@ -123,7 +123,7 @@ def test_the_page_is_served_and_its_scene_holds_the_run(window: viewer.Window, w
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_choices_change_what_is_shown(window: viewer.Window, whole: Path) -> None:  # noqa: F811
+def test_choices_change_what_is_shown(window: viewer.ViewerWindow, whole: Path) -> None:  # noqa: F811
     node = window.server.scene.get_handle_by_name
     window.map.value = "normals"
     window._object()
@@ -145,4 +145,4 @@ def test_choices_change_what_is_shown(window: viewer.Window, whole: Path) -> Non
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="needs the extra `view`")
     with pytest.raises(BadFile, match="is no run"):
-        viewer.Window(tmp_path, "127.0.0.1", free_port())
+        viewer.ViewerWindow(tmp_path, "127.0.0.1", free_port())

@@ -8,14 +8,15 @@ import shutil
 import tempfile
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
-from tumble import pipeline
+from tumble import actions, pipeline
 from tumble.datasets import folder as capture_folder
-from tumble.engine.run import CAPTURE, alone
+from tumble.engine import run
+from tumble.evaluation import Report
 from tumble.io import files, video
-from tumble.recipes import Recipe
-from tumble.report import page
+from tumble.recipes import DRAFT, Recipe
+from tumble.report import write_report
+from tumble.synthetic import environment, other_environment, write_object
 
 CLIP = "clip.mp4"
 
@@ -38,20 +39,19 @@ def unpack(out: Path) -> Path:
     return out
 
 
-def run(out: Path, recipe: Recipe) -> dict[str, Any]:
+def reconstruct_clip(out: Path, recipe: Recipe = DRAFT) -> tuple[Report, Path]:
     """Reconstruct the bundled clip from its frames and masks alone, score it, and write its report.
 
-    Returns the scores (docs/metrics.md); the page is `out/report.html`.
+    Returns:
+        The scores (docs/metrics.md), and the page.
 
     Raises:
         BadFile: `out` holds something else.
     """
-    with alone(out):
-        folder = unpack(out / CAPTURE)
-    asset = pipeline.reconstruct(folder, out, recipe)
-    scores = pipeline.evaluate_run(out, folder, out)
-    page.write(out, asset, health=pipeline.health(out))
-    return scores
+    with run.alone(out):
+        folder = unpack(out / run.CAPTURE)
+    pipeline.reconstruct(folder, out, recipe)
+    return actions.evaluate_run(out, folder), write_report(out)
 
 
 def build(out: Path = Path("tumble/data/demo")) -> None:
@@ -59,15 +59,14 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
 
     $ python -c "from tumble.demo import build; build()"
     """
-    from tumble.synthetic import demo_object
-    from tumble.synthetic.synthesize import NOTE, Options, synthesize
+    from tumble.synthetic import NOTE, SynthOptions, render_capture
 
     with tempfile.TemporaryDirectory() as folder_name:
         work = Path(folder_name)
-        demo_object.write_object(work / "pot.glb")
-        demo_object.environment().write(work / "room.hdr")
-        demo_object.other_environment().write(work / "sunset.hdr")
-        options = Options(
+        write_object(work / "pot.glb")
+        environment().write(work / "room.hdr")
+        other_environment().write(work / "sunset.hdr")
+        options = SynthOptions(
             env=str(work / "room.hdr"),
             relight=(str(work / "sunset.hdr"),),
             views=96,
@@ -77,7 +76,7 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
             pose_free=True,
             video=True,
         )
-        made = synthesize(work / "pot.glb", work / "capture", options)
+        made = render_capture(work / "pot.glb", work / "capture", options)
         (made / NOTE).unlink()
         for frame in capture_folder.load(made).names:
             (made / "images" / frame).unlink()

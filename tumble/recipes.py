@@ -7,17 +7,9 @@ paper are recipes too.
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tumble.inverse_rendering import mean_colour_baseline
-from tumble.inverse_rendering.decompose import Config as Decompose
-from tumble.inverse_rendering.decompose import Rates as DecomposeRates
-from tumble.inverse_rendering.decompose import Weights as DecomposeWeights
-from tumble.inverse_rendering.refine import Config as Refine
-from tumble.poses.progressive.sdf_field import Sizes
-from tumble.poses.progressive.tracker import Config as Track
-from tumble.poses.progressive.tracker import Rates as TrackRates
-from tumble.poses.progressive.tracker import Weights as TrackWeights
-from tumble.poses.sfm import stage as graph
-from tumble.rendering.relight import Config as Relight
+from tumble import inverse_rendering, rendering
+from tumble.inverse_rendering import densify, mean_colour_baseline
+from tumble.poses import progressive, sfm
 
 
 @dataclass(frozen=True)
@@ -26,13 +18,15 @@ class Recipe:
 
     matcher: str = "mixed"
     """Of pixels between frames, for captures without poses: a file of `matching`."""
-    track: graph.Config | Track = field(default_factory=graph.Config)
+    track: sfm.Config | progressive.Config = field(default_factory=sfm.Config)
     """Stage 1, for captures without poses: by the graph route, or by the paper's (`progressive`)."""
-    refine: Refine = field(default_factory=Refine)
+    refine: inverse_rendering.refine.Config = field(default_factory=inverse_rendering.refine.Config)
     """Its pose rate and realignments count where poses are estimated; known ones stay as they are."""
-    decompose: Decompose | mean_colour_baseline.Config = field(default_factory=Decompose)
+    decompose: inverse_rendering.decompose.Config | mean_colour_baseline.Config = field(
+        default_factory=inverse_rendering.decompose.Config
+    )
     """Of the method, or of the baseline that takes its place."""
-    relight: Relight = field(default_factory=Relight)
+    relight: rendering.relight.Config = field(default_factory=rendering.relight.Config)
     seed: int = 0
     """Of every random draw."""
 
@@ -49,7 +43,7 @@ MASK = 3.0
 """Of stage 3. With geometry joining at once, the chess knight's silhouette has an IoU of 0.989, 0.992, 0.993 and 0.994
 at 0, 1, 3 and 10."""
 
-PAPER = Recipe(refine=Refine(realignments=4))
+PAPER = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
 """The paper moves estimated poses by a network; ours are realigned (docs/method.md)."""
 
 STANDARD = replace(
@@ -61,15 +55,15 @@ STANDARD = replace(
         crease=CREASE,
         rates=replace(PAPER.refine.rates, highlight=0.005),
         points=20_000,
-        limit=60_000,
+        densification=densify.Config(max_gaussians=60_000),
     ),
-    decompose=Decompose(
+    decompose=inverse_rendering.decompose.Config(
         steps=10_000,
         warmup=1_000,
         doublings=3,
         fitted=True,
-        weights=DecomposeWeights(light=0.02, material=0.02, mask=MASK),
-        rates=DecomposeRates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
+        weights=inverse_rendering.decompose.Weights(light=0.02, material=0.02, mask=MASK),
+        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
     ),
 )
 
@@ -82,37 +76,45 @@ DRAFT = replace(
         PAPER.refine,
         steps=3_000,
         points=9_000,
-        limit=16_000,
+        densification=densify.Config(refine_every=300, max_gaussians=16_000),
         hull=96,
-        every=300,
         weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, highlight=0.002),
         crease=CREASE,
         rates=replace(PAPER.refine.rates, highlight=0.02),
         ramp=0.5,
     ),
-    decompose=Decompose(
+    decompose=inverse_rendering.decompose.Config(
         steps=1_000,
         warmup=100,
         directions=256,
         doublings=1,
         fitted=True,
-        weights=DecomposeWeights(light=0.002, material=0.01, mask=MASK),
-        rates=DecomposeRates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
+        weights=inverse_rendering.decompose.Weights(light=0.002, material=0.01, mask=MASK),
+        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
 )
 
 SMOKE = replace(
     DRAFT,
-    refine=replace(DRAFT.refine, steps=30, points=300, limit=400, hull=24, every=10, views=3, realignments=1),
+    refine=replace(
+        DRAFT.refine,
+        steps=30,
+        points=300,
+        densification=densify.Config(refine_every=10, max_gaussians=400, score_views=3),
+        hull=24,
+        realignments=1,
+    ),
     decompose=replace(DRAFT.decompose, steps=10, warmup=5, directions=64, sets=2, pixels=64),
     relight=replace(DRAFT.relight, brdf_samples=16, light_samples=16),
 )
 
-QUICK_TRACK = Track(
+QUICK_TRACK = progressive.Config(
     poses="vectors",
     motion="steady",
-    sizes=Sizes(width=64, depth=4, skip=2, features=32, octaves=4, colour_width=64, colour_depth=2, colour_octaves=2),
+    sizes=progressive.Sizes(
+        width=64, depth=4, skip=2, features=32, octaves=4, colour_width=64, colour_depth=2, colour_octaves=2
+    ),
     samples=16,
     warmup=60,
     pose_steps=30,
@@ -123,8 +125,8 @@ QUICK_TRACK = Track(
     match_share=1.0,
     inside=1.0,
     block=2,
-    weights=TrackWeights(match=0.5),
-    rates=TrackRates(poses=3e-3, poses_decay=0.3, fields=2e-3, sharpness=2e-3, ramp=1),
+    weights=progressive.Weights(match=0.5),
+    rates=progressive.Rates(poses=3e-3, poses_decay=0.3, fields=2e-3, sharpness=2e-3, ramp=1),
 )
 """The progressive route for two CPU cores: its network, rays and steps are a hundredth of the paper's work. So few want
 a heavier match term: the cracker box is 8 degrees off after 99 degrees of turn, at the paper's weight 13."""
@@ -136,7 +138,7 @@ def known_poses(recipe: Recipe) -> Recipe:
     """For captures whose poses are given: they stay as they are."""
     second, third = recipe.refine, recipe.decompose
     second = replace(second, rates=replace(second.rates, poses=0.0), realignments=0)
-    if isinstance(third, Decompose):
+    if isinstance(third, inverse_rendering.decompose.Config):
         third = replace(third, rates=replace(third.rates, poses=0.0))
     return replace(recipe, refine=second, decompose=third)
 
@@ -177,7 +179,7 @@ def no_sdf(recipe: Recipe) -> Recipe:
 def full_light(recipe: Recipe) -> Recipe:
     """Ablation: the light map has its last size from the start."""
     stage = recipe.decompose
-    assert isinstance(stage, Decompose), "an ablation of the method, not of a baseline"
+    assert isinstance(stage, inverse_rendering.decompose.Config), "an ablation of the method, not of a baseline"
     return replace(recipe, decompose=replace(stage, rows=stage.rows * 2**stage.doublings, doublings=0))
 
 
@@ -194,11 +196,13 @@ def descended_highlight(recipe: Recipe) -> Recipe:
 def progressive_poses(recipe: Recipe) -> Recipe:
     """The paper's route of stage 1: a neural field that grows frame by frame. PAPER's numbers take days on a CPU; other
     recipes take a network, rays and steps for minutes."""
-    return replace(recipe, track=Track() if recipe == PAPER else QUICK_TRACK)
+    return replace(recipe, track=progressive.Config() if recipe == PAPER else QUICK_TRACK)
 
 
 def _decomposing(recipe: Recipe, **changes: Any) -> Recipe:
-    assert isinstance(recipe.decompose, Decompose), "an ablation of the method, not of a baseline"
+    assert isinstance(recipe.decompose, inverse_rendering.decompose.Config), (
+        "an ablation of the method, not of a baseline"
+    )
     return replace(recipe, decompose=replace(recipe.decompose, **changes))
 
 

@@ -18,23 +18,13 @@ from torch import Tensor
 
 from tumble.datasets import which
 from tumble.engine import loop, run
-from tumble.export import asset as export
-from tumble.inverse_rendering import decompose
-from tumble.inverse_rendering.refine import Refined
-from tumble.io import tree
-from tumble.io.files import BadFile
-from tumble.maths.directions import texel_directions
-from tumble.maths.images import resize_area, srgb_from_linear
-from tumble.maths.se3 import SO3
-from tumble.pipeline import ASSET
-from tumble.poses.sfm.finalize import Tracked
-from tumble.report import figures
-from tumble.scene.asset import Asset
-from tumble.scene.capture import Capture
-from tumble.scene.environment import Environment
-from tumble.scene.gaussians import Gaussians, opacity
-from tumble.scene.material import Material
-from tumble.scene.trajectory import Trajectory
+from tumble.inverse_rendering import Refined, decompose
+from tumble.io import BadFile, tree
+from tumble.maths import SO3, resize_area, srgb_from_linear, texel_directions
+from tumble.poses import PoseResult
+from tumble.rendering import relight
+from tumble.report import panorama
+from tumble.scene import Asset, Capture, Environment, Gaussians, Material, Trajectory, opacity
 
 SECONDS = 2.0
 """Between two looks at the run."""
@@ -43,11 +33,11 @@ CAMERAS, THUMBNAIL = 48, 96
 SKY, SKY_ROWS, SKY_TEXEL = 12.0, 48, 0.85
 """Radius of the sphere of light, beyond the cameras [object radius], its rows of points, and their size."""
 SOURCES = (
-    ASSET,
-    f"3-decompose/{run.CHECKPOINT}",
-    f"2-refine/{run.OUT}",
-    f"2-refine/{run.CHECKPOINT}",
-    f"1-track/{run.OUT}",
+    run.ASSET,
+    f"{run.DECOMPOSE}/{run.CHECKPOINT}",
+    f"{run.REFINE}/{run.OUT}",
+    f"{run.REFINE}/{run.CHECKPOINT}",
+    f"{run.TRACK}/{run.OUT}",
 )
 """Where geometry is, the latest first."""
 
@@ -77,18 +67,17 @@ def look(out: Path, capture: Capture | None) -> Look:
         BadFile: A file of the run is damaged.
     """
     source = next((name for name in SOURCES if (out / name).is_file()), "")
-    tracked = tree.load(Tracked, out / "1-track" / run.OUT) if (out / "1-track" / run.OUT).is_file() else None
+    tracked = run.output(out, run.TRACK, PoseResult)
     trajectory, names = _frames(tracked, capture)
-    if source == ASSET:
-        asset = tree.load(Asset, out / ASSET)
-        assert asset.material is not None, "an asset with material"
-        lit = torch.stack([torch.from_numpy(export.splats(asset, 1.0)[f"f_dc_{i}"]) for i in range(3)], -1)
-        colours = {"as photographed": 0.5 + export.SH_DC * lit} | _maps(asset.gaussians, asset.material)
+    if source == run.ASSET:
+        asset = run.asset(out, Asset)
+        lit = srgb_from_linear(relight.gaussian_colours(asset)).clamp(0, 1)
+        colours = {"as photographed": lit} | _maps(asset.gaussians, asset.material)
         shown = asset.gaussians, asset.gamma, None, colours, asset.trajectory, names, asset.environment
         return Look("finished", *shown)
-    if source.startswith("3") or source.endswith(f"2-refine/{run.CHECKPOINT}"):
+    if source.endswith(run.CHECKPOINT):
         return replace(_checkpoint(out / source), trajectory=trajectory, names=names)
-    if source.startswith("2"):
+    if source.startswith(run.REFINE):
         refined = tree.load(Refined, out / source)
         colours = {"albedo": srgb_from_linear(refined.albedo)} | _normals(refined.gaussians)
         return Look("stage 2 finished", refined.gaussians, refined.gamma, None, colours, trajectory, names)
@@ -98,12 +87,12 @@ def look(out: Path, capture: Capture | None) -> Look:
     return Look("nothing yet", trajectory=trajectory, names=names)
 
 
-def _frames(tracked: Tracked | None, capture: Capture | None) -> tuple[Trajectory | None, tuple[str, ...]]:
+def _frames(tracked: PoseResult | None, capture: Capture | None) -> tuple[Trajectory | None, tuple[str, ...]]:
     """Poses and names of the frames that are used; those whose pose is lost are left out."""
     names = () if capture is None else capture.names
     if tracked is None:
         return (None if capture is None else capture.trajectory), names
-    kept = torch.where(~tracked.health.lost)[0].tolist()
+    kept = torch.where(~tracked.quality.lost)[0].tolist()
     return tracked.trajectory.select(kept), tuple(names[i] for i in kept) if names else ()
 
 
@@ -150,7 +139,7 @@ def progress(out: Path) -> str:
 # The browser ----------------------------------------------------------------------------------------------------------
 
 
-class Window:
+class ViewerWindow:
     """A server whose page follows a run; a class, because it remembers what the page shows."""
 
     def __init__(self, out: Path, host: str, port: int) -> None:
@@ -186,8 +175,9 @@ class Window:
             self.capture = _capture(self.out)
         if (stamp, self.capture is None) != self.stamp:
             self.stamp = stamp, self.capture is None
-            if self.capture is not None and (self.out / "1-track" / run.OUT).is_file():
-                self.capture = replace(self.capture, camera=tree.load(Tracked, self.out / "1-track" / run.OUT).camera)
+            tracked = run.output(self.out, run.TRACK, PoseResult)
+            if self.capture is not None and tracked is not None:
+                self.capture = replace(self.capture, camera=tracked.camera)
             self.look = look(self.out, self.capture)
             self._cameras()
             self.map.options = tuple(self.look.colours) or ("as photographed",)
@@ -238,8 +228,8 @@ class Window:
     def _light(self) -> None:
         if self.look.environment is None:
             return
-        picture = figures.panorama(self.look.environment, SKY_ROWS)
-        self.panorama.image = figures.panorama(self.look.environment, 96)
+        picture = panorama(self.look.environment, SKY_ROWS)
+        self.panorama.image = panorama(self.look.environment, 96)
         around = SKY * texel_directions(SKY_ROWS, 2 * SKY_ROWS).reshape(-1, 3).numpy()
         self.server.scene.add_point_cloud("/light", around, picture.reshape(-1, 3), point_size=SKY_TEXEL)
 
@@ -255,14 +245,14 @@ class Window:
             light.visible = self.sky.value
 
 
-def view(out: Path, host: str, port: int) -> None:
+def serve(out: Path, host: str, port: int) -> None:
     """Serve a run until Ctrl-C.
 
     Raises:
         ModuleNotFoundError: viser is not installed; says how to.
         BadFile: `out` is no run, or a file of it is damaged.
     """
-    window = Window(out, host, port)
+    window = ViewerWindow(out, host, port)
     print(f"{window.address}   (Ctrl-C ends it; from another machine: ssh -L {port}:localhost:{port} THIS_MACHINE)")
     try:
         with contextlib.suppress(KeyboardInterrupt):

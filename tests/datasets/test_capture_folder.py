@@ -56,7 +56,7 @@ def a_capture() -> tuple[Capture, Truth]:
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    _capture_folder.save(tmp_path / "capture", *a_capture(), setting="handheld")
+    _capture_folder.save_capture(tmp_path / "capture", *a_capture(), setting="handheld")
     return tmp_path / "capture"
 
 
@@ -106,7 +106,7 @@ def test_a_capture_loads_when_its_truth_is_deleted(written: Path) -> None:
 def test_a_pose_free_capture_keeps_its_true_poses_apart(tmp_path: Path) -> None:
     capture, truth = a_capture()
     bare = Capture(capture.images, capture.masks, capture.camera, capture.names, capture.light)
-    _capture_folder.save(tmp_path / "capture", bare, truth)
+    _capture_folder.save_capture(tmp_path / "capture", bare, truth)
     again = folder.load_truth(tmp_path / "capture")
     assert folder.load(tmp_path / "capture").trajectory is None
     assert again is not None
@@ -115,8 +115,8 @@ def test_a_pose_free_capture_keeps_its_true_poses_apart(tmp_path: Path) -> None:
 
 def test_a_guessed_focal_length_stays_one(tmp_path: Path) -> None:
     capture, truth = a_capture()
-    _capture_folder.save(tmp_path / "guess", replace(capture, focal_guessed=True), truth)
-    _capture_folder.save(tmp_path / "known", capture, truth)
+    _capture_folder.save_capture(tmp_path / "guess", replace(capture, focal_guessed=True), truth)
+    _capture_folder.save_capture(tmp_path / "known", capture, truth)
     assert folder.load(tmp_path / "guess").focal_guessed
     assert folder.load(tmp_path / "guess").select([1]).focal_guessed
     assert not folder.load(tmp_path / "known").focal_guessed
@@ -124,7 +124,7 @@ def test_a_guessed_focal_length_stays_one(tmp_path: Path) -> None:
 
 def test_saving_over_a_folder_is_refused(written: Path) -> None:
     with pytest.raises(BadFile, match="is there already"):
-        _capture_folder.save(written, *a_capture())
+        _capture_folder.save_capture(written, *a_capture())
 
 
 # Folders of other tools -----------------------------------------------------------------------------------------------

@@ -18,14 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from tumble import datasets
 from tumble.datasets import _capture_folder, bop, folder, ho3d
-from tumble.engine.run import capture_key
 from tumble.evaluation import evaluate, metrics
 from tumble.evaluation.prediction import Prediction
 from tumble.io import files, plugins
 from tumble.io.files import BadFile
 from tumble.maths.se3 import SE3, SO3
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, no_views
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, content_key, no_views
 from tumble.scene.trajectory import Trajectory
 
 HEIGHT, WIDTH = 96, 128
@@ -160,7 +159,7 @@ def write_folder(root: Path, seed: int = 0) -> Path:
     masks = torch.where(shown, OBJECT, BACKGROUND).to(torch.uint8)
     capture = Capture(images * shown[..., None], masks, camera, ("a.png", "b.png", "c.png"), "camera")
     truth = Truth(**{**vars(no_views(camera)), "poses": Trajectory(T, "camera")})
-    _capture_folder.save(root / "mug", capture, truth)
+    _capture_folder.save_capture(root / "mug", capture, truth)
     return root / "mug"
 
 
@@ -214,7 +213,7 @@ def test_a_reader_is_found_by_its_layout_and_keeps_its_word(name: str, tmp_path:
 def test_a_capture_does_not_depend_on_its_truth(name: str, tmp_path: Path) -> None:
     reader = plugins.named("datasets", name)
     one, other = (LAYOUTS[name](tmp_path / str(seed), seed) for seed in (0, 1))
-    assert capture_key(reader.load(one)) == capture_key(reader.load(other))
+    assert content_key(reader.load(one)) == content_key(reader.load(other))
     a, b = (reader.load_truth(path).poses.T_cam_obj.matrix() for path in (one, other))
     assert (a - b).abs().max() > 0.1
 
@@ -222,14 +221,14 @@ def test_a_capture_does_not_depend_on_its_truth(name: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_poses_in_a_frame_of_their_own_score_full_marks(name: str, tmp_path: Path) -> None:
     path = LAYOUTS[name](tmp_path)
-    known = evaluate.subject(path)
+    known = evaluate.read_subject(path)
     assert known.truth.poses is not None
     names = tuple(known.truth.posed(known.capture))
     other = metrics.Similarity(
         torch.tensor(3.0), SO3.exp(torch.tensor([0.3, 1.0, -2.0])), torch.tensor([1.0, 0.0, 2.0])
     )
     Prediction(poses=other.to_truth(known.truth.poses), pose_names=names).write(tmp_path / "mine")
-    poses = evaluate.run(tmp_path / "mine", known, tmp_path / "out")["poses"]
+    poses = evaluate.score(tmp_path / "mine", known, tmp_path / "out")["poses"]
     assert poses["poses.lost_frames"] == 0
     assert poses["poses.auc_percent"] == pytest.approx(100, abs=0.01)
     assert poses["poses.rpe_translation"] == pytest.approx(0, abs=1e-5)
@@ -321,7 +320,7 @@ def test_a_sequence_without_annotation_has_no_truth(tmp_path: Path) -> None:
         (path / "meta" / f"{i:04}.pkl").write_bytes(b"\x80\x02" + python_2({"camMat": K, "objRot": None}) + b".")
     assert ho3d.load_truth(path) is None
     with pytest.raises(BadFile, match="has no truth to score against"):
-        evaluate.subject(path)
+        evaluate.read_subject(path)
 
 
 def spoil(name: str, content: bytes) -> Callable[[Path], None]:

@@ -18,7 +18,7 @@ from rich.console import Console
 from torch import Tensor
 
 from tumble.engine import loop, optim
-from tumble.engine.loop import Stage, State, drive, fingerprint
+from tumble.engine.loop import Progress, Stage, State, drive, fingerprint
 from tumble.engine.optim import NotFinite
 from tumble.io import files, tree
 from tumble.io.files import BadFile
@@ -26,6 +26,8 @@ from tumble.io.files import BadFile
 # A stage: points that move to a target, are born and die, under a light on a growing grid -----------------------------
 
 VERSION = 1
+NOISE = 0.1
+"""A setting that nobody sets."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     params, optimizer = state.params, state.optimizer
     assert optimizer is not None
-    noise = 0.1 * torch.randn(params.points.shape, generator=state.rng)
+    noise = NOISE * torch.randn(params.points.shape, generator=state.rng)
     away = ((params.points + noise - inputs.target) ** 2).sum(-1)
     loss = params.weight * away.mean() + ((params.light - 1) ** 2).mean() + params.weight**2
     inputs.at.get(state.step, lambda state: None)(state)
@@ -345,23 +347,23 @@ def test_a_checkpoint_of_another_structure_is_refused(tmp_path: Path) -> None:
 
 
 def test_reports_are_few_and_hold_what_a_log_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    records: list[dict[str, Any]] = []
+    records: list[Progress] = []
     drive(THIS, Config(), Inputs(), seed=3, report=records.append, name="toy")
     # Thirty steps of a millisecond: the first and the last.
-    assert (records[0]["step"], records[-1]["step"]) == (1, 30)
+    assert (records[0].step, records[-1].step) == (1, 30)
     assert len(records) < 5
-    assert records[-1]["of"] == 30
-    assert records[-1]["name"] == "toy"
-    assert records[-1]["eta"] == 0
-    assert set(records[-1]["metrics"]) == {"loss", "points"}
+    assert records[-1].of == 30
+    assert records[-1].name == "toy"
+    assert records[-1].eta == 0
+    assert set(records[-1].metrics) == {"loss", "points"}
     monkeypatch.setattr(loop, "REPORT_SECONDS", 0.0)
     records.clear()
     path = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
         drive(THIS, Config(), Inputs(at={9: press_ctrl_c}), seed=3, report=records.append, checkpoint=path)
     drive(THIS, Config(), Inputs(), seed=3, report=records.append, checkpoint=path)
-    assert [record["step"] for record in records] == list(range(1, 31))
-    seconds = [record["seconds"] for record in records]
+    assert [record.step for record in records] == list(range(1, 31))
+    seconds = [record.seconds for record in records]
     assert seconds == sorted(seconds), "the clock of a resumed run goes on"
 
 

@@ -23,7 +23,7 @@ from tumble.io import files
 from tumble.io.files import BadFile
 from tumble.maths.se3 import SE3
 from tumble.scene.camera import Camera
-from tumble.scene.capture import Capture
+from tumble.scene.capture import Capture, content_key
 from tumble.scene.trajectory import Trajectory
 
 
@@ -47,11 +47,10 @@ def counted(steps: Steps, accidents: dict[int, Callable[..., Any]] | None = None
 def pipeline(path: Path, recipe: Recipe, steps: Steps, **accidents: dict[int, Callable[..., Any]]) -> Any:
     """Two stages, the second of which reads the first's output."""
     opened = run.open(path, Path("clip"), recipe)
-    first = run.stage(opened, 1, "first", toy, recipe.first, counted(steps, accidents.get("first")), ["clip"])
-    own = run.key("first", toy.VERSION, recipe.first, ["clip"])
+    first, own = run.stage(opened, "1-first", toy, recipe.first, counted(steps, accidents.get("first")), ["clip"])
     target = first.params.points.mean(0)
     inputs = replace(counted(steps, accidents.get("second")), target=target)
-    return run.stage(opened, 2, "second", toy, recipe.second, inputs, [own])
+    return run.stage(opened, "2-second", toy, recipe.second, inputs, [own])[0]
 
 
 # Stages ---------------------------------------------------------------------------------------------------------------
@@ -92,16 +91,19 @@ def test_stages_draw_from_seeds_of_their_own(tmp_path: Path) -> None:
     assert toy.bits(one) != toy.bits(other)
 
 
-def test_what_decides_a_result_decides_its_key() -> None:
-    usual = ("refine", 1, toy.Config(), ["capture"])
+def test_what_decides_a_result_decides_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = ("refine", toy, toy.Config(), ["capture"])
     variants = [
         ("decompose", *usual[1:]),
-        ("refine", 2, *usual[2:]),
-        ("refine", 1, toy.Config(rate=0.1), ["capture"]),
-        ("refine", 1, toy.Config(), ["another"]),
-        ("refine", 1, toy.Config(), ["capture", "poses"]),
+        ("refine", toy, toy.Config(rate=0.1), ["capture"]),
+        ("refine", toy, toy.Config(), ["another"]),
+        ("refine", toy, toy.Config(), ["capture", "poses"]),
     ]
     keys = [run.key(*usual), *(run.key(*variant) for variant in variants)]
+    for name, value in (("VERSION", 2), ("NOISE", 0.2)):
+        with monkeypatch.context() as patch:
+            patch.setattr(toy, name, value)
+            keys.append(run.key(*usual))
     assert len(set(keys)) == len(keys)
     assert run.key(*usual) == keys[0]
 
@@ -109,7 +111,7 @@ def test_what_decides_a_result_decides_its_key() -> None:
 def test_a_stage_whose_inputs_changed_is_made_anew(tmp_path: Path) -> None:
     opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
     for keys in (["a"], ["b"], ["b"]):
-        run.stage(opened, 1, "first", toy, toy.Config(), counted(steps), keys)
+        run.stage(opened, "1-first", toy, toy.Config(), counted(steps), keys)
     assert len(steps) == 60
 
 
@@ -117,7 +119,7 @@ def test_a_stage_of_another_seed_is_made_anew(tmp_path: Path) -> None:
     steps: Steps = []
     for seed in (0, 1, 1):
         opened = run.Run(tmp_path, Recipe(seed=seed))
-        run.stage(opened, 1, "first", toy, toy.Config(), counted(steps), ["a"])
+        run.stage(opened, "1-first", toy, toy.Config(), counted(steps), ["a"])
     assert len(steps) == 60
 
 
@@ -131,12 +133,12 @@ def test_a_key_never_stands_beside_the_output_of_another(tmp_path: Path, monkeyp
     """The power fails between the two files of a stage; then the stage's old settings come back."""
     opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
     inputs = counted(steps)
-    once = run.stage(opened, 1, "first", toy, toy.Config(), inputs, ["a"])
+    once = run.stage(opened, "1-first", toy, toy.Config(), inputs, ["a"])[0]
     monkeypatch.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(RuntimeError("power cut")))
     with pytest.raises(RuntimeError, match="power cut"):
-        run.stage(opened, 1, "first", toy, toy.Config(rate=0.2), inputs, ["a"])
+        run.stage(opened, "1-first", toy, toy.Config(rate=0.2), inputs, ["a"])
     monkeypatch.undo()
-    again = run.stage(opened, 1, "first", toy, toy.Config(), inputs, ["a"])
+    again = run.stage(opened, "1-first", toy, toy.Config(), inputs, ["a"])[0]
     assert len(steps) == 90
     assert toy.bits(again) == toy.bits(once)
 
@@ -165,10 +167,10 @@ def test_an_output_that_does_not_fit_on_the_disk_leaves_nothing_behind(tmp_path:
     opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
     inputs = counted(steps)
     with full_disk(100_000), pytest.raises(OSError, match=r"out\.safetensors: cannot be written"):
-        run.stage(opened, 1, "big", Big, toy.Config(), inputs, [])
+        run.stage(opened, "1-big", Big, toy.Config(), inputs, [])
     names = sorted(p.name for p in (tmp_path / "run" / "1-big").iterdir())
     assert names == ["preview.png", "state.safetensors"]
-    run.stage(opened, 1, "big", Big, toy.Config(), inputs, [])
+    run.stage(opened, "1-big", Big, toy.Config(), inputs, [])
     assert len(steps) == 30, "training was not repeated"
 
 
@@ -179,10 +181,10 @@ def test_a_stage_without_steps_and_one_without_a_class_of_output(tmp_path: Path)
             return toy.finish(cfg, inputs, state)
 
     opened = run.open(tmp_path / "run", Path("clip"), Recipe())
-    output = run.stage(opened, 1, "none", toy, toy.Config(steps=0), toy.Inputs(), [])
+    output = run.stage(opened, "1-none", toy, toy.Config(steps=0), toy.Inputs(), [])[0]
     assert output.params.points.shape == (6, 2)
     with pytest.raises(TypeError, match="return annotation"):
-        run.stage(opened, 2, "untold", Untold, toy.Config(), toy.Inputs(), [])
+        run.stage(opened, "2-untold", Untold, toy.Config(), toy.Inputs(), [])
 
 
 def test_the_log_has_a_line_of_json_for_what_happened(tmp_path: Path) -> None:
@@ -314,9 +316,9 @@ def test_all_that_a_method_may_see_decides_the_captures_key() -> None:
         replace(capture, names=("0.png", "2.png")),
         replace(capture, focal_guessed=True),
     ]
-    keys = [run.capture_key(variant) for variant in variants]
+    keys = [content_key(variant) for variant in variants]
     assert len(set(keys)) == len(keys)
-    assert run.capture_key(a_capture()) == keys[0]
+    assert content_key(a_capture()) == keys[0]
 
 
 def test_truth_never_enters_the_captures_key(tmp_path: Path) -> None:
@@ -331,14 +333,14 @@ def test_truth_never_enters_the_captures_key(tmp_path: Path) -> None:
         _capture_folder.training_frame("0.png", pose.tolist()),
         _capture_folder.evaluation_frame("1.png", pose.tolist(), "shared", maps=("albedo",), lights=()),
     ]
-    document = _capture_folder.document(
+    document = _capture_folder.capture_document(
         Camera.from_fov(0.5, 6, 8), "camera", frames, setting="handheld", with_light=False
     )
     files.write_json(tmp_path / "transforms.json", document)
-    before = run.capture_key(datasets_folder.load(tmp_path))
+    before = content_key(datasets_folder.load(tmp_path))
     shutil.rmtree(tmp_path / "truth")
-    assert run.capture_key(datasets_folder.load(tmp_path)) == before
+    assert content_key(datasets_folder.load(tmp_path)) == before
     files.write_png(tmp_path / "images" / "1.png", 255 - pixels)
-    assert run.capture_key(datasets_folder.load(tmp_path)) == before, "evaluation views are truth"
+    assert content_key(datasets_folder.load(tmp_path)) == before, "evaluation views are truth"
     files.write_png(tmp_path / "images" / "0.png", 255 - pixels)
-    assert run.capture_key(datasets_folder.load(tmp_path)) != before
+    assert content_key(datasets_folder.load(tmp_path)) != before

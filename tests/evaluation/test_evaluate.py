@@ -91,7 +91,7 @@ def synthetic() -> tuple[Capture, Truth]:
 @pytest.fixture(scope="module")
 def capture_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("captures") / "ball"
-    _capture_folder.save(path, *synthetic(), setting="handheld")
+    _capture_folder.save_capture(path, *synthetic(), setting="handheld")
     return path
 
 
@@ -155,7 +155,7 @@ def assert_perfect(report: dict[str, Any], *, but: tuple[str, ...] = ()) -> None
 
 
 def test_the_truth_is_a_perfect_prediction(capture_path: Path, perfect_path: Path, tmp_path: Path) -> None:
-    report = evaluate.run(perfect_path, capture_path, tmp_path)
+    report = evaluate.score(perfect_path, capture_path, tmp_path)
     assert_perfect(report)
     assert report["albedo_scale"] == [1, 1, 1]
     assert report["notes"] == []
@@ -280,7 +280,7 @@ def test_lost_frames_are_counted(capture_path: Path) -> None:
 def rewritten(root: Path, change: Callable[[dict[str, Any]], None]) -> Path:
     """A copy of the capture with another transforms.json."""
     capture, truth = synthetic()
-    _capture_folder.save(root / "ball", capture, truth, setting="handheld")
+    _capture_folder.save_capture(root / "ball", capture, truth, setting="handheld")
     document = json.loads((root / "ball" / "transforms.json").read_text())
     change(document)
     (root / "ball" / "transforms.json").write_text(json.dumps(document))
@@ -291,7 +291,7 @@ def test_in_metres_the_tolerance_is_ten_centimetres(tmp_path: Path) -> None:
     metric = rewritten(tmp_path, lambda document: document.update(units="m"))
     truth = the_truth(metric)
     Prediction(poses=truth.poses, pose_names=truth.pose_names).write(tmp_path / "mine")
-    report = evaluate.run(tmp_path / "mine", metric, tmp_path / "out")
+    report = evaluate.score(tmp_path / "mine", metric, tmp_path / "out")
     assert report["poses"]["poses.tolerance"] == 0.1
     assert report["capture"]["units"] == "m"
 
@@ -299,7 +299,7 @@ def test_in_metres_the_tolerance_is_ten_centimetres(tmp_path: Path) -> None:
 def test_an_unknown_unit_is_refused(tmp_path: Path, perfect_path: Path) -> None:
     inches = rewritten(tmp_path, lambda document: document.update(units="inch"))
     with pytest.raises(BadFile, match=r"transforms\.json.*'inch'.*m, arbitrary"):
-        evaluate.run(perfect_path, inches, tmp_path / "out")
+        evaluate.score(perfect_path, inches, tmp_path / "out")
 
 
 def test_positions_on_a_line_are_not_scored_and_the_report_says_why(tmp_path: Path) -> None:
@@ -310,7 +310,7 @@ def test_positions_on_a_line_are_not_scored_and_the_report_says_why(tmp_path: Pa
         dataclasses.replace(capture, trajectory=line),
         dataclasses.replace(truth, poses=line),
     )
-    _capture_folder.save(tmp_path / "ball", capture, truth)
+    _capture_folder.save_capture(tmp_path / "ball", capture, truth)
     report = score(tmp_path / "ball")
     assert report["poses"]["poses.ate"] is None
     assert report["poses"]["poses.auc_percent"] is None
@@ -323,7 +323,7 @@ def test_unknown_pixels_count_nowhere(tmp_path: Path) -> None:
     capture, truth = synthetic()
     masks = truth.masks.clone()
     masks[:, 10:14] = UNKNOWN
-    _capture_folder.save(tmp_path / "ball", capture, dataclasses.replace(truth, masks=masks))
+    _capture_folder.save_capture(tmp_path / "ball", capture, dataclasses.replace(truth, masks=masks))
     good = the_truth(tmp_path / "ball")
     assert good.albedo is not None
     assert good.normals is not None
@@ -350,7 +350,7 @@ def test_an_absent_part_is_noted_and_the_rest_is_scored(capture_path: Path, part
 
 def test_a_single_part_is_enough(capture_path: Path, tmp_path: Path) -> None:
     Prediction(light=the_truth(capture_path).light).write(tmp_path / "mine")
-    report = evaluate.run(tmp_path / "mine", capture_path, tmp_path / "out")
+    report = evaluate.score(tmp_path / "mine", capture_path, tmp_path / "out")
     assert report["light"]["light.rmse_clip10"] == pytest.approx(0, abs=1e-6)
     assert report["regions"] == {"shared": {}, "sphere": {}}
     assert any("no albedo scale" in note for note in report["notes"])
@@ -359,9 +359,9 @@ def test_a_single_part_is_enough(capture_path: Path, tmp_path: Path) -> None:
 
 def test_a_capture_without_evaluation_views_still_scores_poses(tmp_path: Path) -> None:
     capture, _ = synthetic()
-    _capture_folder.save(tmp_path / "ball", capture)
+    _capture_folder.save_capture(tmp_path / "ball", capture)
     Prediction(poses=capture.trajectory, pose_names=capture.names).write(tmp_path / "mine")
-    report = evaluate.run(tmp_path / "mine", tmp_path / "ball", tmp_path / "out")
+    report = evaluate.score(tmp_path / "mine", tmp_path / "ball", tmp_path / "out")
     assert report["poses"]["poses.ate"] == pytest.approx(0, abs=1e-5)
     assert report["regions"] == {}
 
@@ -428,23 +428,23 @@ def test_a_broken_file_is_named_with_its_rule_and_nothing_is_written(
     shutil.copytree(perfect_path, tmp_path / "mine")
     BROKEN[message](tmp_path / "mine")
     with pytest.raises(BadFile, match=message):
-        evaluate.run(tmp_path / "mine", capture_path, tmp_path / "out")
+        evaluate.score(tmp_path / "mine", capture_path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_an_empty_folder_and_no_folder_are_refused(capture_path: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(BadFile, match="holds no part of a prediction, none of: albedo"):
-        evaluate.run(tmp_path / "empty", capture_path, tmp_path / "out")
+        evaluate.score(tmp_path / "empty", capture_path, tmp_path / "out")
     with pytest.raises(BadFile, match="is not a folder"):
-        evaluate.run(tmp_path / "none", capture_path, tmp_path / "out")
+        evaluate.score(tmp_path / "none", capture_path, tmp_path / "out")
 
 
 def test_a_capture_without_truth_is_refused(tmp_path: Path) -> None:
     capture, _ = synthetic()
-    _capture_folder.save(tmp_path / "ball", dataclasses.replace(capture, trajectory=None))
+    _capture_folder.save_capture(tmp_path / "ball", dataclasses.replace(capture, trajectory=None))
     with pytest.raises(BadFile, match="has no truth"):
-        evaluate.run(tmp_path / "mine", tmp_path / "ball", tmp_path / "out")
+        evaluate.score(tmp_path / "mine", tmp_path / "ball", tmp_path / "out")
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
@@ -479,17 +479,17 @@ def test_writing_again_replaces_all_parts_and_leaves_other_files(capture_path: P
 def test_the_report_on_disk_is_the_one_returned_and_the_same_every_time(
     capture_path: Path, perfect_path: Path, tmp_path: Path
 ) -> None:
-    report = evaluate.run(perfect_path, capture_path, tmp_path / "once")
+    report = evaluate.score(perfect_path, capture_path, tmp_path / "once")
     text = (tmp_path / "once" / "report.json").read_text()
     assert json.loads(text) == report
     assert str(tmp_path) not in text
-    evaluate.run(perfect_path, capture_path, tmp_path / "again")
+    evaluate.score(perfect_path, capture_path, tmp_path / "again")
     for name in ("report.json", "sheet.png"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()
 
 
 def test_every_score_has_a_protocol(capture_path: Path, perfect_path: Path, tmp_path: Path) -> None:
-    report = evaluate.run(perfect_path, capture_path, tmp_path)
+    report = evaluate.score(perfect_path, capture_path, tmp_path)
     facts = {"poses.posed_frames", "poses.lost_frames", "poses.tolerance", "poses.alignment"}
     keys = {key.split(": ")[1] for key in everything(report)}
     assert keys - facts == set(report["protocol"])
@@ -507,7 +507,7 @@ def test_the_documentation_names_every_score() -> None:
 def test_vgg_numbers_join_those_of_alexnet(capture_path: Path, tmp_path: Path, shared_data: Path) -> None:
     Prediction(images=the_truth(capture_path).images).write(tmp_path / "mine")
     weights = shared_data / "lpips" / "lpips_vgg_v01_f16.npz"
-    report = evaluate.run(tmp_path / "mine", capture_path, tmp_path / "out", vgg=weights)
+    report = evaluate.score(tmp_path / "mine", capture_path, tmp_path / "out", vgg=weights)
     assert report["regions"]["shared"]["image.lpips_full_srgb_vgg"] == 0
     assert "vgg features" in report["protocol"]["image.lpips_full_srgb_vgg"]
 
@@ -516,7 +516,7 @@ def test_folders_of_a_run_go_by_the_names_of_their_runs(capture_path: Path, tmp_
     """`RUN/prediction` and `RUN/capture` would name nothing."""
     shutil.copytree(capture_path, tmp_path / "runs" / "pot" / "capture")
     Prediction(light=the_truth(capture_path).light).write(tmp_path / "runs" / "mug" / "prediction")
-    report = evaluate.run(
+    report = evaluate.score(
         tmp_path / "runs" / "mug" / "prediction", tmp_path / "runs" / "pot" / "capture", tmp_path / "out"
     )
     assert (report["prediction"], report["capture"]["name"]) == ("mug", "pot")

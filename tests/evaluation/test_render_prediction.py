@@ -75,7 +75,6 @@ def disguised(asset: Asset) -> Asset:
     """The same object, told in the frame and unit of `OTHER`."""
     R, scale, old, material = OTHER.R_true_pred, OTHER.scale, asset.gaussians, asset.material
     assert material is not None
-    assert asset.environment is not None
     fixed = asset.trajectory.light == "object"
     return dataclasses.replace(
         asset,
@@ -112,7 +111,7 @@ def a_truth(asset: Asset) -> tuple[Capture, Truth]:
         poses=asset.trajectory,
     )
     same = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
-    shown = render_prediction.predict(OTHER_CONFIG, asset, capture, blank, same, names=NAMES)
+    shown = render_prediction.predict_views(OTHER_CONFIG, asset, capture, blank, same, names=NAMES)
     assert shown.albedo is not None
     assert shown.normals is not None
     assert shown.masks is not None
@@ -133,8 +132,8 @@ def a_truth(asset: Asset) -> tuple[Capture, Truth]:
 
 def scored(asset: Asset, capture: Capture, truth: Truth) -> tuple[dict[str, Any], str]:
     given = capture.trajectory is not None
-    alignment, words = render_prediction.aligned(asset.trajectory, NAMES, capture, truth, given=given)
-    predicted = render_prediction.predict(CONFIG, asset, capture, truth, alignment, names=NAMES)
+    alignment, words = render_prediction.align_views(asset.trajectory, NAMES, capture, truth, given=given)
+    predicted = render_prediction.predict_views(CONFIG, asset, capture, truth, alignment, names=NAMES)
     return evaluate.compare(predicted, capture, truth, []), words
 
 
@@ -169,10 +168,10 @@ def test_without_the_alignment_nothing_fits() -> None:
     capture, truth = a_truth(asset)
     other = disguised(asset)
     same = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
-    right, _ = render_prediction.aligned(other.trajectory, NAMES, capture, truth, given=False)
+    right, _ = render_prediction.align_views(other.trajectory, NAMES, capture, truth, given=False)
     assert right is not None
-    wrong = render_prediction.predict(CONFIG, other, capture, truth, same, names=NAMES)
-    good = render_prediction.predict(CONFIG, other, capture, truth, right, names=NAMES)
+    wrong = render_prediction.predict_views(CONFIG, other, capture, truth, same, names=NAMES)
+    good = render_prediction.predict_views(CONFIG, other, capture, truth, right, names=NAMES)
     halves = {"normals": wrong.normals, "relit": wrong.relit, "albedo": wrong.albedo, "light": wrong.light}
     for part, value in halves.items():
         scores = evaluate.compare(dataclasses.replace(good, **{part: value}), capture, truth, [])
@@ -204,13 +203,13 @@ def test_what_another_lens_saw_is_brought_to_where_this_one_sees_it_as_large() -
     capture, truth = a_truth(asset)
     T = asset.trajectory.T_cam_obj
     farther = Trajectory(dataclasses.replace(T, xyz=T.xyz * torch.tensor([1.0, 1.0, 1.2])), "camera")
-    found, words = render_prediction.aligned(farther, NAMES, capture, truth, given=False, lens=1 / 1.2)
+    found, words = render_prediction.align_views(farther, NAMES, capture, truth, given=False, lens=1 / 1.2)
     assert found is not None
     assert float(found.scale) == pytest.approx(1, abs=1e-4)
     assert float(found.R_true_pred.angle()) < 1e-3
     assert found.shift.abs().max() < 1e-4
     assert "depths times 0.8333" in words
-    plain, words = render_prediction.aligned(farther, NAMES, capture, truth, given=False)
+    plain, words = render_prediction.align_views(farther, NAMES, capture, truth, given=False)
     assert plain is not None
     # Otherwise the object would be drawn a fifth too large.
     assert float(plain.scale) == pytest.approx(1 / 1.2, abs=0.01)
@@ -221,19 +220,19 @@ def test_what_cannot_be_aligned_is_a_prediction_of_poses_and_says_so() -> None:
     asset = an_asset("camera")
     capture, truth = a_truth(asset)
     still = Trajectory(asset.trajectory.select([0] * len(NAMES)).T_cam_obj, "camera")
-    nothing, words = render_prediction.aligned(
+    nothing, words = render_prediction.align_views(
         still, NAMES, capture, dataclasses.replace(truth, poses=still), given=False
     )
     assert nothing is None
     assert "hardly turns" in words
-    made = render_prediction.predict(CONFIG, asset, capture, truth, None, names=NAMES)
+    made = render_prediction.predict_views(CONFIG, asset, capture, truth, None, names=NAMES)
     assert made.albedo is None
     assert made.poses is asset.trajectory
     assert made.light is asset.environment, "the camera's frame needs no alignment"
-    fixed = render_prediction.predict(CONFIG, an_asset("object"), capture, truth, None, names=NAMES)
+    fixed = render_prediction.predict_views(CONFIG, an_asset("object"), capture, truth, None, names=NAMES)
     assert fixed.light is None
     bare = dataclasses.replace(truth, poses=None)
-    blind, words = render_prediction.aligned(asset.trajectory, NAMES, capture, bare, given=False)
+    blind, words = render_prediction.align_views(asset.trajectory, NAMES, capture, bare, given=False)
     assert blind is None
     assert "unknown" in words
 
@@ -250,7 +249,7 @@ def test_true_poses_of_some_frames_align_and_score_those() -> None:
     kept = [i for i in range(24) if i not in (4, 7)]
     names = tuple(NAMES[i] for i in kept)
     path = other.trajectory.select(kept)
-    alignment, words = render_prediction.aligned(path, names, capture, some, given=False)
+    alignment, words = render_prediction.align_views(path, names, capture, some, given=False)
     assert alignment is not None
     assert "11 training poses" in words
     torch.testing.assert_close(alignment.to_truth(path).T_cam_obj.xyz, asset.trajectory.select(kept).T_cam_obj.xyz)

@@ -12,7 +12,8 @@ import torch
 from tests.export.test_bake import RADIUS, colour, painted, rough
 from tests.surfaces import sphere
 from tumble.export import asset as export
-from tumble.export import mesh
+from tumble.export import gltf, mesh, ply
+from tumble.export import poses as pose_files
 from tumble.export.asset import Preset
 from tumble.io import files
 from tumble.maths.directions import fibonacci_sphere
@@ -40,7 +41,7 @@ def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("export")
     patch = pytest.MonkeyPatch()
     patch.setitem(export.PRESETS, "web", SMALL)
-    export.export(asset, NAMES, out, "web", SCALE_MM)
+    export.write_asset(asset, NAMES, out, "web", SCALE_MM)
     patch.undo()
     return out
 
@@ -115,8 +116,8 @@ def test_another_reader_finds_each_colour_where_it_belongs(folder: Path) -> None
 
 
 def test_a_highlight_below_that_of_glass_is_dimmed_and_one_above_has_an_index() -> None:
-    assert export.specular(0.02) == ("KHR_materials_specular", {"specularFactor": 0.5})
-    name, value = export.specular(0.0625)
+    assert gltf.specular(0.02) == ("KHR_materials_specular", {"specularFactor": 0.5})
+    name, value = gltf.specular(0.0625)
     # ((n - 1) / (n + 1))^2 = 1/16.
     assert name == "KHR_materials_ior"
     assert value["ior"] == pytest.approx(5 / 3)
@@ -149,7 +150,7 @@ def test_a_splat_viewer_shows_the_light_of_the_first_frame(folder: Path, asset: 
             "environment": Environment.from_radiance(torch.full((8, 16, 3), 0.8)),
         }
     )
-    columns = export.splats(lit, 1.0)
+    columns = ply.splats(lit, 1.0)
     shown = torch.tensor(np.stack([columns[f"f_dc_{i}"] for i in range(3)], -1)) * 0.28209479 + 0.5
     expected = 0.8 * colour(asset.gaussians.means)
     error = linear_from_srgb(shown) - expected
@@ -192,12 +193,11 @@ def test_poses_come_back_from_all_three_forms(folder: Path, asset: Asset) -> Non
 
 
 def test_frames_without_numbers_are_counted() -> None:
-    assert export._numbers(["b.png", "a.png"]) == [0, 1]
-    assert export._numbers(["7.png", "007.png"]) == [0, 1]
+    assert pose_files._numbers(["b.png", "a.png"]) == [0, 1]
+    assert pose_files._numbers(["7.png", "007.png"]) == [0, 1]
 
 
 def test_the_light_says_how_it_lies(folder: Path, asset: Asset) -> None:
-    assert asset.environment is not None
     about = files.read_json(folder / "light.json")
     assert about["up"].startswith("+y")
     assert about["zero_azimuth"].startswith("-z")
@@ -211,7 +211,7 @@ def test_the_light_says_how_it_lies(folder: Path, asset: Asset) -> None:
 
 
 def test_splats_alone_need_no_mesh(asset: Asset, tmp_path: Path) -> None:
-    export.export(asset, NAMES, tmp_path, "splat")
+    export.write_asset(asset, NAMES, tmp_path, "splat")
     assert not (tmp_path / "asset.glb").exists()
     assert files.read_json(tmp_path / "export.json")["metres_per_object_radius"] == 1.0
     assert np.allclose(table(tmp_path / "asset.ply")["x"], asset.gaussians.means[:, 0])

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from tests.surfaces import GAMMA, sphere
-from tumble.export import bake, mesh
+from tumble.export import bake, depth_fusion, mesh
 from tumble.export.bake import Textures
 from tumble.export.mesh import Unwrapped
 from tumble.maths.images import linear_from_srgb
@@ -56,9 +56,9 @@ def asset() -> Asset:
 
 @pytest.fixture(scope="module")
 def ball() -> Unwrapped:
-    axis = np.linspace(-mesh.REACH, mesh.REACH, 33)
+    axis = np.linspace(-depth_fusion.REACH, depth_fusion.REACH, 33)
     values = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - RADIUS
-    made = mesh.simplified(mesh.march(values, -mesh.REACH, 2 * mesh.REACH / 32), 1500)
+    made = mesh.simplified(mesh.march(values, -depth_fusion.REACH, 2 * depth_fusion.REACH / 32), 1500)
     return mesh.unwrapped(made, 192, 8)
 
 

@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from tests.surfaces import GAMMA, MAJOR, MINOR, flat, sphere, torus
-from tumble.export import mesh
+from tumble.export import depth_fusion, mesh
 from tumble.export.mesh import Mesh
 from tumble.maths.directions import fibonacci_sphere
 from tumble.scene.gaussians import Gaussians
 
 CELLS = 48
-CELL = 2 * mesh.REACH / CELLS
+CELL = 2 * depth_fusion.REACH / CELLS
 
 
 def grid(n: int = CELLS) -> np.ndarray:
-    axis = np.linspace(-mesh.REACH, mesh.REACH, n + 1)
+    axis = np.linspace(-depth_fusion.REACH, depth_fusion.REACH, n + 1)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
@@ -26,7 +26,7 @@ def to_torus(x: np.ndarray) -> np.ndarray:
 
 
 def marched(distance: np.ndarray) -> Mesh:
-    return mesh.march(distance, -mesh.REACH, CELL)
+    return mesh.march(distance, -depth_fusion.REACH, CELL)
 
 
 def directed_edges(faces: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_marching_agrees_with_marching_cubes() -> None:
     distance = np.linalg.norm(x * [1.0, 1.4, 2.0] - [0.2, 0, 0.1], axis=-1) - 0.6 + 0.05 * np.sin(5 * x[..., 0])
     vertices, faces, _, _ = measure.marching_cubes(distance, 0.0, spacing=(CELL,) * 3)
     made = marched(distance)
-    other = Mesh(vertices.astype(np.float64) - mesh.REACH, faces)
+    other = Mesh(vertices.astype(np.float64) - depth_fusion.REACH, faces)
     assert area(made) == pytest.approx(area(other), rel=5e-3)
     assert volume(made) == pytest.approx(abs(volume(other)), rel=5e-3)
 
@@ -94,8 +94,8 @@ def test_random_values_give_a_closed_surface() -> None:
 
 
 def fused(gaussians: Gaussians) -> Mesh:
-    values = mesh.distances(gaussians, GAMMA, cells=CELLS, views=32, pixels=128)
-    return mesh.without_floaters(mesh.march(values, -mesh.REACH, CELL))
+    values = depth_fusion.distances(gaussians, GAMMA, cells=CELLS, views=32, pixels=128)
+    return mesh.without_floaters(mesh.march(values, -depth_fusion.REACH, CELL))
 
 
 def test_gaussians_on_a_torus_become_its_surface() -> None:
@@ -173,7 +173,7 @@ def test_the_diameter_is_the_largest_distance() -> None:
 
 
 def test_the_cameras_around_see_the_whole_unit_ball() -> None:
-    poses, camera = mesh.around(20, 64)
+    poses, camera = depth_fusion.around(20, 64)
     for i in range(20):
         x_cam = poses[i] @ fibonacci_sphere(500)
         assert x_cam[:, 2].min() > 1

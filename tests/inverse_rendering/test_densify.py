@@ -6,24 +6,28 @@ from tumble.inverse_rendering import densify
 from tumble.scene.gaussians import Gaussians
 
 
+def config(score: float, share: float, most: int) -> densify.Config:
+    return densify.Config(grow_score=score, grow_share=share, max_gaussians=most)
+
+
 def test_the_most_important_split_the_useless_go_and_the_rest_stay() -> None:
     importance = torch.tensor([0.0, 9.0, 5.0, 7.0, 1.0])
     drop = torch.tensor([True, False, False, False, False])
-    plan = densify.plan(importance, drop, threshold=2.0, fraction=0.4, limit=100)
+    plan = densify.plan(config(2.0, 0.4, 100), importance, drop)
     assert plan.index.tolist() == [2, 4, 1, 3, 1, 3]
     assert plan.fresh.tolist() == [False, False, True, True, True, True]
 
 
 def test_the_limit_holds() -> None:
     importance = torch.arange(10.0) + 5
-    plan = densify.plan(importance, torch.zeros(10, dtype=torch.bool), threshold=0.0, fraction=1.0, limit=12)
+    plan = densify.plan(config(0.0, 1.0, 12), importance, torch.zeros(10, dtype=torch.bool))
     assert len(plan.index) == 12
     assert plan.index[plan.fresh].unique().tolist() == [8, 9]
 
 
 def test_what_is_dropped_never_splits() -> None:
     importance = torch.tensor([9.0, 1.0])
-    plan = densify.plan(importance, torch.tensor([True, False]), threshold=0.5, fraction=0.5, limit=10)
+    plan = densify.plan(config(0.5, 0.5, 10), importance, torch.tensor([True, False]))
     assert plan.index.tolist() == [1, 1]
 
 
@@ -47,8 +51,8 @@ def test_children_lie_on_both_sides_along_the_longer_axis() -> None:
 def test_a_nearly_perfect_picture_has_no_bad_pixels() -> None:
     error, mask = torch.full((4, 4), 0.01), torch.ones(4, 4)
     error[0, 0] = 0.015
-    assert densify.bad_pixels(error, mask, relative=0.1, absolute=0.02).sum() == 0
+    assert densify.bad_pixels(densify.Config(), error, mask).sum() == 0
     error[0, 0] = 0.5
-    assert densify.bad_pixels(error, mask, relative=0.1, absolute=0.02).sum() == 1
+    assert densify.bad_pixels(densify.Config(), error, mask).sum() == 1
     mask[0, 0] = 0
-    assert densify.bad_pixels(error, mask, relative=0.1, absolute=0.02).sum() == 0
+    assert densify.bad_pixels(densify.Config(), error, mask).sum() == 0

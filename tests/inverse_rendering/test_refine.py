@@ -8,17 +8,16 @@ import numpy as np
 import torch
 
 from tumble.engine.loop import State
-from tumble.inverse_rendering import losses, refine
+from tumble.inverse_rendering import densify, losses, refine
 from tumble.inverse_rendering.refine import Config, Params, Points
 from tumble.inverse_rendering.sh_lighting import CoarseLight
 from tumble.maths.images import srgb_from_linear
 from tumble.maths.se3 import SE3, SO3, angle_between
 from tumble.recipes import SMOKE
-from tumble.rendering.buffers import Buffers
+from tumble.rendering.rasterizer import Buffers
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture, TargetView
 from tumble.scene.gaussians import Gaussians, constant_sh, facing
-from tumble.scene.photograph import Frame
 from tumble.scene.trajectory import Trajectory
 
 GAMMA = torch.tensor(30.0)
@@ -35,7 +34,7 @@ def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkey
     normal, rgb = ((rendered[..., None] * torch.rand(h, w, 3, **like)).requires_grad_() for _ in range(2))
     nothing = torch.zeros(n)
     view = Buffers(*images, normal, rgb, {}, nothing + 1, nothing.int(), torch.zeros(h, w, dtype=torch.int32))
-    truth = Frame(mask[..., None] * torch.rand(h, w, 3, **like), mask, torch.ones(h, w, 1, dtype=torch.float64))
+    truth = TargetView(mask[..., None] * torch.rand(h, w, 3, **like), mask, torch.ones(h, w, 1, dtype=torch.float64))
     means = 0.1 * torch.randn(n, 3, **like)
     gaussians = Gaussians(means, torch.randn(n, 4, **like), means - 2, means[:, 0], means[:, None])
     params = Params(Points(gaussians, means), torch.tensor(30.0), CoarseLight.constant(0.4, means), torch.zeros(1, 6))
@@ -60,7 +59,7 @@ def test_a_picture_with_nothing_in_it_has_losses_too() -> None:
     black, none = torch.zeros(20, 20), torch.zeros(0)
     coloured = torch.zeros(20, 20, 3)
     view = Buffers(black, black, black, coloured, coloured, {}, none, none.int(), black.int())
-    truth, camera = Frame(coloured, black, torch.ones(20, 20, 1)), Camera.from_fov(1.0, 20, 20)
+    truth, camera = TargetView(coloured, black, torch.ones(20, 20, 1)), Camera.from_fov(1.0, 20, 20)
     assert refine._window(view, truth, camera) == (view, truth, camera, 1.0)
 
 
@@ -97,19 +96,20 @@ def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
 
 def test_what_no_frame_has_shown_since_the_last_densification_is_dropped() -> None:
     _, true, capture = ball()
-    cfg = replace(SMOKE.refine, points=600, limit=600, importance=math.inf, every=1000)
+    growth = densify.Config(max_gaussians=600, grow_score=math.inf, refine_every=1000)
+    cfg = replace(SMOKE.refine, points=600, densification=growth)
     inputs = refine.Inputs(capture, Trajectory(true, "camera"))
     state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
     shown = []
     for state.step in range(1, 5):
         refine.step(cfg, inputs, state)
-        shown.append(state.memory["shown"] > cfg.least_weight)
+        shown.append(state.memory["shown"] > growth.prune_weight)
     # What any frame shows stays shown, and every frame hides the ball's other side.
     assert all((before <= after).all() for before, after in pairwise(shown))
     assert 0.2 < shown[0].float().mean() < 0.8 * shown[3].float().mean()
-    state.memory["shown"][::3] = 0.9 * cfg.least_weight
+    state.memory["shown"][::3] = 0.9 * growth.prune_weight
     # One view is scored; what it hides stays all the same.
-    refine._densify(replace(cfg, views=1), inputs, state)
+    refine._densify(replace(cfg, densification=replace(growth, score_views=1)), inputs, state)
     left = len(state.params.points.albedo_logits)
     assert left == (shown[3] & (torch.arange(600) % 3 > 0)).sum()
     assert torch.equal(state.memory["shown"], torch.zeros(left))

@@ -5,7 +5,7 @@ import math
 import torch
 
 from tests.surfaces import GAMMA, MAJOR, MINOR, sphere, torus
-from tumble.export.mesh import around
+from tumble.export.depth_fusion import around
 from tumble.inverse_rendering import self_shadowing
 from tumble.inverse_rendering.self_shadowing import Sky, look_around
 from tumble.inverse_rendering.sh_lighting import CoarseLight

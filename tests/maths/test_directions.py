@@ -7,15 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.oracles.directions import fibonacci_hemisphere, spherical
 from tumble.maths.directions import (
     direction_from_equirect,
     equirect_from_direction,
-    fibonacci_hemisphere,
     fibonacci_sphere,
     local_frame,
     random_rotation,
     reflect,
-    spherical,
     texel_directions,
     texel_solid_angles,
 )

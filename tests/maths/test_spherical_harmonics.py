@@ -9,8 +9,9 @@ import torch
 from scipy import special
 from torch import Tensor
 
+from tests.oracles.irradiance import irradiance_coefficients
 from tumble.maths.directions import fibonacci_sphere, texel_directions, texel_solid_angles
-from tumble.maths.spherical_harmonics import basis, irradiance_coefficients, project, series
+from tumble.maths.spherical_harmonics import basis, project, series
 
 DOUBLE = torch.float64
 

@@ -12,8 +12,8 @@ from tumble.engine.loop import drive
 from tumble.evaluation import metrics
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.frame_pairs import neighbours
+from tumble.poses.result import PoseResult
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.finalize import Tracked
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.match import Match
@@ -61,13 +61,13 @@ def turning(n: int, rock: float) -> SE3:
     return SE3.from_rotation(SO3.exp(tilt) @ SO3.exp(spin), at)
 
 
-def tracked(capture: Capture) -> Tracked:
+def tracked(capture: Capture) -> PoseResult:
     matches = matching.match_pairs(matching.views_of(capture), neighbours(len(capture), (1, 2)), "mixed")
-    return drive(stage, QUICK, stage.gather(capture, matches), seed=0)
+    return drive(stage, QUICK, stage.gather(capture, matches, "mixed"), seed=0)
 
 
 def test_a_plain_ball() -> None:
-    health = tracked(photographed(turning(12, 0.0), None)).health
+    health = tracked(photographed(turning(12, 0.0), None)).quality
     assert health.verdict == "bad"
     assert "not observable" in health.sentence
 
@@ -76,7 +76,7 @@ def test_a_plain_ball() -> None:
 def test_a_can_without_a_label() -> None:
     """Its axis rocks by 40 degrees, which outlines show; its spin nobody can see."""
     T_cam_obj = turning(16, 0.7)
-    health = tracked(photographed(T_cam_obj, 0.8)).health
+    health = tracked(photographed(T_cam_obj, 0.8)).quality
     assert health.verdict == "bad"
     assert health.sentence.startswith("Rotation about axis (")
     axis = T_cam_obj.rotation[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
@@ -103,7 +103,7 @@ def test_another_object_halfway(scene: Tumble) -> None:
         half = 14 + 2 * (k % 3)
         masks[k, 64 - half : 64 + half, 50:78] = OBJECT
     some = [m for m in matches(scene) if m.j < 12]
-    health = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), some), seed=0).health
+    health = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), some, "mixed"), seed=0).quality
     assert health.verdict == "bad"
 
 
@@ -119,7 +119,7 @@ def test_some_wrong_masks_do_no_harm(scene: Tumble) -> None:
             if k in (5, 15):
                 here &= uv[:, 0] < 62
         kept.append(m.select(here))
-    found = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), kept), seed=0)
+    found = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), kept, "mixed"), seed=0)
     others = [k for k in range(24) if k not in (5, 15)]
     scores = metrics.rotation_scores(found.trajectory.select(others), truth(scene).select(others))
     assert scores["rotation_median_degrees"] < 2

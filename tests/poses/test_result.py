@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tumble.poses.result import Health, Observability
+from tumble.poses.result import Observability, PoseQuality
 
 SEEN = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.005, 0.004, 0.003]))
 ONES = torch.ones(10)
-GOOD = Health(
+GOOD = PoseQuality(
     0.3 * ONES,
     100 * ONES,
     0.1 * ONES,

@@ -21,10 +21,10 @@ from tumble import cli, pipeline
 from tumble.io import files
 from tumble.io.files import BadFile
 from tumble.preprocess import box_picker
-from tumble.preprocess.footage import Frame
-from tumble.preprocess.survey import Options
+from tumble.preprocess.footage import FootageFrame
+from tumble.preprocess.options import FootageOptions
 
-FRAME = Frame(7, 0.0, np.random.default_rng(0).integers(0, 255, (90, 160, 3), np.uint8), None)
+FRAME = FootageFrame(7, 0.0, np.random.default_rng(0).integers(0, 255, (90, 160, 3), np.uint8), None)
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Asked:
 
 
 @contextmanager
-def asking(frame: Frame = FRAME) -> Iterator[Asked]:
+def asking(frame: FootageFrame = FRAME) -> Iterator[Asked]:
     asked = Asked()
     thread = threading.Thread(target=lambda: asked.boxes.append(box_picker.ask(frame, asked.said.put)), daemon=True)
     thread.start()
@@ -129,16 +129,16 @@ def film(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(("at", "shown"), [(0, 3), (12, 12)])
 def test_the_first_sharp_frame_is_shown_or_the_one_that_is_named(at: int, shown: int, tmp_path: Path) -> None:
-    frame = box_picker.sharp_frame(film(tmp_path), Options(at=at, focal=300.0))
+    frame = box_picker.sharp_frame(film(tmp_path), FootageOptions(at=at, focal=300.0))
     assert frame.number == shown
     with pytest.raises(BadFile, match="has no frame 99"):
-        box_picker.sharp_frame(film(tmp_path), Options(at=99, focal=300.0))
+        box_picker.sharp_frame(film(tmp_path), FootageOptions(at=99, focal=300.0))
 
 
 def test_the_frame_is_shown_as_the_pinhole_camera_sees_it(tmp_path: Path) -> None:
     """A box is in pixels of the straightened film."""
-    bent = box_picker.sharp_frame(film(tmp_path), Options(at=3, focal=300.0, distortion=(0.5, 0.0, 0.0, 0.0)))
-    straight = box_picker.sharp_frame(film(tmp_path), Options(at=3, focal=300.0))
+    bent = box_picker.sharp_frame(film(tmp_path), FootageOptions(at=3, focal=300.0, distortion=(0.5, 0.0, 0.0, 0.0)))
+    straight = box_picker.sharp_frame(film(tmp_path), FootageOptions(at=3, focal=300.0))
     assert np.abs(bent.picture.astype(int) - straight.picture).mean() > 1
 
 
@@ -148,11 +148,11 @@ def test_a_run_asks_once_and_then_knows(
     path, box = film(tmp_path), scene().box(3)
     asked = []
     monkeypatch.setattr(box_picker, "ask", lambda frame, tell: asked.append(frame.number) or box)
-    options = box_picker.picked(path, Options(focal=300.0), tmp_path / "run" / "capture")
+    options = box_picker.picked(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
     assert (options.box, options.at) == (box, 3)
     assert capsys.readouterr().out == f"--box {' '.join(map(str, box))} --at 3\n"
     pipeline.ingested(path, tmp_path / "run", options)
-    again = box_picker.picked(path, Options(focal=300.0), tmp_path / "run" / "capture")
+    again = box_picker.picked(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
     assert again == options
     assert asked == [3]
     # The same as the words that were said.
@@ -163,11 +163,11 @@ def test_where_masks_or_hints_are_nobody_is_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     with pytest.raises(ValueError, match="--pick asks for what"):
-        box_picker.picked(tmp_path, Options(box=(0, 0, 9, 9)), tmp_path)
+        box_picker.picked(tmp_path, FootageOptions(box=(0, 0, 9, 9)), tmp_path)
     files.write_png(tmp_path / "c" / "images" / "0.png", scene().pictures[0])
     files.write_png(tmp_path / "c" / "masks" / "0.png", scene().object[0][..., None] * np.uint8(255))
     with pytest.raises(BadFile, match="has masks"):
-        box_picker.picked(tmp_path / "c", Options(), tmp_path / "none")
+        box_picker.picked(tmp_path / "c", FootageOptions(), tmp_path / "none")
     monkeypatch.setattr("sys.argv", ["tumble", "check", str(tmp_path / "nowhere"), "--pick"])
     with pytest.raises(SystemExit) as end:
         cli.main()

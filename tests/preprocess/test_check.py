@@ -11,18 +11,18 @@ from tests.films import scene, written
 from tumble import cli
 from tumble.io import files
 from tumble.preprocess import check as checking
-from tumble.preprocess.check import Finding, check, go
-from tumble.preprocess.survey import Options
+from tumble.preprocess.check import Finding, check_footage, go
+from tumble.preprocess.options import FootageOptions
 
 
-def findings(pictures: np.ndarray, tmp_path: Path, options: Options) -> dict[str, Finding]:
-    found = check(written(pictures, tmp_path / "x.mp4"), tmp_path / "out", options)
+def findings(pictures: np.ndarray, tmp_path: Path, options: FootageOptions) -> dict[str, Finding]:
+    found = check_footage(written(pictures, tmp_path / "x.mp4"), tmp_path / "out", options)
     assert (tmp_path / "out" / "mask_preview.mp4").is_file()
     assert all(bool(finding.advice) == (finding.verdict != "good") for finding in found)
     return {finding.subject: finding for finding in found}
 
 
-OPTIONS = Options(box=scene().box(), focal=300.0)
+OPTIONS = FootageOptions(box=scene().box(), focal=300.0)
 
 
 def test_a_good_film_is_a_go(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_an_object_at_the_border_is_told(tmp_path: Path) -> None:
     """The picture ends through the middle of the object."""
     left, top, width, height = scene().box()
     cut = left + width // 2 // 2 * 2
-    options = Options(box=(left, top, cut - left, height), focal=300.0)
+    options = FootageOptions(box=(left, top, cut - left, height), focal=300.0)
     found = findings(np.ascontiguousarray(scene().pictures[:, :, : cut // 2 * 2]), tmp_path, options)
     assert found["framing"].verdict == "stop"
 
@@ -58,7 +58,7 @@ def test_drift_and_blur_are_told(tmp_path: Path) -> None:
     blurred = np.stack([cv2.GaussianBlur(p, (0, 0), 3.0) for p in scene(tint=0.15).pictures])
     for i, mask in enumerate(scene().object):
         files.write_png(tmp_path / "m" / f"{i}.png", (mask * np.uint8(255))[..., None])
-    found = findings(blurred, tmp_path, Options(masks=tmp_path / "m", focal=300.0))
+    found = findings(blurred, tmp_path, FootageOptions(masks=tmp_path / "m", focal=300.0))
     assert found["sharpness"].verdict != "good"
     assert found["exposure"].verdict == "warn"
     assert "colours by" in found["exposure"].state

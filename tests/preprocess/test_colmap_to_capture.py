@@ -21,7 +21,8 @@ from tumble.datasets import folder
 from tumble.io import files
 from tumble.io.files import BadFile
 from tumble.preprocess import check, colmap_to_capture
-from tumble.preprocess.survey import Options
+from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.source import kind_of
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
 CENTRE, UNIT = np.array([3.0, -1.0, 7.0]), 2.5
@@ -97,8 +98,8 @@ def save(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path)
 
 
-def made(tmp_path: Path, options: Options | None = None, **how: Any) -> Path:
-    return colmap_to_capture.capture_from_model(write(tmp_path, **how), tmp_path / "out", options or Options())
+def made(tmp_path: Path, options: FootageOptions | None = None, **how: Any) -> Path:
+    return colmap_to_capture.capture_from_model(write(tmp_path, **how), tmp_path / "out", options or FootageOptions())
 
 
 def object_from_room(capture_path: Path, *, still: bool = False) -> tuple[np.ndarray, np.ndarray, float]:
@@ -140,7 +141,7 @@ def assert_points_lie_where_they_are_painted(path: Path, *, still: bool = False)
     ("model", "masks", "size"), [(write_binary, "stem", 256), (write_text, "name", 100), (write_binary, "alpha", 160)]
 )
 def test_points_lie_where_the_capture_says(model: Callable[..., Path], masks: str, size: int, tmp_path: Path) -> None:
-    path = made(tmp_path, Options(size=size), model=model, masks=masks)
+    path = made(tmp_path, FootageOptions(size=size), model=model, masks=masks)
     capture = folder.load(path)
     assert len(capture) == N
     assert capture.light == "object"
@@ -171,7 +172,7 @@ def test_the_object_fills_the_unit_ball_upright_around_the_origin(tmp_path: Path
 
 def test_a_turned_object_keeps_the_light_with_one_camera(tmp_path: Path) -> None:
     """A turntable under a fixed camera: after one common turn of the camera, the poses still turn about one axis."""
-    path = made(tmp_path, Options(light="camera"), still=True)
+    path = made(tmp_path, FootageOptions(light="camera"), still=True)
     capture = folder.load(path)
     assert capture.light == "camera"
     assert_points_lie_where_they_are_painted(path, still=True)
@@ -191,20 +192,22 @@ def test_what_lies_beyond_a_picture_is_unknown(tmp_path: Path) -> None:
             values = np.asarray(Image.open(file)).copy()
             values[:, :170] = 0
             save(file, values)
-    capture = folder.load(colmap_to_capture.capture_from_model(source, tmp_path / "out", Options()))
-    plain = folder.load(colmap_to_capture.capture_from_model(write(tmp_path / "again"), tmp_path / "other", Options()))
+    capture = folder.load(colmap_to_capture.capture_from_model(source, tmp_path / "out", FootageOptions()))
+    plain = folder.load(
+        colmap_to_capture.capture_from_model(write(tmp_path / "again"), tmp_path / "other", FootageOptions())
+    )
     assert (plain.masks == UNKNOWN).float().mean() < 0.1
     for masks in (capture.masks, plain.masks):
         assert ((masks == OBJECT) | (masks == BACKGROUND) | (masks == UNKNOWN)).all()
     assert (capture.images[capture.masks == BACKGROUND] == 0).all()
-    narrow = made(tmp_path / "narrow", Options(frames=3))
+    narrow = made(tmp_path / "narrow", FootageOptions(frames=3))
     assert len(folder.load(narrow)) == 3
 
 
 def test_an_empty_mask_drops_its_picture(tmp_path: Path) -> None:
     source = write(tmp_path)
     save(source / "masks" / "one" / "002.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    path = colmap_to_capture.capture_from_model(source, tmp_path / "out", Options())
+    path = colmap_to_capture.capture_from_model(source, tmp_path / "out", FootageOptions())
     origin = files.read_json(path / "ingest.json")
     assert origin["without_object"] == ["one/002.png"]
     assert len(folder.load(path)) == N - 1
@@ -216,16 +219,16 @@ def test_an_empty_mask_drops_its_picture(tmp_path: Path) -> None:
 
 def test_a_run_takes_the_folder_once_and_refuses_other_options(tmp_path: Path) -> None:
     source, out = write(tmp_path), tmp_path / "run"
-    path = pipeline.ingested(source, out, Options())
+    path = pipeline.ingested(source, out, FootageOptions())
     assert path == out / "capture"
-    assert pipeline.ingested(source, out, Options()) == path
+    assert pipeline.ingested(source, out, FootageOptions()) == path
     with pytest.raises(BadFile, match=r"options\.light is 'object' there and 'camera' here"):
-        pipeline.ingested(source, out, Options(light="camera"))
+        pipeline.ingested(source, out, FootageOptions(light="camera"))
 
 
 def test_check_says_what_the_pictures_are_good_for(tmp_path: Path) -> None:
     source = write(tmp_path)
-    found = {finding.subject: finding for finding in check.check(source, tmp_path / "out", Options())}
+    found = {finding.subject: finding for finding in check.check_footage(source, tmp_path / "out", FootageOptions())}
     # The four balls are the size of one of 33 pixels; all else is well.
     assert {subject for subject, finding in found.items() if finding.verdict == "stop"} == {"size"}
     assert "12 pictures with a pose, 4 points, off by 0.40 pixels" in found["model"].state
@@ -234,7 +237,7 @@ def test_check_says_what_the_pictures_are_good_for(tmp_path: Path) -> None:
     # Every other mask is moved by a quarter of the picture: they no longer look at one point.
     for mask in sorted((source / "masks").rglob("*.png"))[::2]:
         save(mask, np.roll(np.asarray(Image.open(mask)), -WIDTH // 4, 1))
-    moved = {finding.subject: finding for finding in check.check(source, tmp_path / "out", Options())}
+    moved = {finding.subject: finding for finding in check.check_footage(source, tmp_path / "out", FootageOptions())}
     assert (found["agreement"].verdict, moved["agreement"].verdict) == ("good", "stop")
 
 
@@ -253,17 +256,21 @@ def wipe(path: Path) -> None:
         save(mask, np.zeros((HEIGHT, WIDTH), np.uint8))
 
 
-BROKEN: dict[str, tuple[Callable[[Path], Any], Options, str]] = {
-    "a missing picture": (lambda p: (p / "images/two/007.png").unlink(), Options(), r"007\.png: is missing"),
-    "a missing mask": (lambda p: (p / "masks/two/007.png").unlink(), Options(), r"two: has no mask for 007\.png"),
-    "no masks": (lambda p: (p / "masks").rename(p / "other"), Options(), r"000\.png: has no mask"),
-    "shrunk pictures": (shrink, Options(), r"001\.png: is 200 x 150 pixels, its model says 400 x 300"),
-    "a path to elsewhere": (escape, Options(), r"'\.\./\.\./x\.png' leaves the folder"),
-    "empty masks": (wipe, Options(), "has masks, and all are empty"),
-    "a second lens": (lambda p: None, Options(fov=40.0), "--fov contradicts it"),
+BROKEN: dict[str, tuple[Callable[[Path], Any], FootageOptions, str]] = {
+    "a missing picture": (lambda p: (p / "images/two/007.png").unlink(), FootageOptions(), r"007\.png: is missing"),
+    "a missing mask": (
+        lambda p: (p / "masks/two/007.png").unlink(),
+        FootageOptions(),
+        r"has no mask for 007\.png",
+    ),
+    "no masks": (lambda p: (p / "masks").rename(p / "other"), FootageOptions(), r"000\.png: has no mask"),
+    "shrunk pictures": (shrink, FootageOptions(), r"001\.png: is 200 x 150 pixels, its model says 400 x 300"),
+    "a path to elsewhere": (escape, FootageOptions(), r"'\.\./\.\./x\.png' leaves the folder"),
+    "empty masks": (wipe, FootageOptions(), "has masks, and all are empty"),
+    "a second lens": (lambda p: None, FootageOptions(fov=40.0), "--fov contradicts it"),
     "text as a model": (
         lambda p: (p / "sparse/0/images.bin").write_text("hello"),
-        Options(),
+        FootageOptions(),
         r"images\.bin: is damaged",
     ),
 }
@@ -281,6 +288,6 @@ def test_a_broken_folder_is_refused_by_file_and_rule(name: str, tmp_path: Path) 
 
 def test_a_capture_folder_with_a_model_beside_it_is_a_capture(tmp_path: Path) -> None:
     path = write(tmp_path)
-    assert colmap_to_capture.recognises(path)
+    assert kind_of(path) == "posed pictures"
     (path / folder.TRANSFORMS).write_text(json.dumps({}))
-    assert not colmap_to_capture.recognises(path)
+    assert kind_of(path) == "capture"

@@ -18,7 +18,7 @@ CORNERS[:33, :40], CORNERS[:33, 40:], CORNERS[33:, :40] = (250, 0, 0), (0, 250, 
 BARE = {"focal": None, "fov": None, "fisheye": None, "distortion": None}
 
 
-def opened(path: Path, masks: Path | None = None, *, invert: bool = False) -> list[footage.Frame]:
+def opened(path: Path, masks: Path | None = None, *, invert: bool = False) -> list[footage.FootageFrame]:
     return list(footage.frames(footage.open_footage(path, masks), invert_masks=invert))
 
 

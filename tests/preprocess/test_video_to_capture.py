@@ -11,11 +11,12 @@ from tumble.datasets import folder
 from tumble.io import files, video
 from tumble.io.files import BadFile
 from tumble.preprocess import video_to_capture
+from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.segmentation import overlap
-from tumble.preprocess.survey import Options, survey
+from tumble.preprocess.survey import survey
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
-SHOWN = Options(box=scene().box())
+SHOWN = FootageOptions(box=scene().box())
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A film, in a folder with a difficult name, and its capture."""
     root = tmp_path_factory.mktemp("drei Dinge – ä")
     film = written(scene().pictures, root / "mein Film.mp4")
-    return film, video_to_capture.capture_from_video(film, root / "capture", Options(box=scene().box(), focal=300.0))
+    return film, video_to_capture.capture_from_video(
+        film, root / "capture", FootageOptions(box=scene().box(), focal=300.0)
+    )
 
 
 def test_a_capture_can_be_loaded_and_has_no_poses(made: tuple[Path, Path]) -> None:
@@ -72,7 +75,7 @@ def test_a_larger_film_is_shrunk_and_its_camera_with_it(tmp_path: Path) -> None:
     for i, mask in enumerate(film.object):
         large = np.kron(mask.astype(np.uint8) * 255, np.ones((4, 4), np.uint8))
         files.write_png(tmp_path / "m" / f"{i}.png", large[..., None])
-    options = Options(masks=tmp_path / "m", focal=1200.0, size=96)
+    options = FootageOptions(masks=tmp_path / "m", focal=1200.0, size=96)
     out = video_to_capture.capture_from_video(tmp_path / "x.mp4", tmp_path / "out", options)
     capture, origin = folder.load(out), files.read_json(out / video_to_capture.PROVENANCE)
     top, left, height, width = origin["window_top_left_height_width"]
@@ -94,7 +97,7 @@ def test_drift_of_the_camera_is_taken_out_of_the_frames(tmp_path: Path) -> None:
     """Red swings by 15 %; after compensation a frame has the red of the film without drift, to 4 codes on average."""
     tinted, plain = scene(tint=0.15), scene()
     film = written(tinted.pictures, tmp_path / "x.mp4")
-    out = video_to_capture.capture_from_video(film, tmp_path / "out", Options(box=tinted.box(), focal=300.0))
+    out = video_to_capture.capture_from_video(film, tmp_path / "out", FootageOptions(box=tinted.box(), focal=300.0))
     capture, origin = folder.load(out), files.read_json(out / video_to_capture.PROVENANCE)
     top, left, height, width = origin["window_top_left_height_width"]
     before, after = [], []
@@ -112,7 +115,9 @@ def test_a_folder_of_pictures_with_alpha_keeps_all_of_them(tmp_path: Path) -> No
     for i in range(5):
         alpha = np.where(film.object[i], 255, 0).astype(np.uint8)
         files.write_png(tmp_path / "in" / f"{i}.png", np.dstack([film.pictures[i], alpha]))
-    capture = folder.load(video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "out", Options(fov=40.0)))
+    capture = folder.load(
+        video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "out", FootageOptions(fov=40.0))
+    )
     assert len(capture) == 5
 
 
@@ -121,7 +126,7 @@ def test_an_empty_mask_drops_its_frame_and_only_empty_ones_are_refused(tmp_path:
     for i in range(5):
         files.write_png(tmp_path / "in" / "images" / f"{i}.png", film.pictures[i])
         files.write_png(tmp_path / "in" / "masks" / f"{i}.png", (film.object[i] * np.uint8(255 * (i != 2)))[..., None])
-    out = video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "out", Options())
+    out = video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "out", FootageOptions())
     assert [said["source_frame"] for said in files.read_json(out / video_to_capture.PROVENANCE)["frames"]] == [
         0,
         1,
@@ -131,23 +136,23 @@ def test_an_empty_mask_drops_its_frame_and_only_empty_ones_are_refused(tmp_path:
     for i in range(5):
         files.write_png(tmp_path / "in" / "masks" / f"{i}.png", np.zeros((HEIGHT, WIDTH, 1), np.uint8))
     with pytest.raises(BadFile, match="all are empty"):
-        video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "again", Options())
+        video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "again", FootageOptions())
 
 
 @pytest.mark.parametrize(
     ("pictures", "options", "message"),
     [
-        (scene().pictures[:1], Options(), "nothing that moves"),
+        (scene().pictures[:1], FootageOptions(), "nothing that moves"),
         (scene(still=True).pictures, SHOWN, "turns by"),
         (np.stack([np.roll(p, 2 * i, 1) for i, p in enumerate(scene().pictures)]), SHOWN, "a camera that moved"),
-        (scene().pictures, Options(box=(100, 100, 100, 100)), "the hint lies outside"),
-        (scene().pictures, Options(box=(1, 1, 20, 20), at=99), "--at is 99"),
-        (np.repeat(scene().background[None], 8, 0), Options(), "nothing that moves"),
-        (np.zeros((4, 40, 40, 3), np.uint8), Options(), "is 40 x 40 pixels"),
+        (scene().pictures, FootageOptions(box=(100, 100, 100, 100)), "the hint lies outside"),
+        (scene().pictures, FootageOptions(box=(1, 1, 20, 20), at=99), "--at is 99"),
+        (np.repeat(scene().background[None], 8, 0), FootageOptions(), "nothing that moves"),
+        (np.zeros((4, 40, 40, 3), np.uint8), FootageOptions(), "is 40 x 40 pixels"),
     ],
 )
 def test_what_cannot_be_a_capture_is_refused_and_leaves_nothing(
-    pictures: np.ndarray, options: Options, message: str, tmp_path: Path
+    pictures: np.ndarray, options: FootageOptions, message: str, tmp_path: Path
 ) -> None:
     film = written(pictures, tmp_path / "x.mp4")
     with pytest.raises(BadFile, match=rf"x\.mp4: .*{message}"):
@@ -166,18 +171,18 @@ def test_nothing_is_overwritten_and_a_failure_midway_leaves_nothing(
 
     monkeypatch.setattr(video_to_capture, "preview", fail)
     with pytest.raises(OSError, match="disk full"):
-        video_to_capture.capture_from_video(made[0], tmp_path / "out", Options(box=scene().box()))
+        video_to_capture.capture_from_video(made[0], tmp_path / "out", FootageOptions(box=scene().box()))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_long_films_are_thinned_and_endless_ones_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     film = written(scene().pictures, tmp_path / "x.mp4")
     monkeypatch.setattr("tumble.preprocess.survey.SURVEYED", 8)
-    found = survey(film, Options(box=scene().box(), frames=8))
+    found = survey(film, FootageOptions(box=scene().box(), frames=8))
     assert found.numbers.tolist() == [0, 4, 8, 12, 16]
     monkeypatch.setattr("tumble.preprocess.survey.MOST_FRAMES", 10)
     with pytest.raises(BadFile, match="has more than 10 frames"):
-        survey(film, Options(box=scene().box(), frames=8))
+        survey(film, FootageOptions(box=scene().box(), frames=8))
 
 
 @pytest.mark.parametrize(
@@ -192,4 +197,4 @@ def test_long_films_are_thinned_and_endless_ones_refused(tmp_path: Path, monkeyp
 )
 def test_contradicting_options_are_refused(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Options(**options)
+        FootageOptions(**options)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.oracles.directions import fibonacci_hemisphere, spherical
 from tumble.maths import directions
 from tumble.rendering import brdf
 
@@ -75,7 +76,7 @@ def test_the_fit_of_fresnel_is_that_of_glass() -> None:
 def test_the_peak_of_a_smooth_lobe_keeps_its_digits_in_float32() -> None:
     """Two milliradians from the mirror direction, nine tenths of alpha; noh^2 alone would be off by 2 percent."""
     theta = torch.linspace(0, 0.01, 50, dtype=DOUBLE)
-    wi, wo = directions.spherical(theta, 0.0), UP.double()
+    wi, wo = spherical(theta, 0.0), UP.double()
     exact = brdf.ggx(wi, wo, UP.double(), roughness=0.05, f0=0.04)
     assert exact[0].item() == pytest.approx(0.04 / (4 * math.pi * 0.05**4))
     single = brdf.ggx(wi.float(), UP, UP, roughness=0.05, f0=0.04)
@@ -87,15 +88,15 @@ def test_the_peak_of_a_smooth_lobe_keeps_its_digits_in_float32() -> None:
 @pytest.mark.parametrize("theta", [0.1, 0.6, 1.2])
 def test_ggx_never_creates_energy(roughness: float, theta: float) -> None:
     """Under uniform light glass sends back some light, and no more than a perfect mirror of the same microfacets."""
-    wi, area = directions.fibonacci_hemisphere(1 << 16)
-    wo = directions.spherical(theta, phi=0.0)
+    wi, area = fibonacci_hemisphere(1 << 16)
+    wo = spherical(theta, phi=0.0)
     reflected = (brdf.ggx(wi, wo, UP, roughness=roughness, f0=0.04) * wi[:, 2:] * area).sum(0)
     assert 0.01 < reflected.item() <= 0.3
 
 
 def test_lambert_sends_back_exactly_its_albedo() -> None:
     albedo = torch.tensor([0.2, 0.5, 1.0], dtype=DOUBLE)
-    wi, area = directions.fibonacci_hemisphere(64, dtype=DOUBLE)
+    wi, area = fibonacci_hemisphere(64, dtype=DOUBLE)
     reflected = (brdf.lambert(albedo) * wi[:, 2:] * area).sum(0)
     # Midpoints in z integrate z exactly.
     torch.testing.assert_close(reflected, albedo, rtol=1e-12, atol=0)
@@ -104,10 +105,10 @@ def test_lambert_sends_back_exactly_its_albedo() -> None:
 @pytest.mark.parametrize(("roughness", "excess"), [(0.1, 1.454), (0.2, 1.400), (0.3, 1.294)])
 def test_a_white_surface_returns_more_than_it_gets(roughness: float, excess: float) -> None:
     """Known and kept: the paper adds the lobes without taking the specular share from the diffuse one."""
-    wi, area = directions.fibonacci_hemisphere(1 << 17, dtype=DOUBLE)
+    wi, area = fibonacci_hemisphere(1 << 17, dtype=DOUBLE)
     returned = []
     for theta in torch.linspace(1.34, 1.43, 7).tolist():
-        wo = directions.spherical(torch.tensor(theta, dtype=DOUBLE), phi=0.0)
+        wo = spherical(torch.tensor(theta, dtype=DOUBLE), phi=0.0)
         f = brdf.evaluate(wi, wo, UP.double(), albedo=WHITE, roughness=roughness, f0=0.04)
         returned.append((f * wi[:, 2:] * area).sum(0)[0].item())
     # The largest over theta, recorded to three digits.
@@ -167,7 +168,7 @@ def test_gradients_stay_finite_at_the_mirror_the_horizon_and_against_the_eye() -
 def test_the_density_of_samples_integrates_to_one(roughness: float, theta: float) -> None:
     """Over the whole sphere: GGX samples that fall below the horizon are part of it, with value 0."""
     wi = directions.fibonacci_sphere(1 << 18, dtype=DOUBLE)
-    wo = directions.spherical(torch.tensor(theta, dtype=DOUBLE), 0.3)
+    wo = spherical(torch.tensor(theta, dtype=DOUBLE), 0.3)
     density = brdf.pdf(wi, wo, UP.double(), roughness=roughness)
     # The lattice's error for a lobe of 0.1 radian, and the integrable pole opposite to the eye.
     assert (density.mean() * 4 * math.pi).item() == pytest.approx(1.0, abs=1e-3)
@@ -178,7 +179,7 @@ def test_the_density_of_samples_integrates_to_one(roughness: float, theta: float
 def test_samples_are_distributed_as_their_density_says(roughness: float, theta: float) -> None:
     """Pearson's chi-square over the cells of a map of the sphere."""
     n = torch.tensor([0.48, -0.64, 0.6], dtype=DOUBLE)
-    wo = directions.local_frame(n) @ directions.spherical(torch.tensor(theta, dtype=DOUBLE), 1.0)
+    wo = directions.local_frame(n) @ spherical(torch.tensor(theta, dtype=DOUBLE), 1.0)
     rows, columns, draws = 10, 20, 200_000
 
     def cell(d: Tensor) -> Tensor:
@@ -218,13 +219,13 @@ def test_half_vectors_of_the_smoothest_lobe_follow_their_law_in_float32() -> Non
 def test_importance_sampling_finds_what_quadrature_finds(roughness: float, theta: float) -> None:
     """Under light that is brighter to one side; both lobes, a coloured albedo."""
     albedo = torch.tensor([0.8, 0.4, 0.1], dtype=DOUBLE)
-    n, wo = UP.double(), directions.spherical(torch.tensor(theta, dtype=DOUBLE), 0.0)
+    n, wo = UP.double(), spherical(torch.tensor(theta, dtype=DOUBLE), 0.0)
 
     def integrand(wi: Tensor) -> Tensor:
         f = brdf.evaluate(wi, wo, n, albedo=albedo, roughness=roughness, f0=0.5)
         return f * wi[:, 2:].clamp_min(0) * (1 + 0.8 * wi[:, :1])
 
-    wi, area = directions.fibonacci_hemisphere(1 << 17, dtype=DOUBLE)
+    wi, area = fibonacci_hemisphere(1 << 17, dtype=DOUBLE)
     quadrature = (integrand(wi) * area).sum(0)
     draws = brdf.sample(uniform(100_000, seed=3), wo, n, roughness=roughness)
     terms = integrand(draws) / brdf.pdf(draws, wo, n, roughness=roughness)
@@ -252,8 +253,8 @@ def table() -> Tensor:
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("theta", [0.0, 0.6, 1.2, 1.5])
 def test_split_sum_is_the_albedo_found_by_brute_force(table: Tensor, roughness: float, theta: float, f0: float) -> None:
-    wi, area = directions.fibonacci_hemisphere(1 << 16, dtype=DOUBLE)
-    wo = directions.spherical(torch.tensor(theta, dtype=DOUBLE), 0.0)
+    wi, area = fibonacci_hemisphere(1 << 16, dtype=DOUBLE)
+    wo = spherical(torch.tensor(theta, dtype=DOUBLE), 0.0)
     exact = (brdf.ggx(wi, wo, UP.double(), roughness=roughness, f0=f0) * wi[:, 2:] * area).sum()
     share = brdf.split_sum(table, wo[2:].float(), roughness)
     # The error of 4096 half vectors, and linear interpolation between 64 entries where grazing Fresnel is steep.

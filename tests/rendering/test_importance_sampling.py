@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.rendering.test_shade import CAMERA, F0, ball, grey, lamp, rms, seen_by_all, uniform
+from tests.rendering.test_shading import CAMERA, F0, ball, grey, lamp, rms, seen_by_all, uniform
 from tests.surfaces import GAMMA, look_at, sphere, torus
 from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_solid_angles
-from tumble.rendering import importance_sampling, shade
-from tumble.rendering.prefilter import prefilter
-from tumble.rendering.rasterize import rasterize
-from tumble.rendering.shade import Bounce
+from tumble.rendering import importance_sampling, shading
+from tumble.rendering.prefiltered_light import prefilter
+from tumble.rendering.rasterizer import rasterize
+from tumble.rendering.shading import Bounce
 from tumble.rendering.trace import build, open_sky
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
@@ -26,17 +26,19 @@ def one_texel() -> Environment:
     return Environment.from_radiance(radiance)
 
 
-def quadrature(seen: shade.Surface, roughness: float, environment: Environment, R_env_obj: Tensor) -> Tensor:
+def quadrature(seen: shading.Surface, roughness: float, environment: Environment, R_env_obj: Tensor) -> Tensor:
     """Both lobes over 2^17 even directions, nothing in the way."""
     total, n = torch.zeros_like(seen.points), 1 << 17
     for directions in fibonacci_sphere(n).split(1 << 14):
         sky = open_sky(directions, len(seen.pixels))
-        part = shade.shade(seen, *grey(seen, 0.5, roughness), environment, R_env_obj, sky, f0=F0)
+        part = shading.shade(seen, *grey(seen, 0.5, roughness), environment, R_env_obj, sky, f0=F0)
         total += len(directions) / n * part
     return total
 
 
-def relit(seen: shade.Surface, roughness: float, environment: Environment, R: Tensor, n: int, seed: int = 0) -> Tensor:
+def relit(
+    seen: shading.Surface, roughness: float, environment: Environment, R: Tensor, n: int, seed: int = 0
+) -> Tensor:
     light, generator = importance_sampling.light_sampler(environment), torch.Generator().manual_seed(seed)
     counts = {"n_brdf": n, "n_light": n}
     material = grey(seen, 0.5, roughness)
@@ -113,7 +115,7 @@ def test_shading_in_chunks_is_shading_at_once(monkeypatch: pytest.MonkeyPatch) -
 def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_back() -> None:
     """A white torus in a white furnace: one bounce, lit from everywhere, is as bright as the light it hides."""
     gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
-    seen = shade.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
+    seen = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
     light, tracer = importance_sampling.light_sampler(uniform()), build(gaussians, GAMMA)
     # Specular light on top of white would be more than the furnace holds: no f0.
     rough = torch.ones(1000, 1)

@@ -35,8 +35,8 @@ def test_a_small_lamp_is_not_lost_between_the_directions(rows: int, row: int, co
     # The camera stands on the lamp's side, a little to the left.
     T_cam_obj = look_at((4 * lamp + torch.tensor([0.5, 0.5, 0.7])).tolist())
     poses = SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None])
-    asset = Asset(gaussians, GAMMA, material, None, Trajectory(poses, "object"), CAMERA)
     environment = Environment.from_radiance(radiance)
+    asset = Asset(gaussians, GAMMA, material, environment, Trajectory(poses, "object"), CAMERA)
     (picture,) = relight.preview(relight.Config(), asset, environment, asset.trajectory, CAMERA)
     normals = sphere_normals(T_cam_obj)
     inside = normals.norm(dim=-1) > 0.5

@@ -6,12 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.oracles.irradiance import irradiance_coefficients
 from tests.surfaces import GAMMA, MAJOR, MINOR, look_at, sphere, torus
 from tumble.maths import spherical_harmonics
 from tumble.maths.directions import fibonacci_sphere
 from tumble.rendering import trace as tracing
-from tumble.rendering.rasterize import rasterize
-from tumble.rendering.shade import surface
+from tumble.rendering.rasterizer import rasterize
+from tumble.rendering.shading import surface
 from tumble.scene.camera import Camera
 from tumble.scene.gaussians import Gaussians
 
@@ -178,7 +179,7 @@ def test_transfer_is_the_irradiance_of_what_is_seen() -> None:
         truth = 4 * math.pi / 4096 * (cosine * seen) @ light
         torch.testing.assert_close(tracing.transfer([sky], normals) @ coefficients, truth, atol=1e-3, rtol=0)
     opened = tracing.transfer([tracing.open_sky(directions, 9)], normals) @ coefficients
-    series = spherical_harmonics.series(spherical_harmonics.irradiance_coefficients(coefficients), normals)
+    series = spherical_harmonics.series(irradiance_coefficients(coefficients), normals)
     torch.testing.assert_close(opened, series, atol=0.01, rtol=0)
 
 

@@ -22,7 +22,7 @@ from tumble.export import confidence
 from tumble.io.files import BadFile
 from tumble.maths.images import linear_from_srgb, photograph, srgb_from_linear
 from tumble.maths.se3 import SE3
-from tumble.poses.result import Health, Observability
+from tumble.poses.result import Observability, PoseQuality
 from tumble.report import health_card, preset_lights, svg, training_views
 from tumble.report import page as report
 from tumble.scene.asset import Asset
@@ -77,7 +77,7 @@ def capture(asset: Asset) -> Capture:
 @pytest.fixture(scope="module")
 def page(asset: Asset, capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    export.glb(asset, export.surface(asset, SMALL), SMALL, 1.0, folder / "asset.glb")
+    export.write_textured_mesh(asset, export.extract_mesh(asset, SMALL), SMALL, 1.0, folder / "asset.glb")
     report.build(asset, capture, folder / "asset.glb", STORY, None, folder / "report.html")
     return folder / "report.html"
 
@@ -118,7 +118,6 @@ def test_a_guessed_focal_length_is_called_one(page: Path, asset: Asset, capture:
 
 def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:
     assert embedded(page, "glb")[:4] == b"glTF"
-    assert asset.environment is not None
     for name, light in {
         "recovered": asset.environment,
         "studio": preset_lights.studio(),
@@ -183,7 +182,7 @@ def test_renders_of_photographs_that_are_renders_are_the_same(asset: Asset, capt
     assert min(frame.psnr for frame in frames) > 55
     assert all(frame.iou == 1 for frame in frames)
     assert max(abs(frame.stops) for frame in frames) < 0.02
-    rows = health_card.card(frames, None, confidence.confidence(asset, asset.camera))
+    rows = health_card.card(frames, None, confidence.confidence_of(asset, asset.camera))
     assert [row.verdict for row in rows[:5]] == ["good", "good", "good", "none", "none"]
 
 
@@ -198,10 +197,10 @@ def test_the_card_names_drift_lost_frames_and_outliers(asset: Asset, capture: Ca
     lost[3] = True
     ones = torch.ones(N)
     sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
-    health = Health(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), sight)
+    health = PoseQuality(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), sight)
     frames = list(training_views.frames(training_views.scene(asset), spoilt))
     fit, outline, exposure, away, match, _ = health_card.card(
-        frames, health, confidence.confidence(asset, asset.camera)
+        frames, health, confidence.confidence_of(asset, asset.camera)
     )
     assert fit.marks[0] == "bad" or fit.verdict != "good"
     # One frame's mask is shifted by a quarter of the picture.
@@ -219,7 +218,7 @@ def test_the_card_names_drift_lost_frames_and_outliers(asset: Asset, capture: Ca
 def test_matches_that_agree_do_not_hide_a_drift() -> None:
     ones = torch.ones(N)
     sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
-    health = Health(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), sight)
+    health = PoseQuality(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), sight)
     row = health_card._match(health)
     assert row.verdict == "bad"
     assert "28.6 degrees" in row.sentence
@@ -227,9 +226,9 @@ def test_matches_that_agree_do_not_hide_a_drift() -> None:
 
 def test_light_that_turns_with_the_object_comes_from_few_sides(asset: Asset) -> None:
     """At most one cell per lamp; under light that stands still, more."""
-    still = confidence.confidence(asset, asset.camera)
+    still = confidence.confidence_of(asset, asset.camera)
     turned = dataclasses.replace(asset, trajectory=dataclasses.replace(asset.trajectory, light="object"))
-    static = confidence.confidence(turned, asset.camera)
+    static = confidence.confidence_of(turned, asset.camera)
     assert static.lights.max() <= confidence.LAMPS < health_card.FEW_LIGHTS
     seen = still.views > 0
     assert torch.equal(seen, static.views > 0)

@@ -21,7 +21,7 @@ from tumble.scene.camera import Camera  # noqa: E402
 from tumble.scene.environment import Environment  # noqa: E402
 from tumble.scene.trajectory import Trajectory  # noqa: E402
 from tumble.synthetic import pathtracer, synthesize, trajectories  # noqa: E402
-from tumble.synthetic.synthesize import Options  # noqa: E402
+from tumble.synthetic.options import SynthOptions  # noqa: E402
 
 # Dr.Jit speaks of its own deprecations when it is imported; they are not ours to mend.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -278,7 +278,7 @@ def test_a_turntables_camera_sees_the_rooms_ceiling_where_it_is(tmp_path: Path) 
     radiance = torch.full((h, 2 * h, 3), 0.01)
     radiance[:3] = 50.0
     Environment.from_radiance(radiance).write(tmp_path / "room.hdr")
-    light = synthesize._capture_light(Options(env=str(tmp_path / "room.hdr"), setting="turntable"))
+    light = synthesize._capture_light(SynthOptions(env=str(tmp_path / "room.hdr"), setting="turntable"))
     e = math.radians(25)
     assert light.lookup(torch.tensor([0.0, math.cos(e), math.sin(e)])).min() > 25
     assert light.lookup(torch.tensor([0.0, math.cos(e), -math.sin(e)])).max() < 1
@@ -296,10 +296,10 @@ def captures(pebble: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     room().write(root / "room.hdr")
     room(16).write(root / "other.hdr")
     return {
-        setting: synthesize.synthesize(
+        setting: synthesize.render_capture(
             pebble,
             root / setting,
-            Options(env=str(root / "room.hdr"), setting=setting, relight=(str(root / "other.hdr"),), **TINY),
+            SynthOptions(env=str(root / "room.hdr"), setting=setting, relight=(str(root / "other.hdr"),), **TINY),
         )
         for setting in trajectories.SETTINGS
     }
@@ -347,25 +347,25 @@ def test_an_interrupted_capture_goes_on_and_ends_the_same(captures: dict[str, Pa
         (path / gone).unlink()
     kept = (path / "images" / "0000.png").stat().st_mtime_ns
     root = path.parent
-    options = Options(env=str(root / "room.hdr"), setting="turntable", relight=(str(root / "other.hdr"),), **TINY)
-    synthesize.synthesize(pebble, path, options)
+    options = SynthOptions(env=str(root / "room.hdr"), setting="turntable", relight=(str(root / "other.hdr"),), **TINY)
+    synthesize.render_capture(pebble, path, options)
     assert (path / "images" / "0000.png").stat().st_mtime_ns == kept
     assert {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()} == before
 
 
 def test_a_folder_of_another_capture_is_not_touched(captures: dict[str, Path], pebble: Path, tmp_path: Path) -> None:
-    options = Options(env="white", setting="dome", **TINY)
+    options = SynthOptions(env="white", setting="dome", **TINY)
     with pytest.raises(BadFile, match="other options"):
-        synthesize.synthesize(pebble, captures["dome"], options)
+        synthesize.render_capture(pebble, captures["dome"], options)
     (tmp_path / "diary.txt").write_text("mine")
     with pytest.raises(BadFile, match="not made by tumble synth"):
-        synthesize.synthesize(pebble, tmp_path, options)
+        synthesize.render_capture(pebble, tmp_path, options)
     assert [p.name for p in tmp_path.iterdir()] == ["diary.txt"]
 
 
 def test_a_pose_free_film_under_a_white_light(pebble: Path, tmp_path: Path) -> None:
-    options = Options(env="white", material="diffuse", pose_free=True, video=True, **TINY)
-    path = synthesize.synthesize(pebble, tmp_path / "clip", options)
+    options = SynthOptions(env="white", material="diffuse", pose_free=True, video=True, **TINY)
+    path = synthesize.render_capture(pebble, tmp_path / "clip", options)
     capture, truth = folder.load(path), folder.load_truth(path)
     assert capture.trajectory is None
     assert truth.poses is not None
@@ -383,7 +383,7 @@ def test_a_pose_free_film_under_a_white_light(pebble: Path, tmp_path: Path) -> N
 
 
 def test_a_roughness_sweep_changes_roughness_alone(pebble: Path, tmp_path: Path) -> None:
-    low, high = synthesize.sweep(pebble, tmp_path, Options(env="white", **TINY), (0.2, 0.8))
+    low, high = synthesize.render_captures(pebble, tmp_path, SynthOptions(env="white", **TINY), (0.2, 0.8))
     assert (low.name, high.name) == ("r0.20", "r0.80")
     a, b = folder.load_truth(low), folder.load_truth(high)
     assert torch.equal(a.albedo, b.albedo)
@@ -403,7 +403,7 @@ def test_a_roughness_sweep_changes_roughness_alone(pebble: Path, tmp_path: Path)
 )
 def test_impossible_options_are_refused_by_name(change: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Options(env="white", **change)
+        SynthOptions(env="white", **change)
 
 
 def test_broken_sources_are_named_and_leave_nothing(pebble: Path, tmp_path: Path) -> None:
@@ -414,7 +414,7 @@ def test_broken_sources_are_named_and_leave_nothing(pebble: Path, tmp_path: Path
         (pebble, str(tmp_path / "z.hdr"), r"z\.hdr: is missing"),
     ):
         with pytest.raises(BadFile, match=message):
-            synthesize.synthesize(model, tmp_path / "out", Options(env=env, **TINY))
+            synthesize.render_capture(model, tmp_path / "out", SynthOptions(env=env, **TINY))
         assert not (tmp_path / "out").exists()
 
 
@@ -443,8 +443,8 @@ def test_old_llvm_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.slow
 def test_a_real_object_has_consistent_truth(shared_data: Path, tmp_path: Path) -> None:
     """A real scan through the whole generator: depth of its evaluation views agrees where they overlap."""
-    options = Options(env=str(shared_data / "hdri" / "st_fagans_interior_1k.hdr"), views=4, up="z", samples=64)
-    path = synthesize.synthesize(shared_data / "meshes" / "ycb_006_mustard_bottle.glb", tmp_path / "out", options)
+    options = SynthOptions(env=str(shared_data / "hdri" / "st_fagans_interior_1k.hdr"), views=4, up="z", samples=64)
+    path = synthesize.render_capture(shared_data / "meshes" / "ycb_006_mustard_bottle.glb", tmp_path / "out", options)
     truth = folder.load_truth(path)
     pixel = DISTANCE / float(folder.load(path).camera.fx_fy_cx_cy[0])
     T = truth.trajectory.T_cam_obj

@@ -33,6 +33,30 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
+__all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
+    "Backend",
+    "CORNER",
+    "FACING",
+    "Hits",
+    "NEAR",
+    "NEAR_SIGMAS",
+    "ROUGHNESS_MIN",
+    "Rendering",
+    "TRACE_SIGMAS",
+    "TRACE_T_MIN",
+    "T_MIN",
+    "VISIBLE",
+    "choose",
+    "load",
+    "names",
+    "threads",
+    "threads_for_kernels",
+    "usable_device",
+    "vector_bits",
+]
+
 ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian; the gradient is zero beyond, as the function says."""
 ALPHA_MIN = 1 / 255
@@ -80,6 +104,24 @@ def threads_for_kernels() -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _threads.reset(token)
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of a name, if this machine has it.
+
+    Raises:
+        ValueError: Torch sees none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch sees no NVIDIA GPU here; tumble doctor says what it sees")
+    return torch.device(name)
+
+
+def vector_bits() -> int:
+    """Width of the vectors that the CPU's kernels compute with, on this machine."""
+    from tumble.backends import _native
+
+    return 32 * _native.library().lanes()
 
 
 class Rendering(NamedTuple):

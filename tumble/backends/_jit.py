@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from tumble.backends import _warp
-from tumble.backends._native import SOURCES
+from tumble.backends._cache import SOURCES
 
 ENTRY_POINTS = (
     *("lanes", "sizes", "raster_prepare", "raster_forward", "raster_adjoint", "bvh_build"),

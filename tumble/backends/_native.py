@@ -18,9 +18,9 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
+from tumble.backends._cache import SOURCES, NoCache, folders, writable
 from tumble.backends._structs import STRUCTURES
 
-SOURCES = Path(__file__).parent / "native"
 FLAGS = (
     *("-std=c++17", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-Wno-psabi"),
     *("-fno-exceptions", "-fno-rtti", "-fno-math-errno", "-fno-trapping-math", "-pthread"),
@@ -53,11 +53,18 @@ def library() -> ctypes.CDLL | SimpleNamespace:
 def _by_compiler() -> ctypes.CDLL:
     compiler = find_compiler()
     name = f"kernels-{_build_hash(compiler)}.so"
-    path = next((folder / name for folder in _cache_folders() if (folder / name).is_file()), None)
+    path = next((folder / name for folder in folders() if (folder / name).is_file()), None)
     if path is None:
-        path = _writable(_cache_folders()) / name
+        path = _place(name)
         compile_to(path, compiler)
     return ctypes.CDLL(str(path))
+
+
+def _place(name: str) -> Path:
+    try:
+        return writable() / name
+    except NoCache as reason:
+        raise CannotCompile(str(reason)) from None
 
 
 def _by_warp(no_compiler: CannotCompile) -> SimpleNamespace:
@@ -130,20 +137,3 @@ def _cpu_features() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return "\n".join(sorted({x for x in lines if x.startswith(("flags", "Features", "model name"))}))
     return ""
-
-
-def _cache_folders() -> list[Path]:
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tumble"
-    return [user, Path(tempfile.gettempdir()) / f"tumble-{os.getuid() if hasattr(os, 'getuid') else 'user'}"]
-
-
-def _writable(folders: list[Path]) -> Path:
-    """The first folder that can be made, is ours and is not open to others: a library is code."""
-    for folder in folders:
-        with contextlib.suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            if os.access(folder, os.W_OK):
-                return folder
-    raise CannotCompile(
-        f"none of {', '.join(map(str, folders))} can be written; set XDG_CACHE_HOME to a folder that can"
-    )

@@ -16,12 +16,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from tumble.backends import _native
+from tumble.backends import _cache
 
 LANES = 32
 
 if "WARP_CACHE_PATH" not in os.environ and wp.config.kernel_cache_dir is None:
-    wp.config.kernel_cache_dir = str(_native._writable(_native._cache_folders()) / "warp")
+    wp.config.kernel_cache_dir = str(_cache.writable() / "warp")
 # No greeting; what goes wrong is still said.
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 wp.init()

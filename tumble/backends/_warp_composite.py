@@ -203,7 +203,7 @@ def forward(channels: int) -> wp.Kernel:
 
 @wp.struct
 @no_type_check
-class Seed:
+class PixelSeed:
     """Gradient of a pixel's sums, and what is left of dL/dout . out."""
 
     rgb: wp.vec3
@@ -216,9 +216,9 @@ class Seed:
 
 @wp.func
 @no_type_check
-def seed_at(pixels: wp.array2d[float], v_pixels: wp.array2d[float], i: int, z_0: float) -> Seed:
+def seed_at(pixels: wp.array2d[float], v_pixels: wp.array2d[float], i: int, z_0: float) -> PixelSeed:
     """All but the features'."""
-    s = Seed()
+    s = PixelSeed()
     alpha = pixels[i, 3]
     inv = 1.0 / alpha
     mean = pixels[i, 4] - z_0
@@ -237,7 +237,7 @@ def seed_at(pixels: wp.array2d[float], v_pixels: wp.array2d[float], i: int, z_0:
 
 @wp.struct
 @no_type_check
-class Step:
+class BlendStep:
     """Of the walk at one Gaussian: its blending weight, and the gradients of what was computed at its peak."""
 
     w: float
@@ -249,9 +249,9 @@ class Step:
 
 @wp.func
 @no_type_check
-def step_at(p: Peak, s: Seed, T: float, record: wp.array2d[wp.vec4], g: int) -> Step:
+def step_at(p: Peak, s: PixelSeed, T: float, record: wp.array2d[wp.vec4], g: int) -> BlendStep:
     """Without the features."""
-    o = Step()
+    o = BlendStep()
     o.w = T * p.alpha
     z = record[g, 2][3] + record[g, 2][2] * p.zeta_1
     o.value = s.alpha + wp.dot(s.rgb, xyz(record[g, 3])) + wp.dot(s.normal, xyz(record[g, 4])) + z * (s.z + z * s.zz)
@@ -261,7 +261,7 @@ def step_at(p: Peak, s: Seed, T: float, record: wp.array2d[wp.vec4], g: int) -> 
 
 @wp.func
 @no_type_check
-def geometry_sums(p: Peak, s: Seed, o: Step, T: float, record: wp.array2d[wp.vec4], g: int) -> vec32:
+def geometry_sums(p: Peak, s: PixelSeed, o: BlendStep, T: float, record: wp.array2d[wp.vec4], g: int) -> vec32:
     """A pixel's part of a Gaussian's sums, but for its features."""
     x = vec32()
     conic = record[g, 1]
@@ -324,7 +324,7 @@ def adjoint(channels: int) -> wp.Kernel:
         at = pixel_of(thread, width)
         i = at[1] * width + at[0]
         T = float(0.0)
-        s = Seed()
+        s = PixelSeed()
         f = vec()
         if at[0] < width and at[1] < height and pixels[i, 3] > 0.0:
             T = 1.0

@@ -191,7 +191,7 @@ def _int32(*shape: int) -> Int32[Tensor, "..."]:
     return torch.empty(shape, dtype=torch.int32)
 
 
-class Tree(NamedTuple):
+class CpuBvh(NamedTuple):
     """What `build` hands to the tracing functions."""
 
     bvh: Bvh
@@ -205,7 +205,7 @@ def build(
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
     opacity: Float[Tensor, " n"],
-) -> Tree:
+) -> CpuBvh:
     """See `Backend.build`."""
     n = len(means)
     counts = [-(-n // WIDE)]
@@ -230,12 +230,12 @@ def build(
     W = torch.empty(n * 9)
     _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(W.data_ptr()))
     del work
-    return Tree(t, memory)
+    return CpuBvh(t, memory)
 
 
 @torch.no_grad()
 def trace(
-    bvh: Tree,
+    bvh: CpuBvh,
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     radiance: Float[Tensor, "m 3"],
@@ -251,7 +251,7 @@ def trace(
 
 @torch.no_grad()
 def visible(
-    bvh: Tree,
+    bvh: CpuBvh,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -266,7 +266,7 @@ def visible(
 
 @torch.no_grad()
 def blockers(
-    bvh: Tree,
+    bvh: CpuBvh,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -285,7 +285,7 @@ class _Launch(NamedTuple):
     kept: list[Tensor]
 
 
-def _rays(bvh: Tree, origins: Tensor, directions: Tensor, **more: Tensor) -> _Launch:
+def _rays(bvh: CpuBvh, origins: Tensor, directions: Tensor, **more: Tensor) -> _Launch:
     """Arguments of a search, and the tensors they point to."""
     struct = Rays(
         bvh=ctypes.addressof(bvh.bvh),

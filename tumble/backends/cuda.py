@@ -145,7 +145,7 @@ def _bin(
     return torch.searchsorted(tiles[:n_pairs], every, out_int32=True), listed[:n_pairs]
 
 
-class Tree(NamedTuple):
+class WarpBvh(NamedTuple):
     """What `build` hands to the tracing functions."""
 
     boxes: Any
@@ -162,7 +162,7 @@ def build(
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
     opacity: Float[Tensor, " n"],
-) -> Tree:
+) -> WarpBvh:
     """See `Backend.build`."""
     import warp
 
@@ -176,12 +176,12 @@ def build(
         gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
         _warp.launch(_warp_trace.enclose, len(means), *gaussians, record, low, high)
         boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3))
-    return Tree(boxes, record, low, high)
+    return WarpBvh(boxes, record, low, high)
 
 
 @torch.no_grad()
 def trace(
-    bvh: Tree,
+    bvh: WarpBvh,
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     radiance: Float[Tensor, "m 3"],
@@ -199,7 +199,7 @@ def trace(
 
 @torch.no_grad()
 def visible(
-    bvh: Tree,
+    bvh: WarpBvh,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -217,7 +217,7 @@ def visible(
 
 @torch.no_grad()
 def blockers(
-    bvh: Tree,
+    bvh: WarpBvh,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],

@@ -69,7 +69,7 @@ def rasterize(
     return composite(view, opacity, corners, t_cam_obj, fx_fy_cx_cy, mask.expand(height, width), SHARP)
 
 
-class View(NamedTuple):
+class ProjectedView(NamedTuple):
     """The Gaussians as a camera sees them, nearest first."""
 
     index: Int64[Tensor, " v"]
@@ -89,7 +89,7 @@ def project(
     sh: Float[Tensor, "n k 3"],
     R_cam_obj: Float[Tensor, "3 3"],
     t_cam_obj: Float[Tensor, "3"],
-) -> View:
+) -> ProjectedView:
     """Cull, sort by depth and colour the Gaussians."""
     R_obj_local = rotation(quats)
     p_cam = means @ R_cam_obj.T + t_cam_obj
@@ -106,11 +106,11 @@ def project(
     Y = harmonics(direction, sh.shape[1])
     rgb = torch.einsum("vk,vkc->vc", Y, sh[index]).clamp(min=0)
     WR_obj_cam = R_cam_local.mT / scales[index, :, None]
-    return View(index, p_cam, WR_obj_cam, R_obj_local[index, :, 2], rgb)
+    return ProjectedView(index, p_cam, WR_obj_cam, R_obj_local[index, :, 2], rgb)
 
 
 def composite(
-    view: View,
+    view: ProjectedView,
     opacity: Float[Tensor, " n"],
     corners: Float[Tensor, "n 4 c"],
     t_cam_obj: Float[Tensor, "3"],
@@ -133,7 +133,7 @@ def composite(
             square = (slice(top, min(top + TILE, height)), slice(left, min(left + TILE, width)))
             d = _rays(fx_fy_cx_cy, square)
             near = _near(view, opacity, d, rules)
-            part = View(*(x[near] for x in view))
+            part = ProjectedView(*(x[near] for x in view))
             w, values = _blend(part, opacity, corners, d, z_0, rules)
             row.append(torch.einsum("pv,pvc->pc", w, values).unflatten(0, sums[square].shape[:2]))
             if part.index.numel():
@@ -185,7 +185,9 @@ def _rays(fx_fy_cx_cy: Float[Tensor, "4"], square: tuple[slice, slice]) -> Float
 
 
 @torch.no_grad()
-def _near(view: View, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], rules: Rules) -> Bool[Tensor, " v"]:
+def _near(
+    view: ProjectedView, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], rules: Rules
+) -> Bool[Tensor, " v"]:
     """A superset of the Gaussians that reach any of the rays: their bounding spheres meet the rays' cone."""
     if rules.alpha_min == 0 or view.index.numel() == 0:
         return torch.ones_like(view.index, dtype=torch.bool)
@@ -201,7 +203,7 @@ def _near(view: View, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], rul
 
 
 def _blend(
-    view: View,
+    view: ProjectedView,
     opacity: Float[Tensor, " n"],
     corners: Float[Tensor, "n 4 c"],
     d: Float[Tensor, "p 3"],

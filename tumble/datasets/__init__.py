@@ -11,8 +11,22 @@ The last two are apart so that a reconstruction cannot read its own answer.
 from pathlib import Path
 from types import ModuleType
 
-from tumble.io.files import BadFile
-from tumble.io.plugins import named, names
+from tumble.datasets import folder
+from tumble.datasets._capture_folder import MAPS, capture_document, evaluation_frame, save_capture, training_frame
+from tumble.datasets.folder import read_poses
+from tumble.io import BadFile, named, names
+
+__all__ = [
+    "MAPS",
+    "capture_document",
+    "evaluation_frame",
+    "folder",
+    "layouts",
+    "read_poses",
+    "save_capture",
+    "training_frame",
+    "which",
+]
 
 
 def which(path: Path) -> ModuleType:

@@ -12,16 +12,14 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.scene.camera import Camera
-from tumble.scene.capture import Capture, Truth
+from tumble.io import BadFile, files
+from tumble.scene import Camera, Capture, Truth
 
 MAPS = ("albedo", "roughness", "normal", "depth")
 """Truth maps of an evaluation view, as folders of truth/ and as keys `<map>_path` of its frame."""
 
 
-def document(
+def capture_document(
     camera: Camera, light: str, frames: list[dict[str, Any]], *, setting: str | None, with_light: bool
 ) -> dict[str, Any]:
     """A transforms.json.
@@ -54,7 +52,7 @@ def evaluation_frame(
     return entry | {"relit": {light: f"truth/relit/{light}/{name}" for light in lights}}
 
 
-def save(path: Path, capture: Capture, truth: Truth | None = None, *, setting: str | None = None) -> None:
+def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, setting: str | None = None) -> None:
     """Write a capture, and what is true about it, as a new folder.
 
     Raises:
@@ -69,7 +67,7 @@ def save(path: Path, capture: Capture, truth: Truth | None = None, *, setting: s
     if truth is not None:
         frames += _save_truth(path, capture, truth)
     with_light = truth is not None and truth.light is not None
-    fields = document(capture.camera, capture.light, frames, setting=setting, with_light=with_light)
+    fields = capture_document(capture.camera, capture.light, frames, setting=setting, with_light=with_light)
     files.write_json(path / "transforms.json", fields | ({"focal_source": "guess"} if capture.focal_guessed else {}))
 
 

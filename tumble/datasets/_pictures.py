@@ -7,11 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, Capture
-from tumble.scene.trajectory import Light
+from tumble.io import BadFile, files
+from tumble.scene import BACKGROUND, Camera, Capture, Light
 
 
 def camera(K: np.ndarray, picture: Path) -> Camera:

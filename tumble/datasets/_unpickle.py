@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tumble.io.files import BadFile
+from tumble.io import BadFile
 
 MAX_BYTES = 1 << 20
 """Largest file read, and most bytes of arrays made from it: one frame's metadata has about ten kilobytes."""

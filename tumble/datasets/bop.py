@@ -21,12 +21,9 @@ from jaxtyping import Float, UInt8
 
 from tumble.datasets import _pictures
 from tumble.datasets.folder import RIGID_TOLERANCE
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.maths.se3 import SE3
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, no_views
-from tumble.scene.trajectory import Light, Trajectory
+from tumble.io import BadFile, files
+from tumble.maths import SE3
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture, Light, Trajectory, Truth, no_views
 
 CAMERAS, ANNOTATION = "scene_camera.json", "scene_gt.json"
 LAYOUT = f"SCENE/{CAMERAS}, SCENE/{ANNOTATION}, SCENE/rgb/000000.png and SCENE/mask_visib/000000_000000.png of BOP"

@@ -15,13 +15,25 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.maths.images import linear_from_srgb, photograph
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, REGIONS, UNITS, UNKNOWN, Capture, Truth, no_views
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import LIGHTS, Light, Trajectory
+from tumble.io import BadFile, files
+from tumble.maths import linear_from_srgb, photograph
+from tumble.scene import (
+    BACKGROUND,
+    LIGHTS,
+    OBJECT,
+    REGIONS,
+    UNITS,
+    Camera,
+    Capture,
+    Environment,
+    Light,
+    Trajectory,
+    Truth,
+    decoded_mask,
+    mask_from_alpha,
+    no_views,
+    undistortion,
+)
 
 TRANSFORMS = "transforms.json"
 LAYOUT = f"CAPTURE/{TRANSFORMS} (docs/format.md)"
@@ -189,12 +201,7 @@ def _undistortion(
     coefficients = np.array([_number(document, frame, name) or 0.0 for name in names])
     if not coefficients.any() and not fisheye:
         return None
-    K = camera.matrix.double().numpy().copy()
-    K[:2, 2] -= 0.5  # OpenCV puts the centre of the first pixel at (0, 0)
-    size = (camera.width, camera.height)
-    tables = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
-    x, y = tables(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
-    return lambda picture, how: cv2.remap(picture, x, y, how, borderMode=cv2.BORDER_CONSTANT)
+    return undistortion(camera.opencv_matrix, coefficients, camera, fisheye=fisheye)
 
 
 # Pictures -------------------------------------------------------------------------------------------------------------
@@ -256,18 +263,15 @@ def cut_out(image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -
     return image if image[far].max(initial=0) <= NEARLY_BLACK else np.where(background[..., None], np.uint8(0), image)
 
 
-def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Opaque pixels are the object, clear ones background, what lies between is unknown."""
-    return np.select([alpha >= 250, alpha <= 5], [OBJECT, BACKGROUND], UNKNOWN).astype(np.uint8)
-
-
 def three_valued(mask: UInt8[np.ndarray, "h w"], path: Path) -> UInt8[np.ndarray, "h w"]:
-    """A mask file's code values as OBJECT, UNKNOWN and BACKGROUND; a file of only 0 and 1 counts as 0 and 255."""
-    if mask.max(initial=0) == 1:
-        return mask * np.uint8(OBJECT)
+    """A mask file's code values as OBJECT, UNKNOWN and BACKGROUND.
+
+    Raises:
+        BadFile: It is black all over.
+    """
     if mask.max(initial=0) == 0:
         raise BadFile(path, "is an empty mask", "a frame must show the object: drop it or mend it")
-    return mask_from_alpha(mask)
+    return decoded_mask(mask)
 
 
 # Poses ----------------------------------------------------------------------------------------------------------------

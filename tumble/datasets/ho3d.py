@@ -22,13 +22,20 @@ import torch
 from jaxtyping import UInt8
 
 from tumble.datasets import _pictures, _unpickle
-from tumble.datasets.folder import mask_from_alpha, three_valued
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.maths.se3 import SE3, SO3
-from tumble.scene.camera import Camera
-from tumble.scene.capture import OBJECT, UNKNOWN, Capture, Truth, no_views
-from tumble.scene.trajectory import Trajectory, opengl_from_opencv
+from tumble.datasets.folder import three_valued
+from tumble.io import BadFile, files
+from tumble.maths import SE3, SO3
+from tumble.scene import (
+    OBJECT,
+    UNKNOWN,
+    Camera,
+    Capture,
+    Trajectory,
+    Truth,
+    mask_from_alpha,
+    no_views,
+    opengl_from_opencv,
+)
 
 LAYOUT = "SEQUENCE/rgb/0000.jpg and SEQUENCE/meta/0000.pkl of HO3D v2 or v3, with masks as SEQUENCE/masks/0000.png"
 WRONG_AFTER = {"ABF12": 1135, "ABF14": 1135}

@@ -24,15 +24,14 @@ import safetensors.torch
 import torch
 from jaxtyping import UInt8
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
 from torch import Tensor
 
 from tumble import __version__
 from tumble.engine import optim
 from tumble.engine.optim import NotFinite
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.io.tree import named_tensors
+from tumble.io import BadFile, files, tree
 
 BAR_SECONDS = 0.5
 """Least time between two movements of the bar: reading a metric waits for the device."""
@@ -59,6 +58,24 @@ class State:
     """The source of all randomness, on the CPU whatever the device: draw there, then move."""
     memory: dict[str, Tensor] = field(default_factory=dict)
     """What else a stage remembers: accumulators, caches."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a stage has come."""
+
+    name: str
+    """Of the stage."""
+    step: int
+    """Steps done."""
+    of: int
+    """Steps in all."""
+    seconds: float
+    """Of training, over all processes that worked on it."""
+    eta: float
+    """Seconds to go."""
+    metrics: dict[str, float]
+    """What the latest step returned."""
 
 
 @runtime_checkable
@@ -100,7 +117,7 @@ def drive(
     seed: int,
     checkpoint: Path | None = None,
     every: int = 500,
-    report: Callable[[dict[str, Any]], None] | None = None,
+    report: Callable[[Progress], None] | None = None,
     name: str = "",
     key: str = "",
 ) -> Any:
@@ -116,8 +133,7 @@ def drive(
         seed: Of `State.rng`.
         checkpoint: File to take up from and to save to; a preview goes beside it. None keeps nothing.
         every: Steps between two checkpoints; one is also saved at the end, before `finish`.
-        report: Called after the first and the last step and at most every few seconds with a JSON document: name,
-            step, of, seconds (of training, over all processes), eta [s], metrics.
+        report: Called after the first and the last step, and in between every few seconds at most.
         name: Of the stage, for people.
         key: What the inputs are. A checkpoint of another key, version, configuration or seed is started over.
 
@@ -212,7 +228,7 @@ def _show(stage: Stage, cfg: Any, inputs: Any, state: State, path: Path) -> None
 def _named(state: State) -> dict[str, dict[str, Tensor]]:
     """The tensors of a state by part and name."""
     moments = optim.pack(state.optimizer) if state.optimizer else {}
-    return {"params": named_tensors(state.params), "optimizer": moments, "memory": state.memory}
+    return {"params": tree.named_tensors(state.params), "optimizer": moments, "memory": state.memory}
 
 
 def _check(state: State, checkpoint: Path | None) -> None:
@@ -244,9 +260,9 @@ def _restore(state: State, path: Path, key: str) -> float:
         part, _, rest = name.partition("/")
         if part in parts:
             parts[part][rest] = value
-    order = list(named_tensors(state.params))
+    order = list(tree.named_tensors(state.params))
     devices = {name: x.device for name, x in state.memory.items()}
-    home = next((x.device for x in named_tensors(state.params).values()), torch.device("cpu"))
+    home = next((x.device for x in tree.named_tensors(state.params).values()), torch.device("cpu"))
     try:
         params = {name: parts["params"].pop(name) for name in order} | parts["params"]
         state.params = optim.overwrite(state.params, state.optimizer, params)
@@ -294,7 +310,7 @@ def _interrupts() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _told(
-    name: str, total: int, first: int, begun: float, report: Callable[[dict[str, Any]], None] | None
+    name: str, total: int, first: int, begun: float, report: Callable[[Progress], None] | None
 ) -> Iterator[Callable[[int, Mapping[str, Tensor | float]], None]]:
     """A function that tells people and `report` of a step, seldom enough to cost nothing."""
     console = Console(stderr=True)
@@ -306,7 +322,7 @@ def _told(
         TextColumn("{task.fields[metrics]}"),
     )
     # The bar is drawn here and not by a thread of its own: threads are for training.
-    bar = Progress(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
+    bar = ProgressBar(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
     task = bar.add_task(name or "training", total=total, completed=first, metrics="")
     start = time.perf_counter()
     drawn = reported = -float("inf")
@@ -326,8 +342,7 @@ def _told(
         if report is not None and reports:
             reported = now
             eta = (now - start) / (step - first) * (total - step)
-            record = {"name": name, "step": step, "of": total, "seconds": round(now - begun, 3), "eta": round(eta, 1)}
-            report(record | {"metrics": metrics})
+            report(Progress(name, step, total, round(now - begun, 3), round(eta, 1), metrics))
 
     with bar:
         yield tell

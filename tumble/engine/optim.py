@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.io.tree import map as map_tree
-from tumble.io.tree import named_tensors
+from tumble.io import tree as trees
 
 T = TypeVar("T")
 
@@ -42,7 +41,7 @@ def leaves(tree: T) -> T:
         copy = x.detach().clone(memory_format=torch.contiguous_format)
         return copy.requires_grad_(copy.is_floating_point())
 
-    return map_tree(leaf, tree)
+    return trees.map(leaf, tree)
 
 
 def adam(
@@ -57,7 +56,7 @@ def adam(
     Raises:
         ValueError: A leaf without a rate, a rate without a leaf, or nothing left to train.
     """
-    named = {name: x for name, x in named_tensors(tree).items() if x.is_floating_point()}
+    named = {name: x for name, x in trees.named_tensors(tree).items() if x.is_floating_point()}
     found = {name: _longest(name, rates) for name in named}
     if bare := [name for name, key in found.items() if key is None]:
         raise ValueError(f"no learning rate for {', '.join(bare)}; there are rates for {', '.join(rates) or 'nothing'}")
@@ -131,7 +130,7 @@ def regrow(tree: T, optimizer: torch.optim.Adam, index: Int64[Tensor, " m"], fre
         index: Row of the old leaves that each new row starts from; a row left out is pruned.
         fresh: New rows that start with moments of zero.
     """
-    counts = {name: x.shape[0] if x.ndim else 0 for name, x in named_tensors(tree).items()}
+    counts = {name: x.shape[0] if x.ndim else 0 for name, x in trees.named_tensors(tree).items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"leaves to regrow need the same number of rows, these have {counts}")
 
@@ -140,7 +139,7 @@ def regrow(tree: T, optimizer: torch.optim.Adam, index: Int64[Tensor, " m"], fre
         rows[fresh] = 0
         return rows
 
-    return map_tree(lambda leaf: _replaced(leaf, leaf.detach()[index], optimizer, gathered), tree)
+    return trees.map(lambda leaf: _replaced(leaf, leaf.detach()[index], optimizer, gathered), tree)
 
 
 def resample(
@@ -165,7 +164,7 @@ def resample(
     Raises:
         ValueError: There is no such leaf, or `fn` is not linear and `moments` is missing.
     """
-    if name not in (named := named_tensors(tree)):
+    if name not in (named := trees.named_tensors(tree)):
         raise ValueError(f"no leaf {name!r}; there are {', '.join(named)}")
     old = named[name]
     values = fn(old.detach()).contiguous()
@@ -178,7 +177,7 @@ def resample(
             return coarser * resized(moment).contiguous()
         return coarser**2 * resized(moment).contiguous().clamp_min(0)  # a map with overshoots would make it negative
 
-    return map_tree(lambda leaf: _replaced(leaf, values, optimizer, carried) if leaf is old else leaf, tree)
+    return trees.map(lambda leaf: _replaced(leaf, values, optimizer, carried) if leaf is old else leaf, tree)
 
 
 def overwrite(tree: T, optimizer: torch.optim.Adam | None, values: dict[str, Tensor]) -> T:
@@ -187,7 +186,7 @@ def overwrite(tree: T, optimizer: torch.optim.Adam | None, values: dict[str, Ten
     Raises:
         ValueError: The names of `values` are not those of the tree.
     """
-    if (names := list(named_tensors(tree))) != list(values):
+    if (names := list(trees.named_tensors(tree))) != list(values):
         raise ValueError(f"leaves {', '.join(values)} do not fit the tree of {', '.join(names)}")
     following = iter(values.values())  # map_tree goes through a tree in the order of its names
 
@@ -195,7 +194,7 @@ def overwrite(tree: T, optimizer: torch.optim.Adam | None, values: dict[str, Ten
         value = next(following).to(leaf.device, copy=True)
         return _replaced(leaf, value, optimizer, lambda moment, which: torch.zeros_like(value))
 
-    return map_tree(new, tree)
+    return trees.map(new, tree)
 
 
 def _replaced(

@@ -7,7 +7,7 @@ docs/metrics.md why. The number of a region is the mean of its views' numbers; r
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, cast
 
 import numpy as np
 import torch
@@ -18,9 +18,8 @@ from tumble import __version__
 from tumble.datasets import which
 from tumble.evaluation import lpips, metrics, score_sheet
 from tumble.evaluation.prediction import Prediction
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.scene.capture import REGIONS, UNKNOWN, Capture, Truth
+from tumble.io import BadFile, files
+from tumble.scene import REGIONS, UNKNOWN, Capture, Truth
 
 SMALLEST = 11
 """Least height and width of a capture that can be scored [pixels]."""
@@ -73,6 +72,26 @@ PREFIXES = {
 }
 
 
+class Report(TypedDict):
+    """All scores of one prediction, as `report.json` holds them; docs/metrics.md says what each number means."""
+
+    tumble: str
+    prediction: str
+    capture: dict[str, Any]
+    albedo_scale: list[float] | None
+    """Per channel; None where there is no albedo to compare."""
+    regions: dict[str, dict[str, float]]
+    """Means over the evaluation views of each region, by key."""
+    light: dict[str, Any]
+    poses: dict[str, Any]
+    views: list[dict[str, Any]]
+    """The numbers of each view."""
+    protocol: dict[str, str]
+    """What each number means, by key."""
+    notes: list[str]
+    """What could not be scored, and how views were aligned."""
+
+
 @dataclass(frozen=True)
 class Subject:
     """A capture with the truth that predictions about it are scored against."""
@@ -82,7 +101,7 @@ class Subject:
     truth: Truth
 
 
-def subject(path: Path) -> Subject:
+def read_subject(path: Path) -> Subject:
     """Read a capture that can be scored, in any layout of `datasets`.
 
     Raises:
@@ -97,14 +116,14 @@ def subject(path: Path) -> Subject:
     return Subject(path, capture, truth)
 
 
-def run(
+def score(
     prediction: Path,
     capture: Path | Subject,
     out: Path,
     *,
     vgg: Path | None = None,
     notes: Sequence[str] = (),
-) -> dict[str, Any]:
+) -> Report:
     """Score a prediction against the truth of a capture; write report.json and sheet.png, and return the report.
 
     Args:
@@ -117,7 +136,7 @@ def run(
     Raises:
         BadFile: A file of either folder breaks a rule, or the capture has no truth.
     """
-    known = subject(capture) if isinstance(capture, Path) else capture
+    known = read_subject(capture) if isinstance(capture, Path) else capture
     predicted = Prediction.read(prediction, known.capture, known.truth)
     networks = [lpips.read()] + ([lpips.read(vgg)] if vgg else [])
     scores = compare(predicted, known.capture, known.truth, networks)
@@ -126,7 +145,7 @@ def run(
     picture = score_sheet.draw(report, predicted, known.truth)
     files.write_png(out / "sheet.png", picture)
     files.write_json(out / "report.json", report)
-    return report
+    return cast(Report, report)
 
 
 @torch.no_grad()

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from tumble.io.files import BadFile
+from tumble.io import BadFile
 
 SHIPPED = Path(__file__).with_name("lpips_alex.safetensors")
 SMALLEST = 64

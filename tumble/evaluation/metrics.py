@@ -15,11 +15,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.evaluation import lpips
-from tumble.maths.directions import texel_solid_angles
-from tumble.maths.images import crop, crop_box, srgb_from_linear, ssim
-from tumble.maths.se3 import SE3, SO3, angle_between, mean_rotation, umeyama
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import Trajectory
+from tumble.maths import (
+    SE3,
+    SO3,
+    angle_between,
+    crop,
+    crop_box,
+    mean_rotation,
+    srgb_from_linear,
+    ssim,
+    texel_solid_angles,
+    umeyama,
+)
+from tumble.maths import iou as mask_iou
+from tumble.scene import Environment, Trajectory
 
 BEST_PSNR = 100.0
 """What equal pictures score [dB]: an infinite number has no mean and no place in JSON."""
@@ -65,8 +74,7 @@ def rmse(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counted: Bool[Tensor,
 
 def iou(x: Bool[Tensor, "h w"], y: Bool[Tensor, "h w"], counted: Bool[Tensor, "h w"]) -> float:
     """Intersection over union of two silhouettes, among the counted pixels; 1 when both are empty."""
-    union = ((x | y) & counted).sum()
-    return float((x & y & counted).sum() / union) if union else 1.0
+    return float(mask_iou(x, y, counted)) if bool(((x | y) & counted).any()) else 1.0
 
 
 def picture_scores(

@@ -16,12 +16,9 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from tumble.datasets.folder import read_poses
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.scene.capture import Capture, Truth
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import Trajectory
+from tumble.datasets import read_poses
+from tumble.io import BadFile, files
+from tumble.scene import Capture, Environment, Trajectory, Truth
 
 PARTS = ("albedo", "normal", "roughness", "mask", "image", "relit", "light.exr", "poses.json")
 """Everything that a prediction folder may hold under a name of ours."""

@@ -11,14 +11,9 @@ from torch.nn.functional import normalize
 from tumble.evaluation import metrics
 from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
-from tumble.maths.images import photograph
-from tumble.maths.se3 import SO3
-from tumble.rendering import relight
-from tumble.rendering.gbuffer import antialiased
-from tumble.scene.asset import Asset
-from tumble.scene.capture import Capture, Truth
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import Trajectory
+from tumble.maths import SO3, photograph
+from tumble.rendering import antialiased, relight
+from tumble.scene import Asset, Capture, Environment, Trajectory, Truth
 
 SILHOUETTE = 0.55
 """Coverage from which a pixel counts as object. Edges fade more slowly inwards than outwards, so half is too little: of
@@ -27,7 +22,7 @@ ten thousand pixels of the chess knight it misses 17 and claims 57 too many, 0.5
 
 
 @torch.no_grad()
-def predict(
+def predict_views(
     cfg: relight.Config,
     asset: Asset,
     capture: Capture,
@@ -46,7 +41,6 @@ def predict(
         names: Training frames that the asset's trajectory belongs to.
     """
     own = asset.environment
-    assert own is not None, "an asset with light"
     posed = Prediction(poses=asset.trajectory, pose_names=names)
     if asset.trajectory.light == "camera":
         posed = replace(posed, light=own)
@@ -72,7 +66,7 @@ def predict(
     )
 
 
-def aligned(
+def align_views(
     estimated: Trajectory, names: tuple[str, ...], capture: Capture, truth: Truth, *, given: bool, lens: float = 1.0
 ) -> tuple[Similarity | None, str]:
     """How the true object frame relates to the asset's, from training frames alone, and that in words.

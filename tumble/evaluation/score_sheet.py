@@ -11,9 +11,8 @@ from torch import Tensor
 from tumble.evaluation import contact_sheet, metrics
 from tumble.evaluation.contact_sheet import Group, Sheet, Tile
 from tumble.evaluation.prediction import Prediction
-from tumble.maths.images import crop, crop_box, srgb_from_linear
-from tumble.scene.capture import REGIONS, Truth
-from tumble.scene.environment import Environment
+from tumble.maths import crop, crop_box, srgb_from_linear
+from tumble.scene import REGIONS, Environment, Truth
 
 VIEWS = 4
 """Rows of the sheet; both regions have their share."""

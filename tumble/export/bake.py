@@ -13,13 +13,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from tumble.export.mesh import Unwrapped, around
-from tumble.maths.images import srgb_from_linear
-from tumble.maths.se3 import SE3
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.gbuffer import buffers_of
-from tumble.scene.asset import Asset
-from tumble.scene.camera import Camera
+from tumble.export.depth_fusion import around
+from tumble.export.mesh import Unwrapped
+from tumble.maths import SE3, nearest, srgb_from_linear
+from tumble.rendering import Buffers, buffers_of
+from tumble.scene import Asset, Camera
 
 GRAZING = 0.2
 """Least cosine between normal and view that counts."""
@@ -80,7 +78,7 @@ def bake(asset: Asset, mesh: Unwrapped, *, resolution: int, views: int, pixels: 
 def spread(values: Float[Tensor, " n"], asset: Asset, mesh: Unwrapped, *, resolution: int) -> UInt8[np.ndarray, "r r"]:
     """Values in [0, 1], one per Gaussian, as a texture: every texel has that of the Gaussian next to it."""
     spots = texels(mesh, resolution)
-    index = _nearest(asset, spots.points.to(asset.gaussians.means))
+    index = nearest(spots.points.to(asset.gaussians.means), asset.gaussians.means)
     return _painted(spots, values[index, None], resolution)[0][..., 0]
 
 
@@ -194,15 +192,9 @@ def _looked_up(
     return found[:, :CHANNELS], near * (share > 0.25) * share
 
 
-def _nearest(asset: Asset, points: Float[Tensor, "t 3"]) -> Int[Tensor, " t"]:
-    nearest = [torch.cdist(rows, asset.gaussians.means).argmin(1) for rows in points.split(1024)]
-    return torch.cat([*nearest, torch.zeros(0, dtype=torch.long, device=points.device)])
-
-
 def _beside(asset: Asset, points: Float[Tensor, "t 3"], normals: Float[Tensor, "t 3"]) -> Float[Tensor, "t 7"]:
     """What no view sees looks like the Gaussian next to it."""
     material = asset.material
-    assert material is not None, "an asset with material"
-    index = _nearest(asset, points)
+    index = nearest(points, asset.gaussians.means)
     rough = material.roughness.mean(1, keepdim=True)
     return torch.cat([material.albedo.mean(1)[index], rough[index], normals], -1)

@@ -12,11 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.maths.directions import fibonacci_sphere, texel_directions, texel_solid_angles
-from tumble.rendering.rasterize import rasterize
-from tumble.scene.asset import Asset
-from tumble.scene.camera import Camera
-from tumble.scene.environment import Environment
+from tumble.maths import fibonacci_sphere, texel_directions, texel_solid_angles
+from tumble.rendering import rasterize
+from tumble.scene import Asset, Camera, Environment
 
 CELLS = 256
 """Cells of the sphere: about 13 degrees across; half of them lie above a point's horizon."""
@@ -61,9 +59,8 @@ def lamps(environment: Environment) -> Float[Tensor, "k 3"]:
 
 
 @torch.no_grad()
-def confidence(asset: Asset, camera: Camera) -> Confidence:
+def confidence_of(asset: Asset, camera: Camera) -> Confidence:
     """Count over the training frames, as seen by a camera of any size; nothing stands in the way of the lamps."""
-    assert asset.environment is not None, "an asset with light"
     gaussians, trajectory = asset.gaussians, asset.trajectory
     chosen = torch.linspace(0, len(trajectory) - 1, min(FRAMES, len(trajectory))).round().long()
     weights = torch.stack(

@@ -14,27 +14,41 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from tumble.backends import threads_for_kernels
-from tumble.engine import optim
-from tumble.engine.loop import State
+from tumble.engine import State, optim
 from tumble.inverse_rendering import losses, sh_lighting, specular_fit
 from tumble.inverse_rendering.refine import Refined
-from tumble.io.tree import detach, named_tensors
-from tumble.maths.directions import fibonacci_sphere, random_rotation
-from tumble.maths.images import linear_from_srgb
-from tumble.maths.se3 import SE3
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.gbuffer import buffers_of
-from tumble.rendering.prefilter import prefilter
-from tumble.rendering.shade import AveragedBounce, Bounce, Surface, shade_split, surface
-from tumble.rendering.trace import Visibility, build, moved, open_sky, surface_points, transfer, visibility
-from tumble.scene.asset import Asset
-from tumble.scene.capture import Capture
-from tumble.scene.environment import Environment
-from tumble.scene.gaussians import Gaussians
-from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
-from tumble.scene.photograph import frame
-from tumble.scene.trajectory import Trajectory, env_from_obj
+from tumble.io import tree
+from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb, random_rotation
+from tumble.rendering import (
+    AveragedBounce,
+    Bounce,
+    Buffers,
+    Surface,
+    Visibility,
+    buffers_of,
+    build,
+    moved,
+    open_sky,
+    prefilter,
+    shade_split,
+    surface,
+    surface_points,
+    threads_for_kernels,
+    transfer,
+    visibility,
+)
+from tumble.scene import (
+    DIELECTRIC,
+    TEMPERATURE,
+    Asset,
+    Capture,
+    Environment,
+    Gaussians,
+    Material,
+    Trajectory,
+    env_from_obj,
+    target_view,
+)
 
 VERSION = 14
 LOOK_EVERY = 100
@@ -184,7 +198,7 @@ def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
     for number in range(0, len(capture), -(-len(capture) // FITTED)):
         T_cam_obj = pose(params, inputs, number)
         view = buffers_of(params, T_cam_obj, capture.camera)
-        truth = frame(capture, number, view.alpha)
+        truth = target_view(capture, number, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # the outermost pixels mix in the background
         pixels = _draw(FITTED_PIXELS * cfg.pixels, view, inner, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
@@ -241,7 +255,7 @@ def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
         for directions in state.memory["directions"]
     ]
     state.memory["bits"] = torch.stack([v.bits for v in seen])
-    state.memory |= {f"traced.{name}": x.detach().clone() for name, x in named_tensors(gaussians).items()}
+    state.memory |= {f"traced.{name}": x.detach().clone() for name, x in tree.named_tensors(gaussians).items()}
     if cfg.bounce != "none":
         state.memory["transfer"] = transfer(seen, gaussians.normals)
         state.memory["blocker"] = torch.stack([v.blocker for v in seen if v.blocker is not None])
@@ -251,7 +265,7 @@ def _look_again(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace anew when geometry has moved by about the width of a shadow's edge since the last time."""
     if not cfg.visibility or state.step < cfg.warmup or state.step % LOOK_EVERY:
         return
-    traced = Gaussians(*(state.memory[f"traced.{name}"] for name in named_tensors(state.params.gaussians)))
+    traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
     if moved(traced, state.params.gaussians) > MOVED:
         _look_around(cfg, inputs, state)
 
@@ -281,11 +295,11 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     params, capture = state.params, inputs.capture
     if state.step < cfg.warmup:
         # Not yet trained: half of the rasterizer's backward pass is for nobody.
-        params = replace(params, gaussians=detach(params.gaussians), poses=params.poses.detach())
+        params = replace(params, gaussians=tree.detach(params.gaussians), poses=params.poses.detach())
     number = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, number)
     view = buffers_of(params if cfg.corners else uncornered(params), T_cam_obj, capture.camera)
-    truth = frame(capture, number, view.alpha)
+    truth = target_view(capture, number, view.alpha)
     points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg.pixels, view, truth.mask, state.rng))
     R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_tint.exp()
     shaded = _shaded(cfg, state, params, view, points, R_env_obj, points.sample(view.features["albedo"]), f0)

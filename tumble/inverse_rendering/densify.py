@@ -11,7 +11,33 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tumble.scene.gaussians import Gaussians
+from tumble.scene import Gaussians
+
+
+@dataclass(frozen=True)
+class Config:
+    """When Gaussians are added and dropped; names are those of 3D Gaussian splatting, the score is FastGS's."""
+
+    refine_every: int = 500
+    """Steps between densifications (FastGS)."""
+    refine_stop: float = 0.7
+    """Share of the run after which the number of Gaussians stays."""
+    max_gaussians: int = 100_000
+    score_views: int = 10
+    """Views that are scored at each densification (FastGS)."""
+    bad_share: float = 0.1
+    """Share of a view's largest error from which a pixel counts as bad (FastGS)."""
+    bad_floor: float = 0.02
+    """Least error of a bad pixel, sRGB."""
+    grow_score: float = 2.0
+    """Bad pixels that a Gaussian touches, mean over views, from which it splits."""
+    grow_share: float = 0.12
+    """Largest share of the Gaussians that splits at once."""
+    prune_opacity: float = 0.05
+    """Opacity below which a Gaussian is dropped."""
+    prune_weight: float = 0.05
+    """Blending weight that a Gaussian must reach in some view since the last densification, else it lies inside and is
+    dropped [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -26,40 +52,28 @@ class Plan:
     """Rows that stay; behind them come first all first children, then all second ones."""
 
 
-def bad_pixels(
-    error: Float[Tensor, "h w"], mask: Float[Tensor, "h w"], *, relative: float, absolute: float
-) -> Float[Tensor, "h w"]:
+def bad_pixels(cfg: Config, error: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """1 where the rendering is bad: above a share of the view's largest error on the object, and above a floor.
 
     The floor keeps a nearly perfect picture from being split for its noise; the background does not set the scale.
     """
     error = error * mask
-    return ((error > relative * error.max()) & (error > absolute)).to(error.dtype)
+    return ((error > cfg.bad_share * error.max()) & (error > cfg.bad_floor)).to(error.dtype)
 
 
-def plan(
-    importance: Float[Tensor, " n"],
-    drop: Bool[Tensor, " n"],
-    *,
-    threshold: float,
-    fraction: float,
-    limit: int,
-) -> Plan:
-    """Split the most important Gaussians, drop the useless.
+def plan(cfg: Config, score: Float[Tensor, " n"], drop: Bool[Tensor, " n"]) -> Plan:
+    """Split the Gaussians of the highest scores, drop the useless.
 
     Args:
-        importance: Bad pixels touched, mean over views.
+        score: Bad pixels touched, mean over views.
         drop: Rows to leave out.
-        threshold: Least importance of a Gaussian that splits [pixels].
-        fraction: Largest share of the Gaussians that splits at once.
-        limit: Largest number of Gaussians afterwards.
     """
-    n = len(importance)
-    room = max(0, limit - (n - int(drop.sum())))
-    most = min(room, math.ceil(fraction * n))
-    candidates = torch.where(drop, -1.0, importance)
+    n = len(score)
+    room = max(0, cfg.max_gaussians - (n - int(drop.sum())))
+    most = min(room, math.ceil(cfg.grow_share * n))
+    candidates = torch.where(drop, -1.0, score)
     order = candidates.argsort(descending=True, stable=True)[:most]
-    split = order[candidates[order] > threshold]
+    split = order[candidates[order] > cfg.grow_score]
     stays = ~drop
     stays[split] = False
     kept = torch.where(stays)[0]

@@ -9,11 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from tumble.maths.images import edge_aware, planes, srgb_from_linear, ssim_map
-from tumble.maths.se3 import SE3
-from tumble.rendering.buffers import Buffers
-from tumble.scene.camera import Camera
-from tumble.scene.gaussians import Gaussians
+from tumble.maths import SE3, edge_aware, planes, srgb_from_linear, ssim_map
+from tumble.rendering import Buffers
+from tumble.scene import Camera, Gaussians
 
 SSIM_MARGIN = 10
 """Pixels by which the window of `images.ssim_map` reaches beyond one of its pixels, both sides together."""

@@ -9,14 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tumble.engine.loop import State
+from tumble.engine import State
 from tumble.inverse_rendering.decompose import Inputs
-from tumble.maths.images import linear_from_srgb
-from tumble.rendering.rasterize import rasterize
-from tumble.scene.asset import Asset
-from tumble.scene.environment import Environment
-from tumble.scene.material import TEMPERATURE, Material
-from tumble.scene.photograph import frame
+from tumble.maths import linear_from_srgb
+from tumble.rendering import rasterize
+from tumble.scene import TEMPERATURE, Asset, Environment, Material, target_view
 
 VERSION = 1
 
@@ -55,7 +52,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     T_cam_obj = refined.trajectory.T_cam_obj[state.step]
     share = torch.zeros_like(state.params.weight).requires_grad_()
     image = rasterize(refined.gaussians, refined.gamma, T_cam_obj, camera, {"share": share}).features["share"]
-    truth = frame(inputs.capture, state.step, image)
+    truth = target_view(inputs.capture, state.step, image)
     certain = (truth.mask[..., None] * truth.valid).expand_as(image)
     for sums, seed in ((state.params.colour, linear_from_srgb(truth.image) * certain), (state.params.weight, certain)):
         (found,) = torch.autograd.grad(image, share, seed, retain_graph=True)

@@ -7,12 +7,13 @@ in the scale of its own derivatives (direct image alignment; Lucas and Kanade 19
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths.se3 import SE3, SO3
+from tumble.maths import SE3, SO3, Damping, Linearised, minimise
 
 NUDGES = (0.01, 0.01, 0.01, 0.01, 0.01, 0.02)
 """Of the finite differences: three turns [radians], three shifts [object radius], about half a pixel at 128 pixels."""
@@ -37,25 +38,25 @@ def realign(residual: Callable[[SE3], Float[Tensor, " r"]], T_cam_obj: SE3, *, r
     Args:
         residual: What a pose leaves unexplained of a photograph, sRGB units; needs no derivative.
     """
-    now = residual(T_cam_obj)
-    scale = now.new_tensor(NUDGES)
-    for _ in range(rounds):
-        columns = [residual(nudged(T_cam_obj, motion)) - now for motion in scale.diag()]
+    scale = T_cam_obj.xyz.new_tensor(NUDGES)
+
+    def linearised(pose: SE3) -> Linearised:
+        left = residual(pose)
+        cost = torch.log1p((left / ROBUST).square()).sum()
+        return Linearised(cost.nan_to_num(math.inf, math.inf)[None], left)
+
+    def moved(pose: SE3, now: Tensor, damping: Tensor) -> SE3:
+        columns = [residual(nudged(pose, motion)) - now for motion in scale.diag()]
         J = torch.stack(columns, -1)
         weighted = J / (1 + (now / ROBUST).square())[:, None]
         A = weighted.mT @ J
         # A direction that changes nothing at all (a black picture) has an empty row: leave it where it is.
-        A = A + torch.diag(DAMPING * A.diagonal() + 1e-9)
+        A = A + torch.diag(damping * A.diagonal() + 1e-9)
         step = -torch.linalg.solve(A, weighted.mT @ now)
         step = step * (FARTHEST / step.abs().max().clamp_min(FARTHEST))
-        there = nudged(T_cam_obj, step * scale)
-        then = residual(there)
-        if not _cost(then) < _cost(now):
-            break
-        T_cam_obj, now = there, then
-    return T_cam_obj
+        return nudged(pose, step * scale)
 
+    def choose(better: Tensor, new: Any, old: Any) -> Any:
+        return new if bool(better) else old
 
-def _cost(residual: Float[Tensor, " r"]) -> float:
-    cost = float(torch.log1p((residual / ROBUST).square()).sum())
-    return cost if math.isfinite(cost) else math.inf
+    return minimise(T_cam_obj, linearised, moved, choose, steps=rounds, damping=Damping(start=DAMPING))[0]

@@ -13,23 +13,27 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.backends import threads_for_kernels
-from tumble.engine import optim
-from tumble.engine.loop import State
+from tumble.engine import State, optim
 from tumble.inverse_rendering import densify, losses, sh_lighting
 from tumble.inverse_rendering.photometric_alignment import realign
 from tumble.inverse_rendering.self_shadowing import Sky, look_around
 from tumble.inverse_rendering.sh_lighting import CoarseLight
-from tumble.maths.images import crop, crop_box, planes
-from tumble.maths.se3 import SE3
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.rasterize import rasterize
-from tumble.scene import visual_hull
-from tumble.scene.camera import Camera
-from tumble.scene.capture import Capture
-from tumble.scene.gaussians import Gaussians, constant_sh, facing, opacity, sdf_from_opacity
-from tumble.scene.photograph import Frame, frame
-from tumble.scene.trajectory import Trajectory, env_from_obj
+from tumble.maths import SE3, crop, crop_box, planes
+from tumble.rendering import Buffers, rasterize, threads_for_kernels
+from tumble.scene import (
+    Camera,
+    Capture,
+    Gaussians,
+    TargetView,
+    Trajectory,
+    constant_sh,
+    env_from_obj,
+    facing,
+    opacity,
+    sdf_from_opacity,
+    target_view,
+    visual_hull,
+)
 
 VERSION = 9
 SEEN_FROM = 16  # frames, in tracing what Gaussians see
@@ -87,8 +91,6 @@ class Config:
     """light: rotation-aware; sh: the paper's static radiance per Gaussian, degree 3."""
     points: int = 20_000
     """Gaussians at the start. Not stated in the paper."""
-    limit: int = 100_000
-    """Largest number of Gaussians."""
     hull: int = 128
     """Cells per side of the carved grid."""
     opacity: float = 0.9
@@ -105,24 +107,7 @@ class Config:
     """Of the normal term (`losses.normal_consistency`); 0 as in the paper."""
     ramp: float = 0.1
     """Share of the run over which normal and variance terms come in."""
-    every: int = 500
-    """Steps between densifications (FastGS)."""
-    until: float = 0.7
-    """Share of the run after which the number of Gaussians stays."""
-    views: int = 10
-    """Views that are scored at each densification (FastGS)."""
-    bad: float = 0.1
-    """Share of the largest error from which a pixel counts as bad (FastGS)."""
-    bad_floor: float = 0.02
-    """Least error of a bad pixel, sRGB."""
-    importance: float = 2.0
-    """Bad pixels that a Gaussian touches, mean over views, from which it splits."""
-    fraction: float = 0.12
-    """Largest share of the Gaussians that splits at once."""
-    least_opacity: float = 0.05
-    """Gaussians below it are dropped."""
-    least_weight: float = 0.05
-    """Gaussians whose weight in no view since the last densification reaches this lie inside: dropped [pixels]."""
+    densification: densify.Config = field(default_factory=densify.Config)
     shaded: float = 0.2
     """Share of the run from which the object stands in its own shade (`shadow`); before, it is too coarse."""
     realignments: int = 0
@@ -253,10 +238,10 @@ def render(
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
-    progress = state.step / cfg.steps
-    if state.step and state.step % cfg.every == 0 and progress < cfg.until:
+    progress, every = state.step / cfg.steps, cfg.densification.refine_every
+    if state.step and state.step % every == 0 and progress < cfg.densification.refine_stop:
         _densify(cfg, inputs, state)
-    if state.step % cfg.every == 0 and progress >= cfg.shaded and cfg.colour == "light":
+    if state.step % every == 0 and progress >= cfg.shaded and cfg.colour == "light":
         _look_around(inputs, state)
     if state.step in _realignments(cfg):
         _realign(inputs, state)
@@ -265,7 +250,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     T_cam_obj = pose(params, inputs, number)
     view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera, sky=sky(state))
     state.memory["shown"] = torch.maximum(state.memory["shown"], view.weight.detach())
-    terms = _terms(cfg, params, view, frame(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
+    terms = _terms(cfg, params, view, target_view(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
     optim.anneal(state.optimizer, _annealed(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()} | {
@@ -299,7 +284,7 @@ def _annealed(cfg: Config, progress: float) -> dict[str, float]:
 
 
 def _terms(
-    cfg: Config, params: Params, view: Buffers, truth: Frame, camera: Camera, T_cam_obj: SE3, progress: float
+    cfg: Config, params: Params, view: Buffers, truth: TargetView, camera: Camera, T_cam_obj: SE3, progress: float
 ) -> dict[str, Tensor]:
     weights, gaussians = cfg.weights, params.points.gaussians
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
@@ -320,7 +305,7 @@ def _terms(
     }
 
 
-def _window(view: Buffers, truth: Frame, camera: Camera) -> tuple[Buffers, Frame, Camera, float]:
+def _window(view: Buffers, truth: TargetView, camera: Camera) -> tuple[Buffers, TargetView, Camera, float]:
     """The part of a view beyond which rendering and photograph are black, and its share of the picture.
 
     Means over the picture are those over the window times the share: often a third of the work.
@@ -334,27 +319,27 @@ def _window(view: Buffers, truth: Frame, camera: Camera) -> tuple[Buffers, Frame
         **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
         rgb=planes(crop(view.rgb, box)).movedim(0, -1),
     )
-    seen = Frame(planes(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box))
+    seen = TargetView(planes(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box))
     return cut, seen, camera.cropped(*box), box[2] * box[3] / shown.numel()
 
 
 @torch.no_grad()
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
-    params, camera = state.params, inputs.capture.camera
+    params, camera, how = state.params, inputs.capture.camera, cfg.densification
     assert state.optimizer is not None, "init makes one"
     bad = params.gamma.new_zeros(len(params.points.albedo_logits))
-    numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: cfg.views].tolist()
+    numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: how.score_views].tolist()
     for number in numbers:
         T_cam_obj = pose(params, inputs, number)
         arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
         first = render(*arguments, sky=sky(state))
-        truth = frame(inputs.capture, number, first.alpha)
+        truth = target_view(inputs.capture, number, first.alpha)
         error = (losses.developed(first.rgb, truth.image) - truth.image).abs().mean(-1)
-        where = densify.bad_pixels(error, truth.mask, relative=cfg.bad, absolute=cfg.bad_floor)
+        where = densify.bad_pixels(how, error, truth.mask)
         bad += render(*arguments, mask=where, sky=sky(state)).touched / len(numbers)
-    drop = opacity(params.points.gaussians.sdf, params.gamma) < cfg.least_opacity
-    drop |= state.memory["shown"] < cfg.least_weight
-    plan = densify.plan(bad, drop, threshold=cfg.importance, fraction=cfg.fraction, limit=cfg.limit)
+    drop = opacity(params.points.gaussians.sdf, params.gamma) < how.prune_opacity
+    drop |= state.memory["shown"] < how.prune_weight
+    plan = densify.plan(how, bad, drop)
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
     densify.place_children(points.gaussians, plan)
     state.params = replace(params, points=points)
@@ -370,13 +355,15 @@ def _realignments(cfg: Config) -> list[int]:
 def _realign(inputs: Inputs, state: State) -> None:
     params, base = state.params, inputs.trajectory.T_cam_obj
     for number in range(len(inputs.capture)):
-        unexplained = partial(_unexplained, params, inputs, frame(inputs.capture, number, params.gamma), sky(state))
+        unexplained = partial(
+            _unexplained, params, inputs, target_view(inputs.capture, number, params.gamma), sky(state)
+        )
         T_cam_obj = realign(unexplained, pose(params, inputs, number))
         params.poses[number] = (T_cam_obj @ base[number].inverse()).log()
 
 
 def _unexplained(
-    params: Params, inputs: Inputs, truth: Frame, shade: Sky | None, T_cam_obj: SE3
+    params: Params, inputs: Inputs, truth: TargetView, shade: Sky | None, T_cam_obj: SE3
 ) -> Float[Tensor, " r"]:
     """Colours and, with less weight, coverage that a pose leaves over of a photograph, sRGB."""
     arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)

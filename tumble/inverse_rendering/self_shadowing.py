@@ -13,13 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.inverse_rendering.sh_lighting import CoarseLight
-from tumble.maths import spherical_harmonics
-from tumble.maths.directions import fibonacci_sphere
-from tumble.maths.se3 import SE3
-from tumble.rendering.shade import in_own_shade
-from tumble.rendering.trace import build, open_sky, surface_points, transfer, visibility
-from tumble.scene.camera import Camera
-from tumble.scene.gaussians import Gaussians
+from tumble.maths import SE3, fibonacci_sphere, spherical_harmonics
+from tumble.rendering import build, in_own_shade, open_sky, surface_points, transfer, visibility
+from tumble.scene import Camera, Gaussians
 
 DIRECTIONS = 256
 """In which the sky is looked for, and from which the light is summed."""

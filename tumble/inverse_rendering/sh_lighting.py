@@ -21,10 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from tumble.maths import spherical_harmonics
-from tumble.maths.directions import texel_directions
-from tumble.scene.environment import Environment
-from tumble.scene.material import DIELECTRIC
+from tumble.maths import spherical_harmonics, texel_directions
+from tumble.scene import DIELECTRIC, Environment
 
 GLOSS = 0.08
 """Width of the mirrored lobe: degree l is dimmed by exp(-GLOSS l (l + 1)), as by a lobe of roughness about 0.5."""

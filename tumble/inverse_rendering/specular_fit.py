@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
+from tumble.scene import DIELECTRIC, TEMPERATURE, Material
 
 BRIGHTEST = 0.9
 """Albedo that 95 % of a surface stays below."""

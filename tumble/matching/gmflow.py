@@ -12,7 +12,7 @@ from torch import Tensor
 from tumble.io import weights
 from tumble.matching import _gmflow
 from tumble.matching._window import Window, windows
-from tumble.scene.match import Match, View, no_match
+from tumble.scene import Match, View, no_match
 
 VERSION = 1
 SIZE = 256

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tumble.matching._window import Window, windows
-from tumble.scene.match import Match, View, no_match
+from tumble.scene import Match, View, no_match
 
 VERSION = 1
 WEIGHTS = "naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric"

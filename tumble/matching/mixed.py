@@ -7,7 +7,7 @@ the way back, hence its trust in the rest, and falls under the bar as a whole: t
 import torch
 
 from tumble.matching import dis, sift
-from tumble.scene.match import Match, View
+from tumble.scene import Match, View
 
 VERSION = 1
 PARTS = ("sift", "dis")

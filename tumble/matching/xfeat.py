@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from tumble.io import weights
 from tumble.matching._window import MARGIN, digest, extent, window
-from tumble.scene.match import Match, View, no_match
+from tumble.scene import Match, View, no_match
 
 VERSION = 1
 SIZE = 512

@@ -1,0 +1,71 @@
+"""Rotations and rigid motions, directions on the sphere, spherical harmonics, images, least squares, point sets.
+
+Tensors in, tensors out: nothing here knows a camera or a file.
+"""
+
+from tumble.maths import spherical_harmonics
+from tumble.maths.directions import (
+    GOLDEN_ANGLE,
+    direction_from_equirect,
+    equirect_from_direction,
+    fibonacci_sphere,
+    local_frame,
+    random_rotation,
+    reflect,
+    texel_directions,
+    texel_solid_angles,
+)
+from tumble.maths.images import (
+    Box,
+    crop,
+    crop_box,
+    edge_aware,
+    iou,
+    linear_from_srgb,
+    photograph,
+    planes,
+    resize_area,
+    srgb_from_linear,
+    ssim,
+    ssim_map,
+)
+from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, rowwise
+from tumble.maths.points import nearest, smallest_ball
+from tumble.maths.se3 import SE3, SO3, angle_between, interpolate, mean_rotation, umeyama
+
+__all__ = [
+    "Box",
+    "Damping",
+    "GOLDEN_ANGLE",
+    "Linearised",
+    "SE3",
+    "SO3",
+    "angle_between",
+    "crop",
+    "crop_box",
+    "direction_from_equirect",
+    "edge_aware",
+    "equirect_from_direction",
+    "fibonacci_sphere",
+    "interpolate",
+    "iou",
+    "linear_from_srgb",
+    "local_frame",
+    "mean_rotation",
+    "minimise",
+    "nearest",
+    "photograph",
+    "planes",
+    "random_rotation",
+    "reflect",
+    "resize_area",
+    "rowwise",
+    "smallest_ball",
+    "spherical_harmonics",
+    "srgb_from_linear",
+    "ssim",
+    "ssim_map",
+    "texel_directions",
+    "texel_solid_angles",
+    "umeyama",
+]

@@ -56,30 +56,11 @@ def texel_solid_angles(
     return rows[:, None].expand(height, width)
 
 
-def spherical(theta: float | Float[Tensor, "*b"], phi: float | Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
-    """Unit directions at polar angle `theta` from +z and azimuth `phi` from +x [radians]; z is up."""
-    like = theta if isinstance(theta, Tensor) else phi if isinstance(phi, Tensor) else torch.zeros(())
-    to = {"dtype": like.dtype, "device": like.device}
-    t, p = torch.broadcast_tensors(torch.as_tensor(theta, **to), torch.as_tensor(phi, **to))
-    return torch.stack([t.sin() * p.cos(), t.sin() * p.sin(), t.cos()], -1)
-
-
 def fibonacci_sphere(
     n: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> Float[Tensor, "n 3"]:
     """`n` directions spread evenly over the sphere; each stands for 4 pi / n [steradian]."""
     return _spiral(1 - (torch.arange(n, dtype=torch.float64) + 0.5) * 2 / n).to(dtype=dtype, device=device)
-
-
-def fibonacci_hemisphere(
-    n: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
-) -> tuple[Float[Tensor, "n 3"], float]:
-    """`n` directions spread evenly around +z, and the solid angle 2 pi / n [steradian] each stands for.
-
-    Unbiased: midpoints of equal slices down to the horizon, none of them lifted away from it.
-    """
-    heights = (torch.arange(n, dtype=torch.float64) + 0.5) / n
-    return _spiral(heights).to(dtype=dtype, device=device), 2 * math.pi / n
 
 
 def local_frame(n: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:

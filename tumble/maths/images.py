@@ -6,7 +6,7 @@ Pixel centres lie at +0.5, so a resized picture covers the same area. Values are
 from typing import Any
 
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -126,6 +126,14 @@ class _Similarity(torch.autograd.Function):
         v_x = None if first is None else first + 2 * x * v_power + y * v_product
         v_y = None if second is None else second + 2 * y * v_power + x * v_product
         return v_x, v_y, None, None, None
+
+
+def iou(x: Bool[Tensor, "*b"], y: Bool[Tensor, "*b"], counted: Bool[Tensor, "*b"] | None = None) -> Float[Tensor, ""]:
+    """Intersection over union of two masks, among the counted pixels; 0 when both are empty there."""
+    both, either = x & y, x | y
+    if counted is not None:
+        both, either = both & counted, either & counted
+    return both.sum() / either.sum().clamp_min(1)
 
 
 def planes(x: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "c h w"]:

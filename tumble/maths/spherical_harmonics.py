@@ -126,17 +126,6 @@ def project(radiance: Float[Tensor, "h w c"]) -> Float[Tensor, "16 c"]:
     return torch.einsum("hwk,hwc->kc", basis(texel_directions(h, w, **like), MAX_DEGREE), weighted)
 
 
-def irradiance_coefficients(coefficients: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
-    """Coefficients of the irradiance on a surface, as a function of its normal, from those of the radiance.
-
-    `basis(n, degree) @ irradiance_coefficients(c)` is the integral of radiance times max(0, n . w); degree 3 adds
-    nothing to it. Divide by pi and multiply by albedo for the light a Lambertian surface sends back.
-    """
-    degree = math.isqrt(coefficients.shape[0]) - 1
-    lobe = [COSINE_LOBE[l] for l in range(degree + 1) for _ in range(2 * l + 1)]  # noqa: E741
-    return coefficients * coefficients.new_tensor(lobe)[:, None]
-
-
 def _monomials(xyz: Float[Tensor, "3 n"], degree: int) -> Float[Tensor, "m n"]:
     """The products that `MONOMIALS` lists, to a degree."""
     x, y, z = xyz

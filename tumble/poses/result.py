@@ -7,7 +7,9 @@ from typing import Literal
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-Verdict = Literal["good", "warn", "bad"]
+from tumble.scene import Camera, Trajectory
+
+PoseVerdict = Literal["good", "warn", "bad"]
 
 UNSEEN = 0.1
 """Uncertainty about an axis from which a frame's rotation about it counts as not seen [radians]."""
@@ -63,7 +65,7 @@ class Observability:
 
 
 @dataclass(frozen=True)
-class Health:
+class PoseQuality:
     """Per frame, what its pose rests on."""
 
     residual: Float[Tensor, " t"]
@@ -103,7 +105,7 @@ class Health:
         return max(self.misfit, float(kept.median())) if len(kept) else math.pi
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> PoseVerdict:
         gone = float(self.lost.float().mean())
         if self.still or self.observability.unseen or self.uncertainty > LIMITS[1] or gone > MANY_LOST:
             return "bad"
@@ -127,6 +129,21 @@ class Health:
         lost = int(self.lost.sum())
         words = f"Rotations are right to about {_degrees(self.uncertainty)} degrees."
         return f"{words} {lost} of {len(self)} frames contradict the others." if lost else words
+
+
+@dataclass(frozen=True)
+class PoseResult:
+    """The outcome of stage 1, by either route."""
+
+    trajectory: Trajectory
+    """One pose per frame of the capture; of lost frames an interpolated one."""
+    points: Float[Tensor, "n 3"]
+    """On the surface, object frame."""
+    colours: Float[Tensor, "n 3"]
+    """Linear RGB of the points, median over the frames that show them: shading included."""
+    quality: PoseQuality
+    camera: Camera
+    """The capture's; where its focal length is a guess, with the one that was found."""
 
 
 def _degrees(angle: Tensor | float) -> str:

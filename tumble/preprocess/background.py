@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
-from tumble.maths.images import linear_from_srgb, photograph
+from tumble.maths import linear_from_srgb, photograph
 
 SAMPLES = 41
 """Frames the median is taken over; odd, so that it is a value that was there."""

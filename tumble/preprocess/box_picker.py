@@ -18,11 +18,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tumble.io import files
-from tumble.io.files import BadFile
+from tumble.io import BadFile, files
 from tumble.preprocess import footage, video_to_capture
-from tumble.preprocess.footage import Frame
-from tumble.preprocess.survey import Options, lens_of, undistorted
+from tumble.preprocess.footage import FootageFrame
+from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.source import kind_of
+from tumble.preprocess.survey import lens_of, undistorted
 
 LOOKED_AT = 60
 """Frames among which the sharpest is shown: the first two seconds."""
@@ -32,7 +33,7 @@ ANSWER = 256
 Box = tuple[int, int, int, int]
 
 
-def picked(path: Path, options: Options, made: Path, tell: Callable[[str], Any] = print) -> Options:
+def picked(path: Path, options: FootageOptions, made: Path, tell: Callable[[str], Any] = print) -> FootageOptions:
     """The options with a box that a person draws, and the frame it is on; waits until one is drawn.
 
     Args:
@@ -45,7 +46,7 @@ def picked(path: Path, options: Options, made: Path, tell: Callable[[str], Any] 
     """
     if options.box is not None or options.click is not None or options.masks is not None:
         raise ValueError("--pick asks for what --box, --click or --masks say already: leave it out")
-    if not footage.is_footage(path):
+    if kind_of(path) not in ("film", "pictures"):
         raise BadFile(path, "is no film and no folder of pictures", "--pick is for those: leave it out")
     note = made / video_to_capture.PROVENANCE
     if note.is_file():
@@ -57,7 +58,7 @@ def picked(path: Path, options: Options, made: Path, tell: Callable[[str], Any] 
     return replace(options, box=box, at=frame.number)
 
 
-def sharp_frame(path: Path, options: Options) -> Frame:
+def sharp_frame(path: Path, options: FootageOptions) -> FootageFrame:
     """The frame `options.at`, or where that is 0 the sharpest of the first ones, without the lens's distortion."""
     opened = footage.open_footage(path, options.masks)
     best, most = None, -1.0
@@ -76,7 +77,7 @@ def sharp_frame(path: Path, options: Options) -> Frame:
     return undistorted(best, lens_of(opened, options, *best.picture.shape[:2]))
 
 
-def ask(frame: Frame, tell: Callable[[str], Any] = print) -> Box:
+def ask(frame: FootageFrame, tell: Callable[[str], Any] = print) -> Box:
     """Serve the page to this machine alone until a box is drawn: left, top, width, height [pixels]."""
     height, width = frame.picture.shape[:2]
     page, word, answers = _page(frame), secrets.token_urlsafe(12), []
@@ -130,7 +131,7 @@ def _box(content: bytes, height: int, width: int) -> Box | None:
     return (left, top, wide, high) if inside else None
 
 
-def _page(frame: Frame) -> bytes:
+def _page(frame: FootageFrame) -> bytes:
     height, width = frame.picture.shape[:2]
     encoded = cv2.imencode(".jpg", np.ascontiguousarray(frame.picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
     picture = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()

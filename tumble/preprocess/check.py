@@ -13,7 +13,10 @@ import numpy as np
 
 from tumble.io import video
 from tumble.preprocess import colmap_to_capture, keyframes, video_to_capture
-from tumble.preprocess.survey import Options, Survey, survey
+from tumble.preprocess.box_picker import picked
+from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.source import kind_of
+from tumble.preprocess.survey import Survey, survey
 
 SHAKEN = (0.004, video_to_capture.SHAKEN)
 """Motion of the background, as a share of the picture's longer side: from here it warns, and stops (8, 38 of 1920)."""
@@ -44,7 +47,7 @@ APART = (0.4, 0.8)
 ROUND = (math.radians(90), math.radians(30))
 """Largest angle between two views of the object [radians]."""
 
-Verdict = Literal["good", "warn", "stop"]
+CheckVerdict = Literal["good", "warn", "stop"]
 
 
 @dataclass(frozen=True)
@@ -52,21 +55,25 @@ class Finding:
     """One property of the film."""
 
     subject: str
-    verdict: Verdict
+    verdict: CheckVerdict
     state: str
     """What was measured."""
     advice: str = ""
     """What to do about it; empty when good."""
 
 
-def check(path: Path, out: Path, options: Options | None = None) -> list[Finding]:
+def check_footage(path: Path, out: Path, options: FootageOptions | None = None, *, pick: bool = False) -> list[Finding]:
     """Look at a film, or a folder of pictures, and write the preview of its masks to `out`.
+
+    Args:
+        pick: Ask a person in the browser where the object is.
 
     Raises:
         BadFile: It cannot be read, or nothing that moves is found in it.
     """
-    options = options or Options()
-    if colmap_to_capture.recognises(path):
+    options = options or FootageOptions()
+    options = picked(path, options, out / "capture") if pick else options
+    if kind_of(path) == "posed pictures":
         return _check_posed(colmap_to_capture.gather(path, options), out, options)
     found = survey(path, options)
     chosen = keyframes.chosen(found.turned, found.blurs, found.usable, options.frames)
@@ -79,17 +86,17 @@ def check(path: Path, out: Path, options: Options | None = None) -> list[Finding
 
 
 def go(findings: list[Finding]) -> bool:
-    """Whether nothing stops."""
+    """Whether nothing stops a reconstruction."""
     return all(finding.verdict != "stop" for finding in findings)
 
 
-def _graded(value: float, limits: tuple[float, float]) -> Verdict:
+def _graded(value: float, limits: tuple[float, float]) -> CheckVerdict:
     """By where a value stands to the limits of warning and stopping; they may rise or fall."""
     sign = 1 if limits[1] >= limits[0] else -1
     return "stop" if sign * value > sign * limits[1] else "warn" if sign * value > sign * limits[0] else "good"
 
 
-def _finding(subject: str, verdict: Verdict, state: str, advice: str) -> Finding:
+def _finding(subject: str, verdict: CheckVerdict, state: str, advice: str) -> Finding:
     return Finding(subject, verdict, state, "" if verdict == "good" else advice)
 
 
@@ -162,7 +169,7 @@ def _turning(found: Survey, kept: list[int]) -> list[Finding]:
     return [*findings, _finding("frames", "warn" if step > WIDE_STEP else "good", state, advice)]
 
 
-def _sharpness(found: Survey, kept: list[int], options: Options) -> Finding:
+def _sharpness(found: Survey, kept: list[int], options: FootageOptions) -> Finding:
     window = video_to_capture.crop_window(found, kept)
     shrink = min(options.size / max(window[2:]), 1.0)
     width = float(np.median(found.blurs[kept]))
@@ -188,7 +195,7 @@ def _light(found: Survey) -> list[Finding]:
 # Pictures with poses --------------------------------------------------------------------------------------------------
 
 
-def _check_posed(found: colmap_to_capture.Posed, out: Path, options: Options) -> list[Finding]:
+def _check_posed(found: colmap_to_capture.Posed, out: Path, options: FootageOptions) -> list[Finding]:
     """What a COLMAP model, its pictures and their masks are good for."""
     R_new_cam = colmap_to_capture.turns(found, options.light)
     glass, fine = colmap_to_capture.camera(found, R_new_cam, options.size)

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from tumble.io.files import BadFile
-from tumble.maths.se3 import SO3
+from tumble.io import BadFile
+from tumble.maths import SO3
 
 MAX_BYTES = 1 << 30
 """Largest file of a model that is read; a thousand pictures make a tenth of it."""
@@ -62,7 +62,7 @@ class Optics:
 
 
 @dataclass(frozen=True)
-class View:
+class PosedPicture:
     """One picture with its pose."""
 
     name: str
@@ -74,11 +74,11 @@ class View:
 
 
 @dataclass(frozen=True)
-class Model:
+class SparseModel:
     """A sparse reconstruction."""
 
     path: Path
-    views: tuple[View, ...]
+    views: tuple[PosedPicture, ...]
     """In the order of their names."""
     points: Float64[np.ndarray, "n 3"]
     """World frame; none where the model has no file of points."""
@@ -91,7 +91,7 @@ def recognises(path: Path) -> bool:
     return path.is_dir() and bool(_places(path))
 
 
-def read(path: Path) -> Model:
+def read(path: Path) -> SparseModel:
     """The sparse model in a folder of COLMAP.
 
     Raises:
@@ -117,7 +117,7 @@ def _file(place: Path, name: str) -> Path | None:
     return next((p for ending in (".bin", ".txt") if (p := place / f"{name}{ending}").is_file()), None)
 
 
-def _read(place: Path) -> Model:
+def _read(place: Path) -> SparseModel:
     cameras, images, points = (_file(place, name) for name in ("cameras", "images", "points3D"))
     assert cameras is not None, "a place has both"
     assert images is not None, "a place has both"
@@ -130,7 +130,7 @@ def _read(place: Path) -> Model:
     rows = np.array(list(_points(points)) if points is not None else [], np.float64).reshape(-1, 4)
     if points is not None and not np.isfinite(rows).all():
         raise BadFile(points, "holds NaN or infinity")
-    return Model(place, tuple(views), rows[:, :3], rows[:, 3])
+    return SparseModel(place, tuple(views), rows[:, :3], rows[:, 3])
 
 
 # Both layouts give these three ----------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def _cameras(path: Path) -> Iterator[tuple[int, Optics]]:
         yield number, _optics(path, model, width, height, np.array(parameters))
 
 
-def _views(path: Path, optics: dict[int, Optics]) -> Iterator[View]:
+def _views(path: Path, optics: dict[int, Optics]) -> Iterator[PosedPicture]:
     for name, pose, camera in _binary_images(path) if _binary(path) else _text_images(path):
         values = np.array(pose)
         if camera not in optics:
@@ -149,7 +149,9 @@ def _views(path: Path, optics: dict[int, Optics]) -> Iterator[View]:
         length = math.sqrt(float((values[:4] ** 2).sum()))
         if not np.isfinite(values).all() or abs(length - 1) > UNIT:
             raise BadFile(path, f"{name} has no rotation: its quaternion has length {length:.4g}")
-        yield View(name, optics[camera], SO3(torch.from_numpy(values[:4] / length)).matrix().numpy(), values[4:])
+        yield PosedPicture(
+            name, optics[camera], SO3(torch.from_numpy(values[:4] / length)).matrix().numpy(), values[4:]
+        )
 
 
 def _points(path: Path) -> Iterator[tuple[float, ...]]:

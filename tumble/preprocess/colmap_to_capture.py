@@ -17,19 +17,15 @@ import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
 
-from tumble import datasets
-from tumble.datasets import _capture_folder
-from tumble.datasets.folder import mask_from_alpha
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.maths.se3 import SE3
+from tumble.datasets import capture_document, training_frame
+from tumble.io import BadFile, files
+from tumble.maths import SE3, smallest_ball
 from tumble.preprocess import colmap, video_to_capture
-from tumble.preprocess.colmap import Model, View
+from tumble.preprocess.colmap import PosedPicture, SparseModel
 from tumble.preprocess.footage import mask_of, read_mask
-from tumble.preprocess.survey import LEAST_FRAMES, Options, small_mask
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
-from tumble.scene.trajectory import Trajectory
+from tumble.preprocess.options import LEAST_FRAMES, FootageOptions
+from tumble.preprocess.survey import small_mask
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Trajectory, mask_from_alpha, undistortion
 
 ROOM = 1.02
 """Radius of the unit ball over what the silhouettes reach."""
@@ -45,7 +41,7 @@ LEVEL = 0.3
 class Silhouette:
     """One picture with a pose, and the outline of the object in it."""
 
-    view: View
+    view: PosedPicture
     picture: Path
     mask: Path | None
     """None where the picture's alpha is the mask."""
@@ -61,7 +57,7 @@ class Silhouette:
 class Posed:
     """Pictures with poses, before they are written."""
 
-    model: Model
+    model: SparseModel
     root: Path
     """Folder of the pictures."""
     seen: tuple[Silhouette, ...]
@@ -75,12 +71,7 @@ class Posed:
     """Median distance of the rays through the masks' middles from their meeting point [radius of the median mask]."""
 
 
-def recognises(path: Path) -> bool:
-    """Whether a path is a folder with a sparse model, and no capture already."""
-    return path.is_dir() and not datasets.layouts(path) and colmap.recognises(path)
-
-
-def capture_from_model(path: Path, out: Path, options: Options) -> Path:
+def capture_from_model(path: Path, out: Path, options: FootageOptions) -> Path:
     """A capture folder (docs/format.md) with poses; returns it.
 
     Raises:
@@ -93,7 +84,7 @@ def capture_from_model(path: Path, out: Path, options: Options) -> Path:
     return video_to_capture.write_folder(out, lambda partial: _write(found, path, partial, options))
 
 
-def gather(path: Path, options: Options) -> Posed:
+def gather(path: Path, options: FootageOptions) -> Posed:
     """The pictures that are used, evenly over the model's, with their outlines and the ball around the object.
 
     Raises:
@@ -135,15 +126,13 @@ def ball(seen: tuple[Silhouette, ...]) -> tuple[Float64[np.ndarray, "3"], float,
     wide = [np.linalg.norm(r - middle, axis=1).max() for r, middle in zip(rays, middles, strict=True)]
     start = np.repeat(np.stack(starts), [len(r) for r in rays], 0)
     direction = np.concatenate(rays)
-    best, radius = centre, math.inf
-    for step in range(SEARCH):
-        off = _to_ray(centre, start, direction)
-        lengths = np.linalg.norm(off, axis=1)
-        worst = int(lengths.argmax())
-        if lengths[worst] < radius:
-            best, radius = centre, float(lengths[worst])
-        centre = centre + off[worst] / (step + 2)
-    return best, ROOM * radius, float(apart / np.median(far * wide))
+
+    def offsets(x: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(_to_ray(x.numpy(), start, direction))
+
+    found = smallest_ball(offsets, torch.from_numpy(centre), steps=SEARCH)
+    radius = float(offsets(found).norm(dim=-1).max())
+    return found.numpy(), ROOM * radius, float(apart / np.median(far * wide))
 
 
 def _to_ray(x: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -159,7 +148,7 @@ def _unit(x: np.ndarray) -> np.ndarray:
 # Pictures -------------------------------------------------------------------------------------------------------------
 
 
-def _silhouette(path: Path, root: Path, view: View, options: Options) -> Silhouette:
+def _silhouette(path: Path, root: Path, view: PosedPicture, options: FootageOptions) -> Silhouette:
     picture = files.inside(root, view.name)
     folder = options.masks or (path / "masks" if (path / "masks").is_dir() else None)
     mask = None if folder is None else mask_of(picture, folder / Path(view.name).parent)
@@ -177,7 +166,7 @@ def _silhouette(path: Path, root: Path, view: View, options: Options) -> Silhoue
 
 
 def _seen(
-    picture: Path, mask: Path | None, view: View, options: Options
+    picture: Path, mask: Path | None, view: PosedPicture, options: FootageOptions
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
     """A picture as it was taken, and its mask."""
     values = files.read_picture(picture)
@@ -222,19 +211,16 @@ def camera(found: Posed, R_new_cam: Float64[np.ndarray, "t 3 3"], size: int) -> 
 
 
 def frames(
-    found: Posed, R_new_cam: Float64[np.ndarray, "t 3 3"], glass: Camera, fine: int, options: Options
+    found: Posed, R_new_cam: Float64[np.ndarray, "t 3 3"], glass: Camera, fine: int, options: FootageOptions
 ) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]]:
     """Pictures and masks through the new camera; what it sees beyond a picture's border is unknown."""
     large = glass.resized(fine * glass.height, fine * glass.width)
-    K = large.matrix.double().numpy().copy()
-    K[:2, 2] -= 0.5  # OpenCV puts the centre of the first pixel at (0, 0)
     for outline, R in zip(found.seen, R_new_cam, strict=True):
         optics = outline.view.optics
         colour, labels = _seen(outline.picture, outline.mask, outline.view, options)
-        tables = cv2.fisheye.initUndistortRectifyMap if optics.fisheye else cv2.initUndistortRectifyMap
-        at = tables(optics.K, optics.distortion, R, K, (large.width, large.height), cv2.CV_32FC1)
-        colour = cv2.remap(colour, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        labels = cv2.remap(labels, *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN)
+        undistorted = undistortion(optics.K, optics.distortion, large, fisheye=optics.fisheye, R_new_cam=R)
+        colour = undistorted(colour, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        labels = undistorted(labels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT, UNKNOWN)
         picture = video_to_capture.developed(colour, np.ones(3), (glass.height, glass.width))
         mask = small_mask(np.ascontiguousarray(labels), glass.height, glass.width)
         yield np.where(mask[..., None] == BACKGROUND, np.uint8(0), picture), mask
@@ -271,7 +257,7 @@ def _upright(R_cam_world: np.ndarray, places: np.ndarray) -> Float64[np.ndarray,
     return np.stack([np.cross(y, z), y, z])
 
 
-def _write(found: Posed, path: Path, out: Path, options: Options) -> None:
+def _write(found: Posed, path: Path, out: Path, options: FootageOptions) -> None:
     R_new_cam = turns(found, options.light)
     glass, fine = camera(found, R_new_cam, options.size)
     matrices = trajectory(found, R_new_cam, options.light).camera_to_object().tolist()
@@ -280,7 +266,7 @@ def _write(found: Posed, path: Path, out: Path, options: Options) -> None:
         name = f"{i:04d}.png"
         files.write_png(out / "images" / name, picture)
         files.write_png(out / "masks" / name, mask[..., None])
-        entries.append(_capture_folder.training_frame(name, matrices[i]))
+        entries.append(training_frame(name, matrices[i]))
     provenance = {
         "source": str(path),
         **video_to_capture.origin(path, options),
@@ -293,5 +279,5 @@ def _write(found: Posed, path: Path, out: Path, options: Options) -> None:
         ],
     }
     files.write_json(out / video_to_capture.PROVENANCE, provenance)
-    document = _capture_folder.document(glass, options.light, entries, setting=None, with_light=False)
+    document = capture_document(glass, options.light, entries, setting=None, with_light=False)
     files.write_json(out / "transforms.json", document | {"focal_source": "model"})

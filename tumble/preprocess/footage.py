@@ -14,18 +14,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from tumble import datasets
-from tumble.datasets import folder
-from tumble.io import files, video
-from tumble.io.files import BadFile
-from tumble.scene.camera import Camera
-from tumble.scene.capture import OBJECT
+from tumble.io import BadFile, files, video
+from tumble.scene import Camera, decoded_mask, mask_from_alpha, undistortion
 
 PICTURES = (".png", ".jpg", ".jpeg")
 """Endings of pictures read from folders."""
@@ -56,7 +51,7 @@ class Footage:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FootageFrame:
     """One upright frame."""
 
     number: int
@@ -99,15 +94,7 @@ def open_footage(path: Path, masks: Path | None = None) -> Footage:
     return Footage(path, pictures, mask_files, _positive(stated), None)
 
 
-def is_footage(path: Path) -> bool:
-    """Whether a path is a file, which may be a film, or a folder of pictures that is no capture yet."""
-    if not path.is_dir() or datasets.layouts(path):
-        return path.is_file()
-    inside = path / "images" if (path / "images").is_dir() else path
-    return any(p.suffix.lower() in PICTURES for p in inside.iterdir())
-
-
-def frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[Frame]:
+def frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[FootageFrame]:
     """All frames, one at a time.
 
     Raises:
@@ -126,7 +113,7 @@ def frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[Frame]:
                 rule = f"holds {len(footage.masks)} masks, the film has more frames"
                 raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the film, in order")
             mask = read_mask(footage.masks[number], picture, invert_masks)
-        yield Frame(number, time, picture, mask)
+        yield FootageFrame(number, time, picture, mask)
     if footage.masks and not footage.pictures and number + 1 < len(footage.masks):
         rule = f"holds {len(footage.masks)} masks, the film has {number + 1} frames"
         raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the film, in order")
@@ -174,11 +161,8 @@ def lens(
     coefficients = fisheye if fisheye is not None else distortion
     if coefficients is None:
         return Lens(camera, source, None)
-    K = camera.matrix.double().numpy().copy()
-    K[:2, 2] -= 0.5  # OpenCV puts the centre of the first pixel at (0, 0)
-    tables = cv2.fisheye.initUndistortRectifyMap if fisheye is not None else cv2.initUndistortRectifyMap
-    x, y = tables(K, np.array(coefficients, np.float64), np.eye(3), K, (width, height), cv2.CV_32FC1)
-    return Lens(camera, source, lambda picture, how: cv2.remap(picture, x, y, how, borderMode=cv2.BORDER_CONSTANT))
+    bent = np.array(coefficients, np.float64)
+    return Lens(camera, source, undistortion(camera.opencv_matrix, bent, camera, fisheye=fisheye is not None))
 
 
 def _positive(stated: object) -> float | None:
@@ -230,7 +214,7 @@ def _folders_frames(footage: Footage, invert: bool) -> Iterator[tuple[float, np.
         mask = None
         if values.shape[2] == 4:
             alpha = np.ascontiguousarray(values[..., 3])
-            mask = folder.mask_from_alpha(255 - alpha if invert else alpha)
+            mask = mask_from_alpha(255 - alpha if invert else alpha)
         picture = np.repeat(values, 3, 2) if values.shape[2] == 1 else np.ascontiguousarray(values[..., :3])
         yield number / video.FPS, picture, mask
 
@@ -253,6 +237,4 @@ def read_mask(path: Path, picture: UInt8[np.ndarray, "h w c"], invert: bool) -> 
     if mask.shape != picture.shape[:2]:
         found = f"is {mask.shape[1]} x {mask.shape[0]} pixels"
         raise BadFile(path, f"{found}, its frame is {picture.shape[1]} x {picture.shape[0]}", "masks are upright, too")
-    if mask.max(initial=0) == 1:
-        mask = mask * np.uint8(OBJECT)
-    return folder.mask_from_alpha(255 - mask if invert else mask)
+    return decoded_mask(mask, invert=invert)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-from tumble.io.files import BadFile
+from tumble.io import BadFile
 from tumble.preprocess.segmentation import Seed
 
 SAM2_CONFIGS = {

@@ -15,11 +15,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, UInt8
 
+from tumble.maths import iou
 from tumble.preprocess.background import Backdrop
 from tumble.preprocess.colour_model import FIRST, Colours, at_first, object_odds, skin_coloured, smoothed, trimmed
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
 SURE_OVERLAP = 0.85
 """Overlap (IoU) of predicted and found mask below which a frame is flagged."""
@@ -192,8 +194,7 @@ def sharpened(
 
 def overlap(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
     """Intersection over union; 0 for two empty masks."""
-    union = (one | other).sum()
-    return float((one & other).sum() / union) if union else 0.0
+    return float(iou(torch.from_numpy(one), torch.from_numpy(other)))
 
 
 # One frame ------------------------------------------------------------------------------------------------------------

@@ -10,78 +10,27 @@ drift and the backdrop again, from what no mask covers, and the masks again.
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Integer, UInt8
 
-from tumble.io.files import BadFile
+from tumble.io import BadFile
 from tumble.preprocess import keyframes, sam, segmentation
 from tumble.preprocess.background import Backdrop, backdrop, compensate, completed, drift
-from tumble.preprocess.footage import Footage, Frame, Lens, frames, lens, open_footage
+from tumble.preprocess.footage import Footage, FootageFrame, Lens, frames, lens, open_footage
+from tumble.preprocess.options import LEAST_SIDE, SURVEYED, FootageOptions
 from tumble.preprocess.segmentation import Masks, Seed
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera
 
 MOST_FRAMES = 36_000
 """Frames read at most: 20 minutes at 30 per second."""
-SURVEYED, SURVEY_SIDE = 400, 384
-"""Frames that the survey keeps at most (every second, every fourth, ... of a longer film), and their longer side."""
-LEAST_SIDE = 64
-"""Smaller footage shows nothing to reconstruct [pixels]."""
-LEAST_FRAMES = 3
-"""A capture has at least this many."""
+SURVEY_SIDE = 384
+"""Longer side of the survey's copies of the frames [pixels]."""
 USABLE_CONFIDENCE = 0.6
 """Frames whose mask is less certain are left out."""
 ALIKE = 0.01
 """Drift below this gain is left alone: one code value."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How footage becomes a capture."""
-
-    box: tuple[int, int, int, int] | None = None
-    """Left, top, width, height around the object on frame `at` [pixels]. Left out: what moves and is no skin."""
-    click: tuple[int, int] | None = None
-    """A pixel on the object on frame `at`, instead of a box: column, row."""
-    at: int = 0
-    """The frame that box or click are on, counted from 0."""
-    masks: Path | None = None
-    """Folder of masks: white object, black background, grey unknown; one per frame, in order or by name."""
-    invert_masks: bool = False
-    """The masks' object is black."""
-    segmenter: Literal["grabcut", "sam2", "sam3"] = "grabcut"
-    """Who makes masks when none are given; sam2 and sam3 are your own installation, with `weights`."""
-    weights: Path | None = None
-    """Checkpoint of sam2 or sam3."""
-    focal: float | None = None
-    """Focal length in pixels of the film. Left out: from `fov`, else the metadata, else found with the poses, from a
-    guess (a phone's 28 mm)."""
-    fov: float | None = None
-    """Horizontal field of view [degrees]."""
-    fisheye: tuple[float, float, float, float] | None = None
-    """A fisheye lens: OpenCV's k1 k2 k3 k4, zeros for the ideal one."""
-    distortion: tuple[float, ...] | None = None
-    """A normal lens that bends lines: OpenCV's k1 k2 p1 p2 [k3]."""
-    light: Literal["object", "camera"] = "object"
-    """Pictures with poses by COLMAP: what the light stood still with. object: the camera went round the object; camera:
-    the object turned, and the background was masked. (A film's light always stands still with the camera.)"""
-    frames: int = 144
-    """Frames to keep at most."""
-    size: int = 256
-    """Longer side of the frames to write [pixels]; never more than the film has."""
-
-    def __post_init__(self) -> None:
-        if self.box is not None and self.click is not None:
-            raise ValueError("--box and --click are two ways to say the same: give one")
-        if self.box is not None and min(self.box[2:]) < 2:
-            raise ValueError(f"--box is left, top, width, height; this one is {self.box[2]} x {self.box[3]}")
-        if self.segmenter != "grabcut" and self.weights is None:
-            raise ValueError(f"--segmenter {self.segmenter} needs --weights, the path of its checkpoint")
-        if not LEAST_FRAMES <= self.frames <= SURVEYED or not LEAST_SIDE <= self.size <= 4096:
-            raise ValueError(f"--frames is {LEAST_FRAMES} to {SURVEYED}, --size {LEAST_SIDE} to 4096")
 
 
 @dataclass(frozen=True)
@@ -136,7 +85,7 @@ class _Scan:
     times: Float64[np.ndarray, " t"]
 
 
-def survey(path: Path, options: Options) -> Survey:
+def survey(path: Path, options: FootageOptions) -> Survey:
     """Read the footage once and learn what is in it.
 
     Raises:
@@ -172,7 +121,7 @@ def survey(path: Path, options: Options) -> Survey:
     )
 
 
-def undistorted(frame: Frame, glass: Lens) -> Frame:
+def undistorted(frame: FootageFrame, glass: Lens) -> FootageFrame:
     """The frame as the pinhole camera sees it."""
     if glass.undistort is None:
         return frame
@@ -190,7 +139,9 @@ def small_mask(mask: UInt8[np.ndarray, "h w"], height: int, width: int) -> UInt8
     return np.select([shares[0] > 0.99, shares[1] > 0.99], [BACKGROUND, OBJECT], UNKNOWN).astype(np.uint8)
 
 
-def _segmented(path: Path, scan: _Scan, options: Options) -> tuple[np.ndarray, np.ndarray, Backdrop, Seed, Masks]:
+def _segmented(
+    path: Path, scan: _Scan, options: FootageOptions
+) -> tuple[np.ndarray, np.ndarray, Backdrop, Seed, Masks]:
     """Pictures without drift, the drift, the backdrop, the seed and the masks."""
     pictures = _compensated(scan.pictures, drift(scan.pictures))
     still = backdrop(pictures)
@@ -207,8 +158,8 @@ def _segmented(path: Path, scan: _Scan, options: Options) -> tuple[np.ndarray, n
     return pictures, gains, still, seed, masks
 
 
-def _scanned(footage: Footage, options: Options) -> _Scan:
-    small: list[tuple[Frame, np.ndarray]] = []
+def _scanned(footage: Footage, options: FootageOptions) -> _Scan:
+    small: list[tuple[FootageFrame, np.ndarray]] = []
     stride, glass, scale = 1, None, 1.0
     for frame in frames(footage, invert_masks=options.invert_masks):
         height, width = frame.picture.shape[:2]
@@ -239,7 +190,7 @@ def _scanned(footage: Footage, options: Options) -> _Scan:
     )
 
 
-def lens_of(footage: Footage, options: Options, height: int, width: int) -> Lens:
+def lens_of(footage: Footage, options: FootageOptions, height: int, width: int) -> Lens:
     """The lens of footage whose frames have this size."""
     if min(height, width) < LEAST_SIDE:
         raise BadFile(footage.path, f"is {width} x {height} pixels", f"the shorter side needs {LEAST_SIDE} at least")
@@ -254,7 +205,7 @@ def lens_of(footage: Footage, options: Options, height: int, width: int) -> Lens
     )
 
 
-def _check_hint(footage: Footage, options: Options, camera: Camera, n_frames: int) -> None:
+def _check_hint(footage: Footage, options: FootageOptions, camera: Camera, n_frames: int) -> None:
     left, top, width, height = options.box or ((*options.click, 1, 1) if options.click else (0, 0, 1, 1))
     if left < 0 or top < 0 or left + width > camera.width or top + height > camera.height:
         rule = f"is {camera.width} x {camera.height} pixels, the hint lies outside"
@@ -263,7 +214,7 @@ def _check_hint(footage: Footage, options: Options, camera: Camera, n_frames: in
         raise BadFile(footage.path, f"has about {n_frames} frames, --at is {options.at}")
 
 
-def _shrunk(frame: Frame, scale: float) -> tuple[Frame, np.ndarray]:
+def _shrunk(frame: FootageFrame, scale: float) -> tuple[FootageFrame, np.ndarray]:
     """The frame made small, and its edges, measured before."""
     height, width = (max(round(side * scale), 1) for side in frame.picture.shape[:2])
     picture = cv2.resize(frame.picture, (width, height), interpolation=cv2.INTER_AREA)
@@ -277,7 +228,7 @@ def _compensated(pictures: UInt8[np.ndarray, "t h w 3"], gains: Float32[np.ndarr
     return np.stack([p if np.abs(gain - 1).max() < ALIKE else compensate(p, gain) for p, gain in pairs])
 
 
-def _seed(path: Path, scan: _Scan, pictures: np.ndarray, still: Backdrop, options: Options) -> Seed:
+def _seed(path: Path, scan: _Scan, pictures: np.ndarray, still: Backdrop, options: FootageOptions) -> Seed:
     if options.box is None and options.click is None:
         seed = segmentation.find_seed(pictures, still)
         if seed is None:
@@ -292,7 +243,7 @@ def _seed(path: Path, scan: _Scan, pictures: np.ndarray, still: Backdrop, option
     return Seed(index, (*low, math.ceil(left + width) - low[0], math.ceil(top + height) - low[1]))
 
 
-def _masks(path: Path, pictures: np.ndarray, still: Backdrop, seed: Seed, options: Options) -> Masks:
+def _masks(path: Path, pictures: np.ndarray, still: Backdrop, seed: Seed, options: FootageOptions) -> Masks:
     if options.segmenter != "grabcut":
         assert options.weights is not None, "checked where options are made"
         inside = sam.SEGMENTERS[options.segmenter](pictures, seed, options.weights)

@@ -20,15 +20,15 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from tumble.datasets import _capture_folder
-from tumble.io import files, video
-from tumble.io.files import BadFile
-from tumble.maths.images import linear_from_srgb, photograph
+from tumble.datasets import capture_document, training_frame
+from tumble.io import BadFile, files, video
+from tumble.maths import linear_from_srgb, photograph
 from tumble.preprocess import keyframes, segmentation
 from tumble.preprocess.background import compensate, shake
-from tumble.preprocess.footage import Frame, frames
-from tumble.preprocess.survey import ALIKE, LEAST_FRAMES, Options, Survey, small_mask, survey, undistorted
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
+from tumble.preprocess.footage import FootageFrame, frames
+from tumble.preprocess.options import LEAST_FRAMES, FootageOptions
+from tumble.preprocess.survey import ALIKE, Survey, small_mask, survey, undistorted
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
 LEAST_TURN = math.radians(40)
 """Less turning cannot be reconstructed, and most of it may be the noise of flow and masks [radians]."""
@@ -44,7 +44,7 @@ PREVIEW = "mask_preview.mp4"
 PROVENANCE = "ingest.json"
 
 
-def capture_from_video(path: Path, out: Path, options: Options | None = None) -> Path:
+def capture_from_video(path: Path, out: Path, options: FootageOptions | None = None) -> Path:
     """A capture folder (docs/format.md) without poses from a film or a folder of pictures; returns the folder.
 
     It holds besides: `mask_preview.mp4`, and `ingest.json` with what was done to every frame.
@@ -52,7 +52,7 @@ def capture_from_video(path: Path, out: Path, options: Options | None = None) ->
     Raises:
         BadFile: The footage cannot become a capture, or `out` is there already; nothing is written then.
     """
-    options = options or Options()
+    options = options or FootageOptions()
     refuse_full(out)
     found = survey(path, options)
     kept = keep(found, options)
@@ -79,7 +79,7 @@ def write_folder(out: Path, write: Callable[[Path], None]) -> Path:
     return out
 
 
-def origin(path: Path, options: Options) -> dict[str, Any]:
+def origin(path: Path, options: FootageOptions) -> dict[str, Any]:
     """What decides a capture that footage becomes: its content, as a hash, and the options."""
     digest = hashlib.sha256()
     inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
@@ -89,7 +89,7 @@ def origin(path: Path, options: Options) -> dict[str, Any]:
     return {"footage": digest.hexdigest(), "options": json.loads(json.dumps(vars(options), default=str))}
 
 
-def keep(found: Survey, options: Options) -> list[int]:
+def keep(found: Survey, options: FootageOptions) -> list[int]:
     """Indices, in the survey, of the frames to keep: by turning and sharpness for a film, all of a folder of pictures.
 
     Raises:
@@ -154,7 +154,9 @@ def tinted(
 # The second pass ------------------------------------------------------------------------------------------------------
 
 
-def _write(found: Survey, kept: list[int], window: tuple[int, int, int, int], out: Path, options: Options) -> None:
+def _write(
+    found: Survey, kept: list[int], window: tuple[int, int, int, int], out: Path, options: FootageOptions
+) -> None:
     top, left, height, width = window
     shrink = min(options.size / max(height, width), 1.0)
     size = max(round(height * shrink), 1), max(round(width * shrink), 1)
@@ -173,9 +175,9 @@ def _write(found: Survey, kept: list[int], window: tuple[int, int, int, int], ou
             continue
         files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), picture))
         files.write_png(out / "masks" / name, mask[..., None])
-        entries.append(_capture_folder.training_frame(name, None))
+        entries.append(training_frame(name, None))
         report.append(_said(found, i, name))
-    document = _capture_folder.document(camera, "camera", entries, setting=None, with_light=False)
+    document = capture_document(camera, "camera", entries, setting=None, with_light=False)
     preview(found, out / PREVIEW, kept)
     provenance = {
         "source": str(found.footage.path),
@@ -214,7 +216,7 @@ def developed(picture: np.ndarray, gain: np.ndarray, size: tuple[int, int]) -> U
 
 
 def _full_mask(
-    found: Survey, i: int, full: Frame, window: tuple[int, int, int, int], picture: np.ndarray
+    found: Survey, i: int, full: FootageFrame, window: tuple[int, int, int, int], picture: np.ndarray
 ) -> UInt8[np.ndarray, "h w"]:
     """The frame's mask on the written pixels: the given one, or the survey's brought to the picture's edges."""
     top, left, height, width = window

@@ -1,0 +1,39 @@
+"""From Gaussians to pictures: rasterizer, ray tracer, BRDF, deferred shading, relighting.
+
+The only caller of `backends`. Knows no loss and no model.
+"""
+
+from tumble.backends import threads_for_kernels, usable_device
+from tumble.rendering import relight
+from tumble.rendering.gbuffer import antialiased, buffers_of
+from tumble.rendering.prefiltered_light import Prefiltered, prefilter
+from tumble.rendering.rasterizer import Buffers, rasterize
+from tumble.rendering.shading import AveragedBounce, Bounce, Surface, in_own_shade, shade, shade_split, surface
+from tumble.rendering.trace import Tracer, Visibility, build, moved, open_sky, surface_points, transfer, visibility
+
+__all__ = [
+    "AveragedBounce",
+    "Bounce",
+    "Buffers",
+    "Prefiltered",
+    "Surface",
+    "Tracer",
+    "Visibility",
+    "antialiased",
+    "buffers_of",
+    "build",
+    "in_own_shade",
+    "moved",
+    "open_sky",
+    "prefilter",
+    "rasterize",
+    "relight",
+    "shade",
+    "shade_split",
+    "surface",
+    "surface_points",
+    "threads_for_kernels",
+    "transfer",
+    "usable_device",
+    "visibility",
+]

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from tumble.maths.directions import GOLDEN_ANGLE, local_frame, reflect
+from tumble.maths import GOLDEN_ANGLE, local_frame, reflect
 
 MIN_ROUGHNESS = 0.05
 """Floor of r wherever it enters a formula, without gradient below: the peak of the lobe, 1 / (pi r^4), is 5e4 there."""

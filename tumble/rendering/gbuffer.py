@@ -7,12 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths.se3 import SE3
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.rasterize import rasterize
-from tumble.scene.camera import Camera
-from tumble.scene.gaussians import Gaussians
-from tumble.scene.material import Material
+from tumble.maths import SE3
+from tumble.rendering.rasterizer import Buffers, rasterize
+from tumble.scene import Camera, Gaussians, Material
 
 OFFSET = 1 / 6
 """Of the four samples of a pixel from its centre [pixels]. A texture fitted to pixels by their centres is as blurred as
@@ -31,13 +28,12 @@ class Shown(Protocol):
     def gamma(self) -> Float[Tensor, ""]: ...
 
     @property
-    def material(self) -> Material | None: ...
+    def material(self) -> Material: ...
 
 
 def buffers_of(asset: Shown, T_cam_obj: SE3, camera: Camera) -> Buffers:
     """One view's albedo, roughness and normal at the centres of its pixels, with the detail of the normal added."""
     material = asset.material
-    assert material is not None, "an asset with material"
     features = {
         "albedo": material.albedo,
         "roughness": material.roughness[..., None],

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from tumble.maths.directions import equirect_from_direction, fibonacci_sphere, texel_directions, texel_solid_angles
+from tumble.maths import equirect_from_direction, fibonacci_sphere, texel_directions, texel_solid_angles
 from tumble.rendering import brdf
-from tumble.rendering.prefilter import Prefiltered
-from tumble.rendering.shade import Bounce, Surface, specular
+from tumble.rendering.prefiltered_light import Prefiltered
+from tumble.rendering.shading import Bounce, Surface, specular
 from tumble.rendering.trace import Tracer, trace
-from tumble.scene.environment import Environment
+from tumble.scene import Environment
 
 RAYS = 1 << 18
 """Rays at once: bounds memory to some 300 MB, changes nothing else."""

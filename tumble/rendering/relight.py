@@ -11,19 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths.directions import fibonacci_sphere
-from tumble.maths.se3 import SE3, SO3
-from tumble.rendering.buffers import Buffers
+from tumble.maths import SE3, SO3, fibonacci_sphere
 from tumble.rendering.gbuffer import antialiased
 from tumble.rendering.importance_sampling import GlossyBounce, light_sampler, relight_surface
-from tumble.rendering.prefilter import prefilter
-from tumble.rendering.shade import Bounce, Surface, shade_split, surface
+from tumble.rendering.prefiltered_light import prefilter
+from tumble.rendering.rasterizer import Buffers
+from tumble.rendering.shading import Bounce, Surface, shade_split, surface
 from tumble.rendering.trace import Tracer, build, open_sky, surface_points, transfer, visibility
-from tumble.scene.asset import Asset
-from tumble.scene.camera import Camera
-from tumble.scene.environment import Environment
-from tumble.scene.material import TEMPERATURE
-from tumble.scene.trajectory import Trajectory, opengl_from_opencv
+from tumble.scene import TEMPERATURE, Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
 SEEN_FROM = 64
 """Most frames from which the points are found that Gaussians stand for."""
@@ -58,7 +53,6 @@ def relight(
         seed: Of the samples.
     """
     material = asset.material
-    assert material is not None, "an asset with material"
     tracer = build(asset.gaussians, asset.gamma)
     sampler = light_sampler(environment)
     diffuse = Bounce(material.albedo.mean(1), _transfer(asset, tracer))
@@ -87,7 +81,6 @@ def preview(
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """As `relight`, at once: no shadows, no bounce, highlights as in training."""
     material = asset.material
-    assert material is not None, "an asset with material"
     prefiltered = prefilter(environment)
     directions = fibonacci_sphere(cfg.preview_directions).to(asset.gaussians.means)
     for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
@@ -101,6 +94,23 @@ def preview(
             f0=float(material.f0),
         )
         yield points.paint(shaded, camera.height, camera.width) * view.alpha[..., None]
+
+
+@torch.no_grad()
+def gaussian_colours(asset: Asset, frame: int = 0) -> Float[Tensor, "n 3"]:
+    """Linear radiance of every Gaussian under the recovered light of one training frame, unshadowed, seen head-on."""
+    material, normals, n = asset.material, asset.gaussians.normals, len(asset.gaussians)
+    points = Surface(torch.arange(n, device=normals.device), asset.gaussians.means, normals, normals)
+    sky = open_sky(fibonacci_sphere(SKY_DIRECTIONS).to(normals), n)
+    return shade_split(
+        points,
+        material.albedo.mean(1),
+        material.roughness.mean(1, keepdim=True),
+        prefilter(asset.environment),
+        asset.trajectory.R_env_obj[frame],
+        sky,
+        f0=float(material.f0),
+    )
 
 
 def turntable(seen: Trajectory, n: int, elevation: float) -> tuple[Float[Tensor, "3 3"], Trajectory]:
@@ -128,7 +138,6 @@ def turntable(seen: Trajectory, n: int, elevation: float) -> tuple[Float[Tensor,
 def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
     """The asset with its albedo times a factor per channel, at most 0.999."""
     material = asset.material
-    assert material is not None, "an asset with material"
     albedo = (material.albedo * albedo_scale).clamp(1e-4, 0.999)
     logits = TEMPERATURE * torch.logit(albedo)
     return replace(asset, material=replace(material, albedo_logits=logits))

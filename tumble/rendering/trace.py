@@ -19,11 +19,9 @@ from torch import Tensor
 
 from tumble import backends
 from tumble.backends import Backend, Hits
-from tumble.maths import spherical_harmonics
-from tumble.maths.se3 import SE3
-from tumble.rendering.rasterize import rasterize
-from tumble.scene.camera import Camera
-from tumble.scene.gaussians import Gaussians, opacity
+from tumble.maths import SE3, nearest, spherical_harmonics
+from tumble.rendering.rasterizer import rasterize
+from tumble.scene import Camera, Gaussians, opacity
 
 OFFSET = 1.5
 """How far rays start above the surface [median of the Gaussians' largest standard deviations]. On spheres and tori
@@ -31,8 +29,6 @@ with noisy centres, normals, sizes and opacities, 1 throws false shadows and 2 l
 0.998 of its sky."""
 WORD = 32
 """Bits in a word of a visibility."""
-ROWS = 1024
-"""Rows of a table of distances at once: bounds memory, changes nothing else."""
 
 
 @dataclass(frozen=True)
@@ -203,12 +199,7 @@ def surface_points(
     points = torch.where(seen[:, None], total / count.clamp(min=1)[:, None], means)
     if not seen.any() or seen.all():
         return points
-    near = _nearest(means[~seen], points[seen])
+    near = nearest(means[~seen], points[seen])
     height = ((points[seen][near] - means[~seen]) * normals[seen][near]).sum(-1, keepdim=True)
     points[~seen] = means[~seen] + height * normals[seen][near]
     return points
-
-
-def _nearest(x: Float[Tensor, "a 3"], y: Float[Tensor, "b 3"]) -> Int64[Tensor, " a"]:
-    """Index of the y nearest to each x."""
-    return torch.cat([torch.cdist(rows, y).argmin(1) for rows in x.split(ROWS)])

@@ -18,17 +18,12 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.export.confidence import Confidence
-from tumble.maths.directions import texel_directions
-from tumble.maths.images import srgb_from_linear
-from tumble.rendering.gbuffer import buffers_of
-from tumble.rendering.rasterize import rasterize
+from tumble.export import Confidence
+from tumble.maths import srgb_from_linear, texel_directions
+from tumble.rendering import buffers_of, rasterize
 from tumble.report import training_views
-from tumble.report.training_views import Frame
-from tumble.scene.asset import Asset
-from tumble.scene.camera import Camera
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import opengl_from_opencv
+from tumble.report.training_views import RenderedFrame
+from tumble.scene import Asset, Camera, Environment, opengl_from_opencv
 
 SHOWN, HERO = 320, 448
 """Sides of rendered maps and of the picture at the top [pixels]."""
@@ -38,7 +33,7 @@ STOPS = (0, 64, 128, 192, 255)
 """Code values at which a colour bar is written down."""
 
 
-def spread(asset: Asset, frames: Sequence[Frame], n: int) -> list[Frame]:
+def spread(asset: Asset, frames: Sequence[RenderedFrame], n: int) -> list[RenderedFrame]:
     """At most `n` frames that show the object from sides as different as can be, the clearest first."""
     usable = [frame for frame in frames if frame.mask.any()] or list(frames)
     d = normalize(asset.trajectory.camera_positions, dim=-1)
@@ -55,16 +50,16 @@ def resized(camera: Camera, side: int) -> Camera:
     return camera.resized(max(1, round(scale * camera.height)), max(1, round(scale * camera.width)))
 
 
-def small(camera: Camera) -> Camera:
+def small_camera(camera: Camera) -> Camera:
     return resized(camera, min(training_views.SIDE, max(camera.height, camera.width)))
 
 
-def hero(scene: training_views.Scene, frame: Frame) -> UInt8[np.ndarray, "h w 4"]:
+def hero(scene: training_views.LitScene, frame: RenderedFrame) -> UInt8[np.ndarray, "h w 4"]:
     linear, view = training_views.render(scene, frame.number, resized(frame.camera, HERO))
     return _cutout(srgb_from_linear(linear / view.alpha.clamp(min=1e-3)[..., None]), view.alpha)
 
 
-def pair(frame: Frame) -> str:
+def pair(frame: RenderedFrame) -> str:
     name = html.escape(frame.name)
     images = f'<img src="{webp(_codes(frame.photograph))}" alt="Photograph {name}">'
     images += f'<img src="{webp(_codes(frame.rendered))}" alt="Render of {name}">'
@@ -79,7 +74,7 @@ def _strip(title: str, about: str, pictures: Sequence[UInt8[np.ndarray, "h w c"]
     return f'<div class="strip"><div><p>{title}<small>{about}</small></p>{scale}</div>{images}</div>'
 
 
-def maps(asset: Asset, views: Sequence[Frame]) -> str:
+def maps(asset: Asset, views: Sequence[RenderedFrame]) -> str:
     albedo, roughness, normals = [], [], []
     for frame in views:
         T_cam_obj = asset.trajectory.T_cam_obj[frame.number]
@@ -96,7 +91,7 @@ def maps(asset: Asset, views: Sequence[Frame]) -> str:
     )
 
 
-def confidence(asset: Asset, views: Sequence[Frame], seen: Confidence) -> str:
+def confidence(asset: Asset, views: Sequence[RenderedFrame], seen: Confidence) -> str:
     n = len(asset.gaussians)
     rows = [
         ("Frames", "that show the point", 100 * seen.views, " %"),

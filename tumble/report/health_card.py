@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from tumble.export.confidence import LAMPS, Confidence
-from tumble.poses.result import Health
-from tumble.report.training_views import Frame
+from tumble.export import LAMPS, Confidence
+from tumble.poses import PoseQuality
+from tumble.report.training_views import RenderedFrame
 
-Verdict = Literal["good", "warn", "bad", "none"]
-WORDS: dict[Verdict, str] = {"good": "Good", "warn": "Watch", "bad": "Poor", "none": "Not known"}
-OVERALL: dict[Verdict, tuple[str, str]] = {
+CardVerdict = Literal["good", "warn", "bad", "none"]
+WORDS: dict[CardVerdict, str] = {"good": "Good", "warn": "Watch", "bad": "Poor", "none": "Not known"}
+OVERALL: dict[CardVerdict, tuple[str, str]] = {
     "good": ("Good", "Nothing stands out; the asset can be used."),
     "warn": ("Usable", "Something is worth a look before the asset is used: "),
     "bad": ("Doubtful", "Something went wrong: "),
@@ -39,29 +39,29 @@ class Row:
 
     name: str
     value: str
-    verdict: Verdict
+    verdict: CardVerdict
     sentence: str
     bars: tuple[float, ...] = ()
     """One value per frame, NaN where there is none."""
-    marks: tuple[Verdict, ...] = ()
+    marks: tuple[CardVerdict, ...] = ()
     """One per bar."""
 
 
-def card(frames: Sequence[Frame], health: Health | None, seen: Confidence) -> list[Row]:
+def card(frames: Sequence[RenderedFrame], quality: PoseQuality | None, seen: Confidence) -> list[Row]:
     """All rows, in order."""
-    return [_fit(frames), _outline(frames), _exposure(frames), _lost(health), _match(health), _variety(seen)]
+    return [_fit(frames), _outline(frames), _exposure(frames), _lost(quality), _match(quality), _variety(seen)]
 
 
-def overall(rows: Sequence[Row]) -> tuple[Verdict, str, str]:
+def overall(rows: Sequence[Row]) -> tuple[CardVerdict, str, str]:
     """The worst verdict, a word and a sentence for it."""
     found = {row.verdict for row in rows}
-    worst: Verdict = "bad" if "bad" in found else "warn" if "warn" in found else "good"
+    worst: CardVerdict = "bad" if "bad" in found else "warn" if "warn" in found else "good"
     word, sentence = OVERALL[worst]
     names = ", ".join(row.name.lower() for row in rows if row.verdict == worst)
     return worst, word, sentence if worst == "good" else f"{sentence}{names}. The health card says more."
 
 
-def _fit(frames: Sequence[Frame]) -> Row:
+def _fit(frames: Sequence[RenderedFrame]) -> Row:
     values = tuple(frame.psnr for frame in frames)
     middle, limits = _median(values), LIMITS["fit"]
     verdict = _low(middle, limits)
@@ -76,11 +76,11 @@ def _fit(frames: Sequence[Frame]) -> Row:
     off = [frame.name for frame, value in zip(frames, values, strict=True) if value < middle - 6]
     verdict = "warn" if off and verdict == "good" else verdict
     sentence += _list(off, "far worse than the rest; their poses may be wrong")
-    marks: tuple[Verdict, ...] = tuple("bad" if value < middle - 6 else "good" for value in values)
+    marks: tuple[CardVerdict, ...] = tuple("bad" if value < middle - 6 else "good" for value in values)
     return Row("Fit to the photographs", f"{middle:.1f} dB", verdict, sentence, values, marks)
 
 
-def _outline(frames: Sequence[Frame]) -> Row:
+def _outline(frames: Sequence[RenderedFrame]) -> Row:
     values = tuple(frame.iou for frame in frames)
     middle, limits = _median(values), LIMITS["outline"]
     verdict = _low(middle, limits)
@@ -96,7 +96,7 @@ def _outline(frames: Sequence[Frame]) -> Row:
     return Row("Outline against mask", f"{middle:.3f} IoU", verdict, sentence, values, _lows(values, limits))
 
 
-def _exposure(frames: Sequence[Frame]) -> Row:
+def _exposure(frames: Sequence[RenderedFrame]) -> Row:
     values = [frame.stops for frame in frames]
     known = sorted(value for value in values if not math.isnan(value))
     if len(known) < 4:
@@ -112,14 +112,14 @@ def _exposure(frames: Sequence[Frame]) -> Row:
         "white balance, and film again.",
     }[verdict]
     bars = tuple(abs(value - middle) for value in values)
-    marks: tuple[Verdict, ...] = tuple(_high(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars)
+    marks: tuple[CardVerdict, ...] = tuple(_high(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars)
     return Row("Exposure drift", f"{drift:.2f} stops", verdict, sentence, bars, marks)
 
 
-def _lost(health: Health | None) -> Row:
-    if health is None:
+def _lost(quality: PoseQuality | None) -> Row:
+    if quality is None:
         return Row("Lost frames", "-", "none", "The poses came with the capture; none was estimated.")
-    lost, limits = [bool(x) for x in health.lost], LIMITS["lost"]
+    lost, limits = [bool(x) for x in quality.lost], LIMITS["lost"]
     verdict = _high(sum(lost) / max(1, len(lost)), limits)
     sentence = {
         "good": "Every frame was located.",
@@ -127,16 +127,16 @@ def _lost(health: Health | None) -> Row:
         "bad": "Many frames could not be located. Turn the object more slowly, and keep fingers off its texture.",
         "none": "No frames.",
     }[verdict]
-    marks: tuple[Verdict, ...] = tuple("bad" if x else "good" for x in lost)
+    marks: tuple[CardVerdict, ...] = tuple("bad" if x else "good" for x in lost)
     return Row(
         "Lost frames", f"{sum(lost)} of {len(lost)}", verdict, sentence, tuple(0.15 + 0.85 * x for x in lost), marks
     )
 
 
-def _match(health: Health | None) -> Row:
-    if health is None:
+def _match(quality: PoseQuality | None) -> Row:
+    if quality is None:
         return Row("Match residual", "-", "none", "The poses came with the capture; no matches were made.")
-    values = tuple(float(x) for x in health.residual)
+    values = tuple(float(x) for x in quality.residual)
     middle, limits = _median(values), LIMITS["match"]
     verdict = _high(middle, limits)
     sentence = {
@@ -147,10 +147,10 @@ def _match(health: Health | None) -> Row:
         "sides.",
         "none": "There were no matches; the poses rest on outlines alone.",
     }[verdict]
-    sentence = f"{sentence} {health.sentence}"
+    sentence = f"{sentence} {quality.sentence}"
     # Matches may agree with each other on a wrong turn; the health of the poses knows more.
-    if health.verdict == "bad" or (health.verdict == "warn" and verdict in ("good", "none")):
-        verdict = health.verdict
+    if quality.verdict == "bad" or (quality.verdict == "warn" and verdict in ("good", "none")):
+        verdict = quality.verdict
     value = "-" if math.isnan(middle) else f"{middle:.2f} px"
     return Row("Match residual", value, verdict, sentence, values, tuple(_high(v, limits) for v in values))
 
@@ -174,17 +174,17 @@ def _median(values: Sequence[float]) -> float:
     return statistics.median(known) if known else math.nan
 
 
-def _high(value: float, limits: tuple[float, float]) -> Verdict:
+def _high(value: float, limits: tuple[float, float]) -> CardVerdict:
     if math.isnan(value):
         return "none"
     return "bad" if value > limits[1] else "warn" if value > limits[0] else "good"
 
 
-def _low(value: float, limits: tuple[float, float]) -> Verdict:
+def _low(value: float, limits: tuple[float, float]) -> CardVerdict:
     return _high(-value, (-limits[0], -limits[1]))
 
 
-def _lows(values: Sequence[float], limits: tuple[float, float]) -> tuple[Verdict, ...]:
+def _lows(values: Sequence[float], limits: tuple[float, float]) -> tuple[CardVerdict, ...]:
     return tuple(_low(value, limits) for value in values)
 
 

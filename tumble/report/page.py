@@ -25,23 +25,17 @@ from torch.nn.functional import normalize
 from tumble import __version__
 from tumble.datasets import which
 from tumble.engine import run
-from tumble.export import asset as export
-from tumble.export.confidence import confidence
-from tumble.io import files
-from tumble.io.files import BadFile
-from tumble.maths.directions import fibonacci_sphere
-from tumble.poses.result import Health
+from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
+from tumble.io import BadFile, files
+from tumble.maths import fibonacci_sphere
+from tumble.poses import PoseQuality, PoseResult
 from tumble.report import figures, health_card, preset_lights, svg, training_views
-from tumble.report.training_views import Frame
-from tumble.scene.asset import Asset
-from tumble.scene.capture import Capture
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import opengl_from_opencv
+from tumble.report.training_views import RenderedFrame
+from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
 
-REPORT = "report.html"
 PAIRS, VIEWS = 6, 4
 """Frames shown beside their renders, and views of the maps."""
-MESH = export.Preset(triangles=12_000, texture=1024, cells=192, views=48, pixels=512)
+MESH = Preset(triangles=12_000, texture=1024, cells=192, views=48, pixels=512)
 """Of the object in the page: about two megabytes."""
 SECTIONS: dict[str, str] = {
     "relight": "Relight",
@@ -69,29 +63,28 @@ class Story:
     """The capture's focal length where it is a guess [pixels]."""
 
 
-def write(out: Path, asset: Asset, *, capture: Path | None = None, health: Health | None = None) -> Path:
-    """Write `report.html` into a finished run's folder and return its path.
+def write_report(out: Path, *, capture: Path | None = None) -> Path:
+    """Write `report.html` into a finished run's folder; returns its path.
 
     Args:
         capture: Where the capture is now, if not where the run found it.
-        health: Of estimated poses.
 
     Raises:
-        BadFile: The capture is gone, or is not that of the run.
+        BadFile: The run is not finished, or its capture is gone, or `capture` is not that of the run.
     """
-    known = files.read_json(out / run.RECIPE)
-    path = capture or Path(known["capture"]["path"])
+    asset, path = run.asset(out, Asset), capture or run.source(out)
     if not path.exists():
         raise BadFile(path, "is the run's capture and is gone", "say where it is: --capture")
     whole = which(path).load(path)
-    taken = of_run(whole, asset, list(files.read_json(out / "poses.json")), path)
+    taken = of_run(whole, asset, list(files.read_json(out / run.POSES)), path)
+    tracked = run.output(out, run.TRACK, PoseResult)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
     guess = float(whole.camera.fx_fy_cx_cy[0]) if whole.focal_guessed else None
-    story = Story(name, run.records(out), known["recipe"], guess)
+    story = Story(name, run.records(out), run.recipe(out), guess)
     with tempfile.TemporaryDirectory() as folder:
         glb = model(asset, Path(folder))
-        build(asset, taken, glb, story, health, out / REPORT)
-    return out / REPORT
+        build(asset, taken, glb, story, tracked.quality if tracked else None, out / run.REPORT)
+    return out / run.REPORT
 
 
 def of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Path) -> Capture:
@@ -111,11 +104,11 @@ def of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Path) -> 
 def model(asset: Asset, folder: Path) -> Path | None:
     """A small GLB of the asset in a folder; None where the Gaussians show no surface, or xatlas is not installed."""
     try:
-        shape = export.surface(asset, MESH)
+        shape = extract_mesh(asset, MESH)
     except ValueError:
         return None
     try:
-        export.glb(asset, shape, MESH, 1.0, folder / "asset.glb")
+        write_textured_mesh(asset, shape, MESH, 1.0, folder / "asset.glb")
     except ModuleNotFoundError as error:
         warnings.warn(f"{error}; the report shows no mesh", stacklevel=2)
         return None
@@ -124,7 +117,7 @@ def model(asset: Asset, folder: Path) -> Path | None:
 
 @torch.no_grad()
 def build(
-    asset: Asset, capture: Capture, glb: Path | None, story: Story, health: Health | None, out: Path
+    asset: Asset, capture: Capture, glb: Path | None, story: Story, quality: PoseQuality | None, out: Path
 ) -> list[health_card.Row]:
     """Write the page; returns the health card that it shows.
 
@@ -132,14 +125,14 @@ def build(
         asset: With material and light, on the CPU.
         capture: Its training frames, in the order of the asset's trajectory.
         glb: The object for the live view, which is left out without one.
-        health: Of the poses, where they were estimated.
+        quality: Of the poses, where they were estimated.
     """
     scene = training_views.scene(asset)
     frames = list(training_views.frames(scene, capture))
     chosen = figures.spread(asset, frames, PAIRS)
     views = chosen[:VIEWS]
-    seen = confidence(asset, figures.small(asset.camera))
-    rows = health_card.card(frames, health, seen)
+    seen = confidence_of(asset, figures.small_camera(asset.camera))
+    rows = health_card.card(frames, quality, seen)
     verdict, word, sentence = health_card.overall(rows)
     hero = figures.hero(scene, views[0])
     parts = {
@@ -214,7 +207,6 @@ LIGHT_CAPTIONS = {
 
 
 def _environment(asset: Asset) -> Environment:
-    assert asset.environment is not None, "an asset with light"
     return asset.environment
 
 
@@ -289,7 +281,7 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 # The live view --------------------------------------------------------------------------------------------------------
 
 
-def _shown_lights(asset: Asset, frame: Frame) -> dict[str, tuple[str, Environment]]:
+def _shown_lights(asset: Asset, frame: RenderedFrame) -> dict[str, tuple[str, Environment]]:
     """The lights of the live view by key, with their names; axes are the camera's of a frame, x right, y up."""
     recovered = _environment(asset)
     if asset.trajectory.light == "object":
@@ -303,7 +295,7 @@ def _shown_lights(asset: Asset, frame: Frame) -> dict[str, tuple[str, Environmen
     }
 
 
-def _buttons(asset: Asset, frame: Frame) -> str:
+def _buttons(asset: Asset, frame: RenderedFrame) -> str:
     return "".join(
         f'<button type="button" data-light="{key}" aria-pressed="false">'
         f'<img src="{figures.webp(figures.panorama(light, 64))}" alt="">'
@@ -317,7 +309,7 @@ def _rgbe(light: Environment) -> bytes:
     return cv2.imencode(".hdr", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
 
 
-def _scripts(asset: Asset, frame: Frame, glb: bytes) -> str:
+def _scripts(asset: Asset, frame: RenderedFrame, glb: bytes) -> str:
     pose = asset.trajectory.T_cam_obj[frame.number].rotation
     # From OpenCV to OpenGL axes is half a turn about x: (w, x, y, z) -> (-x, w, -z, y), here written x, y, z, w.
     w, x, y, z = pose.wxyz.tolist()

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths.directions import texel_directions
-from tumble.scene.environment import Environment
+from tumble.maths import texel_directions
+from tumble.scene import Environment
 
 HEIGHT = 64
 """Rows of the maps: softboxes of twenty degrees keep their edges."""

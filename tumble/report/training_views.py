@@ -11,17 +11,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.evaluation import metrics
-from tumble.maths.directions import fibonacci_sphere
-from tumble.maths.images import Box, crop, crop_box, linear_from_srgb, resize_area, srgb_from_linear
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.gbuffer import antialiased
-from tumble.rendering.prefilter import Prefiltered, prefilter
-from tumble.rendering.shade import shade_split, surface
-from tumble.rendering.trace import Tracer, build, visibility
-from tumble.scene.asset import Asset
-from tumble.scene.camera import Camera
-from tumble.scene.capture import OBJECT, UNKNOWN, Capture
-from tumble.scene.trajectory import env_from_obj
+from tumble.maths import Box, crop, crop_box, fibonacci_sphere, linear_from_srgb, resize_area, srgb_from_linear
+from tumble.rendering import (
+    Buffers,
+    Prefiltered,
+    Tracer,
+    antialiased,
+    build,
+    prefilter,
+    shade_split,
+    surface,
+    visibility,
+)
+from tumble.scene import OBJECT, UNKNOWN, Asset, Camera, Capture, env_from_obj
 
 SIDE = 256
 """Longer side of a window, at most [pixels]: enough for a page, and for numbers of a whole frame."""
@@ -31,7 +33,7 @@ SOLID = 0.5
 
 
 @dataclass(frozen=True)
-class Frame:
+class RenderedFrame:
     """One training frame and what the asset says of it, in one window."""
 
     number: int
@@ -90,7 +92,7 @@ def window(mask: Tensor) -> Box:
 
 
 @dataclass(frozen=True)
-class Scene:
+class LitScene:
     """An asset made ready to be rendered under its own light."""
 
     asset: Asset
@@ -98,18 +100,15 @@ class Scene:
     prefiltered: Prefiltered
 
 
-def scene(asset: Asset) -> Scene:
+def scene(asset: Asset) -> LitScene:
     """Of an asset with material and light."""
-    assert asset.material is not None, "an asset with material"
-    assert asset.environment is not None, "an asset with light"
-    return Scene(asset, build(asset.gaussians, asset.gamma), prefilter(asset.environment))
+    return LitScene(asset, build(asset.gaussians, asset.gamma), prefilter(asset.environment))
 
 
 @torch.no_grad()
-def render(scene: Scene, number: int, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Buffers]:
+def render(scene: LitScene, number: int, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Buffers]:
     """One training pose through any camera, with shadows and without bounce: linear radiance over black."""
     material, trajectory = scene.asset.material, scene.asset.trajectory
-    assert material is not None, "an asset with material"
     T_cam_obj = trajectory.T_cam_obj[number]
     view = antialiased(scene.asset, T_cam_obj, camera)
     points = surface(view, T_cam_obj, camera, alpha_min=0.1)
@@ -127,7 +126,7 @@ def render(scene: Scene, number: int, camera: Camera) -> tuple[Float[Tensor, "h 
 
 
 @torch.no_grad()
-def frames(scene: Scene, capture: Capture) -> Iterator[Frame]:
+def frames(scene: LitScene, capture: Capture) -> Iterator[RenderedFrame]:
     """All training frames of a capture whose frames are those of the asset's trajectory."""
     for number, name in enumerate(capture.names):
         mask = capture.masks[number]
@@ -139,7 +138,7 @@ def frames(scene: Scene, capture: Capture) -> Iterator[Frame]:
         is_object, unknown = (
             resize_area((crop(mask, box) == value).float()[..., None], *size)[..., 0] for value in (OBJECT, UNKNOWN)
         )
-        yield Frame(
+        yield RenderedFrame(
             number=number,
             name=name,
             camera=camera,

@@ -14,13 +14,13 @@ from tumble.scene.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Asset:
-    """A relightable object. Material and environment are None until stage 3 has found them."""
+    """A relightable object, as stage 3 puts it out."""
 
     gaussians: Gaussians
     gamma: Float[Tensor, ""]
     """Sharpness of the opacity, shared by all Gaussians [1 / object radius] (eq. 8)."""
-    material: Material | None
-    environment: Environment | None
+    material: Material
+    environment: Environment
     """The light of the capture, env frame of the trajectory."""
     trajectory: Trajectory
     camera: Camera

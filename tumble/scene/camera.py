@@ -4,10 +4,13 @@ A *pixel position* `uv` counts from the top left corner of the image; `uv[0]` ru
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 
@@ -39,6 +42,13 @@ class Camera:
         fx, fy, cx, cy = self.fx_fy_cx_cy
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
         return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(3, 3)
+
+    @property
+    def opencv_matrix(self) -> Float64[np.ndarray, "3 3"]:
+        """K for OpenCV's functions and layouts like BOP's, which put the centre of the first pixel at (0, 0)."""
+        K = self.matrix.double().numpy().copy()
+        K[:2, 2] -= 0.5
+        return K
 
     def pixel_centers(self) -> Float[Tensor, "h w 2"]:
         """Positions of all pixel centres [pixels]."""
@@ -77,3 +87,31 @@ class Camera:
     def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
         """The part of the view that a window of pixels shows."""
         return Camera(self.fx_fy_cx_cy - self.fx_fy_cx_cy.new_tensor([0, 0, left, top]), height, width)
+
+
+def undistortion(
+    K: Float64[np.ndarray, "3 3"],
+    coefficients: Float64[np.ndarray, " k"],
+    camera: Camera,
+    *,
+    fisheye: bool,
+    R_new_cam: Float64[np.ndarray, "3 3"] | None = None,
+) -> Callable[..., np.ndarray]:
+    """What a pinhole camera sees of what a real lens photographed, as a function of picture and interpolation.
+
+    It may also be given OpenCV's number of what lies beyond the photograph, and a value for that.
+
+    Args:
+        K: Of the real lens, as OpenCV counts pixels (`Camera.opencv_matrix`).
+        coefficients: OpenCV's, of its fisheye or its normal model.
+        camera: The pinhole camera.
+        R_new_cam: Turns the pinhole camera against the real one.
+    """
+    tables = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    R = np.eye(3) if R_new_cam is None else R_new_cam
+    x, y = tables(K, coefficients, R, camera.opencv_matrix, (camera.width, camera.height), cv2.CV_32FC1)
+
+    def undistorted(picture: np.ndarray, how: int, border: int = cv2.BORDER_CONSTANT, value: int = 0) -> np.ndarray:
+        return cv2.remap(picture, x, y, how, borderMode=border, borderValue=value)
+
+    return undistorted

@@ -5,13 +5,17 @@ metric counts. *Evaluation views* are never trained on; their *region* is "share
 what they show, else "sphere" (format.md).
 """
 
+import hashlib
+import json
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from tumble.io import tree
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Light, Trajectory
@@ -20,6 +24,22 @@ OBJECT, UNKNOWN, BACKGROUND = 255, 128, 0
 REGIONS = ("shared", "sphere")
 Units = Literal["m", "arbitrary"]
 UNITS: tuple[str, ...] = get_args(Units)
+
+
+def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Opaque pixels are the object, clear ones background, what lies between is unknown."""
+    return np.select([alpha >= 250, alpha <= 5], [OBJECT, BACKGROUND], UNKNOWN).astype(np.uint8)
+
+
+def decoded_mask(values: UInt8[np.ndarray, "h w"], *, invert: bool = False) -> UInt8[np.ndarray, "h w"]:
+    """A mask picture's code values as OBJECT, UNKNOWN and BACKGROUND; a picture of only 0 and 1 counts as 0 and 255.
+
+    Args:
+        invert: The object is black.
+    """
+    if values.max(initial=0) == 1:
+        values = values * np.uint8(OBJECT)
+    return mask_from_alpha(255 - values if invert else values)
 
 
 @dataclass(frozen=True)
@@ -120,3 +140,35 @@ def no_views(camera: Camera) -> Truth:
     """A truth without evaluation views, to hang light and poses on."""
     shape = (0, camera.height, camera.width)
     return Truth(torch.zeros(*shape, 3, dtype=torch.uint8), torch.zeros(shape, dtype=torch.uint8), (), ())
+
+
+def content_key(capture: Capture) -> str:
+    """A hash of what a capture shows: images, masks, camera, poses, names of the frames, and who carries the light; and
+    of whether its focal length is a guess."""
+    digest = hashlib.sha256()
+    facts = {"names": capture.names, "light": capture.light, "size": (capture.camera.height, capture.camera.width)}
+    facts |= {"focal": "guess"} if capture.focal_guessed else {}
+    digest.update(json.dumps(facts, sort_keys=True).encode())
+    for name, x in tree.named_tensors(capture).items():
+        digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
+        digest.update(x.detach().cpu().contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class TargetView:
+    """One photograph as losses compare with it."""
+
+    image: Float[Tensor, "h w 3"]
+    """sRGB in [0, 1]."""
+    mask: Float[Tensor, "h w"]
+    """1 where the pixel surely shows the object."""
+    valid: Float[Tensor, "h w 1"]
+    """0 where nobody knows what the pixel shows."""
+
+
+def target_view(capture: Capture, number: int, like: Tensor) -> TargetView:
+    """Photograph `number` of a capture in the dtype and on the device of `like`."""
+    mask = capture.masks[number].to(like.device)
+    image = capture.images[number].to(like) / 255
+    return TargetView(image, (mask == OBJECT).to(like), (mask != UNKNOWN).to(like)[..., None])

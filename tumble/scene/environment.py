@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.io import files
-from tumble.maths.directions import equirect_from_direction, texel_directions, texel_solid_angles
+from tumble.maths import equirect_from_direction, texel_directions, texel_solid_angles
 
 DARKEST = 1e-6
 """Radiance below which a texel counts as black: a logarithm needs a floor, and 8-bit pictures see nothing under it."""

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.maths.se3 import SO3
+from tumble.maths import SO3
 
 
 @dataclass(frozen=True)

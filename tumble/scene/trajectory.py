@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths.se3 import SE3
+from tumble.maths import SE3
 
 Light = Literal["camera", "object"]
 LIGHTS: tuple[str, ...] = get_args(Light)

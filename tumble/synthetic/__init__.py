@@ -1,0 +1,33 @@
+"""Captures with exact truth: any GLB under any light map in one of the three settings, path traced by Mitsuba."""
+
+from typing import TYPE_CHECKING
+
+from tumble._lazy import lazily
+
+if TYPE_CHECKING:
+    from tumble.synthetic.demo_object import environment, other_environment, write_object
+    from tumble.synthetic.options import SynthOptions
+    from tumble.synthetic.pathtracer import OLDEST_LLVM, find_llvm
+    from tumble.synthetic.synthesize import NOTE, render_capture, render_captures
+
+__all__ = [
+    "NOTE",
+    "OLDEST_LLVM",
+    "SynthOptions",
+    "environment",
+    "find_llvm",
+    "other_environment",
+    "render_capture",
+    "render_captures",
+    "write_object",
+]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "demo_object": ("environment", "other_environment", "write_object"),
+        "options": ("SynthOptions",),
+        "pathtracer": ("OLDEST_LLVM", "find_llvm"),
+        "synthesize": ("NOTE", "render_capture", "render_captures"),
+    },
+)

@@ -18,11 +18,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tumble.io.files import BadFile
-from tumble.maths.directions import direction_from_equirect
-from tumble.maths.se3 import SE3
-from tumble.scene.camera import Camera
-from tumble.scene.environment import Environment
+from tumble.io import BadFile
+from tumble.maths import SE3, direction_from_equirect
+from tumble.scene import Camera, Environment
 
 OLDEST_LLVM = 17
 """LLVM 15 and 16 abort the process on some processors while they compile Dr.Jit's kernels."""
@@ -108,7 +106,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Model:
+class ObjectModel:
     """An object as an artist made it, moved into the unit ball with +y up."""
 
     parts: tuple[Part, ...]
@@ -116,7 +114,7 @@ class Model:
     """File to object frame: turn, shift and scale."""
 
 
-def read_model(path: Path, up: str = "y") -> Model:
+def read_model(path: Path, up: str = "y") -> ObjectModel:
     """The parts of a GLB with base colour and roughness; metalness, normal maps and emission are left out.
 
     Args:
@@ -144,7 +142,7 @@ def read_model(path: Path, up: str = "y") -> Model:
     radius = np.linalg.norm(corners - center, axis=1).max()
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = turn / radius, -center / radius
-    return Model(tuple(_moved(part, turn, T) for part in parts), T)
+    return ObjectModel(tuple(_moved(part, turn, T) for part in parts), T)
 
 
 def _moved(part: Part, R: np.ndarray, T: np.ndarray) -> Part:
@@ -186,7 +184,7 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def write_model(source: Path, model: Model, path: Path) -> None:
+def write_model(source: Path, model: ObjectModel, path: Path) -> None:
     """The GLB of `source` again, moved into the object frame (truth/mesh.glb)."""
     import trimesh
 
@@ -211,7 +209,7 @@ class Maps:
     coverage: Float[np.ndarray, "h w"]
 
 
-def shape(model: Model, shading: Shading, roughness: float | None) -> dict[str, Any]:
+def shape(model: ObjectModel, shading: Shading, roughness: float | None) -> dict[str, Any]:
     """The model as Mitsuba objects, to be shared by scenes that differ in light.
 
     Args:
@@ -251,7 +249,7 @@ def radiance(
     return pixels[..., :3], pixels[..., 3]
 
 
-def unlit_scenes(model: Model, roughness: float | None) -> tuple[Any, Any]:
+def unlit_scenes(model: ObjectModel, roughness: float | None) -> tuple[Any, Any]:
     """Two scenes for `maps`. `roughness` replaces the file's when given.
 
     A diffuse reflectance is the one texture that Mitsuba shows unlit: the second scene carries (roughness, 1, 0) in it.

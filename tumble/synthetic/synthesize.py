@@ -10,27 +10,22 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from rich.progress import Progress
 
 from tumble import __version__
-from tumble.datasets import _capture_folder
-from tumble.io import files, video
-from tumble.io.files import BadFile
-from tumble.maths.images import photograph
-from tumble.maths.se3 import SE3, SO3
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT
-from tumble.scene.environment import Environment
-from tumble.scene.trajectory import Light, env_from_obj, opengl_from_opencv
+from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
+from tumble.io import BadFile, files, video
+from tumble.maths import SE3, SO3, photograph
+from tumble.scene import BACKGROUND, OBJECT, Camera, Environment, Light, env_from_obj, opengl_from_opencv
 from tumble.synthetic import pathtracer
+from tumble.synthetic.options import SynthOptions
 from tumble.synthetic.trajectories import (
     ELEVATION,
     LIGHT,
-    Setting,
     distance_for,
     shared_views,
     sphere_views,
@@ -48,67 +43,6 @@ NOTE = "synth.json"
 
 
 @dataclass(frozen=True)
-class Options:
-    """How a capture is made."""
-
-    env: str
-    """The light: a lat-long .hdr or .exr file (+y up), or the word "white" for a uniform one."""
-    setting: Setting = "handheld"
-    """dome (still object), turntable, or handheld."""
-    views: int = 64
-    """Training frames."""
-    resolution: int = 128
-    """Height and width [pixels]."""
-    fov: float = 30.0
-    """Field of view [degrees]; the object fills it."""
-    samples: int = 400
-    """Paths per pixel of a photograph."""
-    truth_samples: int = 1024
-    """Paths per pixel of a relit picture: a score near 40 dB must not measure the truth's noise."""
-    path_depth: int = 5
-    """Path segments: 2 is direct light alone, each further one adds a bounce between parts of the object."""
-    material: Literal["original", "diffuse"] = "original"
-    """original: the file's base colour and roughness as a dielectric (F0 = 0.04); diffuse: Lambertian."""
-    roughness: float | None = None
-    """Replaces the file's roughness everywhere."""
-    env_rotation: float = 0.0
-    """Turns the light about the vertical [degrees]."""
-    up: Literal["y", "z"] = "y"
-    """The object file's upward axis."""
-    relight: tuple[str, ...] = ()
-    """Lights for relit truth, like `env`; their frame is the object's, their names are the files' stems."""
-    eval_shared: int = 12
-    """Evaluation views 15 to 35 degrees above the horizon."""
-    eval_sphere: int = 6
-    """Evaluation views from anywhere."""
-    exposure: float | None = None
-    """Factor on the light; None lets about one percent of the object's pixels saturate."""
-    pose_free: bool = False
-    """Leave the poses of training frames out of transforms.json (they are kept in truth/poses.json)."""
-    video: bool = False
-    """Also write the training frames as clip.mp4 (H.264), as a user would bring them."""
-    seed: int = 0
-    """Of the tumble and of the path tracer."""
-
-    def __post_init__(self) -> None:
-        rules = {
-            "views": self.views >= 1,
-            "resolution": 8 <= self.resolution <= 4096 and self.resolution % 2 == 0,
-            "fov": 1 <= self.fov <= 120,
-            "samples": self.samples >= 1 and self.truth_samples >= 1,
-            "path_depth": self.path_depth >= 2,
-            "roughness": self.roughness is None or 0 < self.roughness <= 1,
-            "exposure": self.exposure is None or self.exposure > 0,
-            "eval_shared": self.eval_shared >= 0 and self.eval_sphere >= 0,
-        }
-        if broken := [name for name, kept in rules.items() if not kept]:
-            raise ValueError(f"{broken[0]} is out of range: {getattr(self, broken[0])} (see tumble synth --help)")
-        stems = [Path(name).stem for name in self.relight]
-        if len(set(stems)) < len(stems):
-            raise ValueError(f"relight needs lights of different names, these are {', '.join(stems)}: rename one")
-
-
-@dataclass(frozen=True)
 class _Shot:
     """One frame to be rendered."""
 
@@ -122,8 +56,8 @@ class _Shot:
 class _Studio:
     """What the frames share. Holds Mitsuba's scenes, whose compiled kernels are worth keeping."""
 
-    options: Options
-    model: pathtracer.Model
+    options: SynthOptions
+    model: pathtracer.ObjectModel
     camera: Camera
     out: Path
     shapes: dict[str, Any]
@@ -139,7 +73,7 @@ class _Studio:
         return pathtracer.radiance(scene, shot.T_cam_obj, self.camera, R_env_obj, samples=samples, seed=seed)
 
 
-def synthesize(model: Path, out: Path, options: Options) -> Path:
+def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
     """Render a capture folder (docs/format.md); returns it. Frames that are there already are kept.
 
     Raises:
@@ -167,7 +101,7 @@ def synthesize(model: Path, out: Path, options: Options) -> Path:
     return out
 
 
-def _note(model: Path, options: Options) -> dict[str, Any]:
+def _note(model: Path, options: SynthOptions) -> dict[str, Any]:
     """All that decides the pictures, so that a resumed folder cannot mix two captures."""
 
     def digest(name: str) -> str:
@@ -200,14 +134,14 @@ def _claim(out: Path, note: dict[str, Any]) -> bool:
     return True
 
 
-def _studio(model: Path, out: Path, options: Options) -> _Studio:
+def _studio(model: Path, out: Path, options: SynthOptions) -> _Studio:
     camera = Camera.from_fov(math.radians(options.fov), options.resolution, options.resolution)
     parts = pathtracer.read_model(model, options.up)
     shapes = pathtracer.shape(parts, options.material, options.roughness)
     return _Studio(options, parts, camera, out, shapes, pathtracer.unlit_scenes(parts, options.roughness))
 
 
-def _shots(options: Options) -> Iterator[_Shot]:
+def _shots(options: SynthOptions) -> Iterator[_Shot]:
     distance = distance_for(math.radians(options.fov))
     training = trajectory(options.setting, options.views, distance, seed=options.seed)
     groups = (
@@ -232,7 +166,7 @@ def _light(name: str) -> Environment:
     return light if light.log_radiance.shape[0] <= LIGHT_ROWS else light.resampled(LIGHT_ROWS, 2 * LIGHT_ROWS)
 
 
-def _capture_light(options: Options) -> Environment:
+def _capture_light(options: SynthOptions) -> Environment:
     """The light in the capture's env frame: a room whose +y is up, seen by a camera that may look down."""
     yaw = SO3.exp(torch.tensor([0.0, math.radians(options.env_rotation), 0.0], dtype=torch.float64))
     # The turntable's camera looks down by its elevation, so in its frame the room is pitched up.
@@ -241,7 +175,7 @@ def _capture_light(options: Options) -> Environment:
     return _light(options.env).rotated(R_env_room.matrix().float())
 
 
-def _sources(options: Options) -> dict[str, Environment]:
+def _sources(options: SynthOptions) -> dict[str, Environment]:
     """The lights before exposure: the capture's under the empty name, in its env frame; those of relit truth."""
     return {"": _capture_light(options)} | {Path(name).stem: _light(name) for name in options.relight}
 
@@ -306,9 +240,9 @@ def _render_truth(studio: _Studio, shot: _Shot, seed: int) -> np.ndarray:
     return view.coverage
 
 
-def _maps(options: Options) -> tuple[str, ...]:
+def _maps(options: SynthOptions) -> tuple[str, ...]:
     """A Lambertian surface has no roughness to speak of."""
-    return tuple(name for name in _capture_folder.MAPS if options.material == "original" or name != "roughness")
+    return tuple(name for name in MAPS if options.material == "original" or name != "roughness")
 
 
 def _write_photograph(path: Path, radiance: np.ndarray) -> None:
@@ -323,15 +257,13 @@ def _write_documents(studio: _Studio, shots: list[_Shot], lights: dict[str, Path
     options = studio.options
     training = [shot for shot in shots if shot.region is None]
     files.write_json(studio.out / "truth" / "poses.json", {shot.name: _matrix(shot) for shot in training})
-    frames = [_capture_folder.training_frame(s.name, None if options.pose_free else _matrix(s)) for s in training]
+    frames = [training_frame(s.name, None if options.pose_free else _matrix(s)) for s in training]
     frames += [
-        _capture_folder.evaluation_frame(s.name, _matrix(s), s.region, maps=_maps(options), lights=filter(None, lights))
+        evaluation_frame(s.name, _matrix(s), s.region, maps=_maps(options), lights=filter(None, lights))
         for s in shots
         if s.region is not None
     ]
-    document = _capture_folder.document(
-        studio.camera, LIGHT[options.setting], frames, setting=options.setting, with_light=True
-    )
+    document = capture_document(studio.camera, LIGHT[options.setting], frames, setting=options.setting, with_light=True)
     files.write_json(studio.out / "transforms.json", document)
 
 
@@ -342,8 +274,14 @@ def _matrix(shot: _Shot) -> list[list[float]]:
     return T_obj_cam.tolist()
 
 
-def sweep(model: Path, out: Path, options: Options, roughnesses: tuple[float, ...]) -> list[Path]:
-    """One capture per constant roughness, `out/r0.20`, `out/r0.40`, ...: alike in all else (paper section 5.2)."""
+def render_captures(
+    model: Path, out: Path, options: SynthOptions, roughness_sweep: tuple[float, ...] = ()
+) -> list[Path]:
+    """One capture in `out`, or one per constant roughness as `out/r0.20`, `out/r0.40`, ...: alike in all else (paper
+    section 5.2)."""
+    if not roughness_sweep:
+        return [render_capture(model, out, options)]
     return [
-        synthesize(model, out / f"r{value:.2f}", dataclasses.replace(options, roughness=value)) for value in roughnesses
+        render_capture(model, out / f"r{value:.2f}", dataclasses.replace(options, roughness=value))
+        for value in roughness_sweep
     ]

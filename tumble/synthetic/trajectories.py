@@ -11,17 +11,16 @@ The object stands at the origin of its frame with +y up, inside the unit ball; i
 
 import math
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths.directions import fibonacci_sphere
-from tumble.maths.se3 import SE3, SO3
-from tumble.scene.trajectory import Light
+from tumble.maths import SE3, SO3, fibonacci_sphere
+from tumble.scene import Light
+from tumble.synthetic.options import Setting
 
-Setting = Literal["dome", "turntable", "handheld"]
 SETTINGS: tuple[str, ...] = get_args(Setting)
 LIGHT: dict[str, Light] = {"dome": "object", "turntable": "camera", "handheld": "camera"}
 """What the light stands still with, by setting."""

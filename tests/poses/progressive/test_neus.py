@@ -7,10 +7,9 @@ import torch
 
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.progressive import neus, sdf_field
-from tumble.poses.progressive.neus import Glimpse
+from tumble.poses.progressive.neus import Glimpse, Rendered
 from tumble.poses.progressive.ray_sampling import Pixels
 from tumble.poses.progressive.sdf_field import Sizes
-from tumble.poses.progressive.volume import Rendered
 from tumble.scene.camera import Camera
 
 SIZES = Sizes(width=64, depth=3, skip=0, features=4, octaves=0, colour_width=8, colour_depth=1, colour_octaves=0)

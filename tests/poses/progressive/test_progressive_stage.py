@@ -1,7 +1,8 @@
-"""The paper's route with the graph route's outcome."""
+"""The paper's route with the outcome of the other."""
 
 import math
 import sys
+from functools import partial
 
 import torch
 
@@ -10,9 +11,9 @@ from tests.poses.progressive.test_tracker import INPUTS, SMOKE, TRUTH
 from tumble import recipes
 from tumble.engine.loop import Stage, drive
 from tumble.maths.se3 import angle_between
-from tumble.poses.progressive import lift, tracker
 from tumble.poses.progressive import stage as progressive
-from tumble.poses.sfm import stage as graph
+from tumble.poses.progressive import tracker, virtual_camera
+from tumble.poses.sfm import stage as sfm
 
 
 def test_true_poses_are_judged_good() -> None:
@@ -20,28 +21,30 @@ def test_true_poses_are_judged_good() -> None:
     scene = tumbling(24, points=200)
     rng = torch.Generator().manual_seed(0)
     some = [scene.match(t - k, t, rng, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
-    found = graph.judged(graph.gather(scene.capture, some), truth(scene))
-    assert found.health.verdict == "good"
-    assert math.degrees(found.health.uncertainty) < 1
+    found = sfm.judged(sfm.gather(scene.capture, some, "mixed"), truth(scene))
+    assert found.quality.verdict == "good"
+    assert math.degrees(found.quality.uncertainty) < 1
     between = found.trajectory.T_cam_obj.rotation.inverse() @ truth(scene).T_cam_obj.rotation
     assert angle_between(between[1:], between[:-1]).max() < 1e-3
 
 
 def test_it_finds_what_track_finds() -> None:
     """Five frames of a painted ball: too few steps to be right, the same ones as those of the stage alone."""
-    inputs = progressive.gather(INPUTS.capture, INPUTS.matches)
+    judged = partial(sfm.judged, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
+    inputs = progressive.gather(INPUTS.capture, INPUTS.matches, judged)
+    cfg = progressive.Config(**vars(SMOKE))
     assert isinstance(sys.modules["tumble.poses.progressive.stage"], Stage)
-    assert progressive.length(SMOKE, inputs) == tracker.length(SMOKE, inputs.track)
-    both = drive(progressive, SMOKE, inputs, seed=1)
+    assert progressive.length(cfg, inputs) == tracker.length(SMOKE, inputs.track)
+    both = drive(progressive, cfg, inputs, seed=1)
     alone = drive(tracker, SMOKE, inputs.track, seed=1)
-    lifted = lift.lift(alone.aim, alone.T_aim_obj, "camera").T_cam_obj
+    lifted = virtual_camera.lift(alone.aim, alone.T_aim_obj, "camera").T_cam_obj
     between = both.trajectory.T_cam_obj.rotation.inverse() @ lifted.rotation
     assert angle_between(between[1:], between[:-1]).max() < 1e-3
-    assert len(both.health) == len(TRUTH.xyz)
+    assert len(both.quality) == len(TRUTH.xyz)
 
 
 def test_the_recipe_names_the_route() -> None:
     quick, paper = (recipes.progressive_poses(r).track for r in (recipes.DRAFT, recipes.PAPER))
-    assert isinstance(quick, tracker.Config)
-    assert paper == tracker.Config()
+    assert isinstance(quick, progressive.Config)
+    assert paper == progressive.Config()
     assert quick.pose_steps < 100

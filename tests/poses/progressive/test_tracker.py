@@ -11,10 +11,10 @@ import torch
 from tumble.engine.loop import Stage, State, drive
 from tumble.io import tree
 from tumble.maths.se3 import SE3, SO3, angle_between
-from tumble.poses.progressive import schedule, tracker, virtual_camera
-from tumble.poses.progressive.lift import lift
+from tumble.poses.progressive import tracker, virtual_camera
 from tumble.poses.progressive.sdf_field import Sizes
 from tumble.poses.progressive.tracker import Config, Inputs, Rates
+from tumble.poses.progressive.virtual_camera import lift
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.match import Match
@@ -70,7 +70,7 @@ def turning_ball(n: int = 5, size: int = 40) -> tuple[Inputs, SE3]:
 INPUTS, TRUTH = turning_ball()
 
 
-def bits(output: tracker.Tracked) -> dict[str, bytes]:
+def bits(output: tracker.ProgressiveResult) -> dict[str, bytes]:
     return {name: x.numpy().tobytes() for name, x in tree.named_tensors(output).items()}
 
 
@@ -105,9 +105,9 @@ def test_on_a_shape_that_is_right_a_turning_ball_is_followed() -> None:
         # A network that is a ball to five percent; and a ball of nine pixels may shift by a thirtieth of its radius,
         # which looks like two degrees.
         assert math.degrees(float(angle_between(motion, true))) < 4
-    assert tracked.health.iou.min() > 0.8
-    assert tracked.health.match[1:].max() < 3
-    assert torch.isinf(tracked.health.match[0])
+    assert tracked.fit.iou.min() > 0.8
+    assert tracked.fit.match[1:].max() < 3
+    assert torch.isinf(tracked.fit.match[0])
 
 
 def test_a_shape_grows_to_its_silhouette() -> None:
@@ -126,7 +126,7 @@ def test_a_shape_grows_to_its_silhouette() -> None:
 
 def test_a_pose_alone_leaves_the_shape_and_older_poses_alone() -> None:
     state = tracker.init(SMOKE, INPUTS, torch.Generator().manual_seed(0))
-    while (here := schedule.place(SMOKE.phases, state.step)).turn < 2 or here.phase == "shape":
+    while (here := tracker.place(SMOKE.phases, state.step)).turn < 2 or here.phase == "shape":
         tracker.step(SMOKE, INPUTS, state)
         state.step += 1
     before = {name: x.detach().clone() for name, x in tree.named_tensors(state.params).items()}
@@ -160,7 +160,7 @@ def test_a_steady_turn_goes_on_without_stretching_quaternions() -> None:
     """Three rotations make the next: lengths off by one percent would be off by three, then by seven, then by 17."""
     cfg = replace(SMOKE, motion="steady", warmup=1, pose_steps=1, joint_steps=1)
     state = tracker.init(cfg, INPUTS, torch.Generator().manual_seed(0))
-    while not (here := schedule.place(cfg.phases, state.step)).first or here.turn < 2:
+    while not (here := tracker.place(cfg.phases, state.step)).first or here.turn < 2:
         tracker.step(cfg, INPUTS, state)
         state.step += 1
     turn = SO3.exp(STEP).wxyz

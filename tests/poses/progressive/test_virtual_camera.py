@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
+from tests.oracles.virtual_camera import warp_images, warp_masks
 from tumble.maths.images import linear_from_srgb
 from tumble.maths.se3 import SE3
-from tumble.poses.progressive.virtual_camera import FILL, aim_at, into_aim, out_of_aim, warp_images, warp_masks
+from tumble.poses.progressive.virtual_camera import FILL, aim_at, into_aim, out_of_aim
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from tumble.maths.se3 import SO3
 from tumble.poses.sfm import bundle_adjustment
-from tumble.poses.sfm.bundle_adjustment import Problem, Scene
+from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
 from tumble.poses.sfm.tracks import Tracks
 from tumble.scene.camera import Camera
 
 CAMERA = Camera(torch.tensor([240.0, 250.0, 64.0, 60.0]), 128, 128)
 
 
-def scene(groups: int, frames: int, points: int, seed: int = 0) -> Scene:
+def scene(groups: int, frames: int, points: int, seed: int = 0) -> BundleState:
     """Random tumbles of random points about (0, 0, 1)."""
     rng = torch.Generator().manual_seed(seed)
     like = {"generator": rng, "dtype": torch.float64}
@@ -24,10 +24,10 @@ def scene(groups: int, frames: int, points: int, seed: int = 0) -> Scene:
     for k in range(1, frames):
         R.append(SO3.exp(steps[:, k]).matrix() @ R[-1])
     t = torch.tensor([0.0, 0.0, 1.0]).double() + 0.02 * torch.randn(groups, frames, 3, **like)
-    return Scene(torch.stack(R, 1), t, 0.12 * torch.randn(groups * points, 3, **like))
+    return BundleState(torch.stack(R, 1), t, 0.12 * torch.randn(groups * points, 3, **like))
 
 
-def seen(truth: Scene, noise: float = 0.0, seed: int = 5) -> Problem:
+def seen(truth: BundleState, noise: float = 0.0, seed: int = 5) -> Problem:
     """Every point in every frame of its group."""
     g, f = truth.t.shape[:2]
     n = len(truth.X)
@@ -51,23 +51,23 @@ def seen(truth: Scene, noise: float = 0.0, seed: int = 5) -> Problem:
     return replace(problem, tracks=replace(tracks, uv=uv))
 
 
-def shaken(truth: Scene, turn: float, seed: int = 7) -> Scene:
+def shaken(truth: BundleState, turn: float, seed: int = 7) -> BundleState:
     rng = torch.Generator().manual_seed(seed)
     like = {"generator": rng, "dtype": torch.float64}
     R = SO3.exp(turn * torch.randn(*truth.t.shape, **like)).matrix() @ truth.R
     shift, moved = (0.02 * torch.randn(*x.shape, **like) for x in (truth.t, truth.X))
-    return Scene(R, truth.t + shift, truth.X + moved)
+    return BundleState(R, truth.t + shift, truth.X + moved)
 
 
-def guessing(truth: Scene, problem: Problem, factor: float) -> tuple[Problem, Scene]:
+def guessing(truth: BundleState, problem: Problem, factor: float) -> tuple[Problem, BundleState]:
     """The same pixels through a camera whose focal length is the true one times a factor, and where that begins."""
     g = len(truth.R)
     shrink = torch.tensor([1 / factor, 1 / factor, 1.0]).double()
-    start = Scene(truth.R, shrink * truth.t, truth.X / factor, torch.zeros(g, dtype=torch.float64))
+    start = BundleState(truth.R, shrink * truth.t, truth.X / factor, torch.zeros(g, dtype=torch.float64))
     return replace(problem, camera=CAMERA.zoomed(factor), reach=problem.reach / factor), start
 
 
-def relative_errors(found: Scene, truth: Scene) -> Tensor:
+def relative_errors(found: BundleState, truth: BundleState) -> Tensor:
     """Angles between the found and true motions from the first frame of each group [radians]."""
     a, b = (s.R @ s.R[:, :1].mT for s in (found, truth))
     return SO3.from_matrix(a @ b.mT).angle()
@@ -104,7 +104,7 @@ def test_the_derivatives_by_the_focal_length_are_those_of_the_cost() -> None:
     h = 1e-6
 
     def at_focal(
-        d: Tensor, problem: Problem = problem, at: Scene = at, scale: float = 1.5
+        d: Tensor, problem: Problem = problem, at: BundleState = at, scale: float = 1.5
     ) -> bundle_adjustment._System:
         return bundle_adjustment._linearise(problem, replace(at, log_focal=d), scale)
 
@@ -222,7 +222,11 @@ def test_groups_do_not_know_of_each_other() -> None:
             problem.reach,
         )
         one, _ = bundle_adjustment.adjust(
-            alone, Scene(start.R[g : g + 1], start.t[g : g + 1], start.X[mine]), steps=15, scale=1.0, tolerance=0.0
+            alone,
+            BundleState(start.R[g : g + 1], start.t[g : g + 1], start.X[mine]),
+            steps=15,
+            scale=1.0,
+            tolerance=0.0,
         )
         torch.testing.assert_close(one.R[0], both.R[g], atol=1e-6, rtol=0)
 

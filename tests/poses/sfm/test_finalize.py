@@ -8,7 +8,7 @@ import torch
 
 from tests.lopsided import DISTANCE, KNOBS, tumbling
 from tumble.maths.se3 import SE3, SO3
-from tumble.poses.result import Observability
+from tumble.poses.result import Observability, PoseResult
 from tumble.poses.sfm import finalize, frontier_points
 from tumble.poses.sfm.finalize import Solution
 from tumble.poses.sfm.tracks import Tracks, followed
@@ -16,7 +16,7 @@ from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 
 
 @pytest.fixture(scope="module")
-def outcome() -> finalize.Tracked:
+def outcome() -> PoseResult:
     """True poses and matches, frame 7 without an object and frame 12 turned by 40 degrees without matches."""
     scene = tumbling(24)
     rng = torch.Generator().manual_seed(0)
@@ -30,30 +30,30 @@ def outcome() -> finalize.Tracked:
     return finalize.finished(scene.capture, tracks, frontier_points.outlines(scene.capture), solution)
 
 
-def test_the_object_fills_the_unit_ball(outcome: finalize.Tracked) -> None:
+def test_the_object_fills_the_unit_ball(outcome: PoseResult) -> None:
     """Longest axis 0.9 on both sides, and the knobs stay within: the unit is 0.9, about the ellipsoid's centre."""
     assert float((KNOBS[:, :3].norm(dim=-1) + KNOBS[:, 3]).max()) > 0.9, "one knob sticks out"
     true = tumbling(24).T_cam_obj.xyz[:, 2]
-    keep = ~outcome.health.lost
+    keep = ~outcome.quality.lost
     scale = (true[keep] / outcome.trajectory.T_cam_obj.xyz[keep, 2]).median()
     assert 0.85 < float(scale) < 1.1
     assert float(outcome.points.norm(dim=-1).quantile(0.99)) < 1.05
     assert (outcome.colours - 0.127).abs().max() < 0.01, "code value 100 is 0.127 of linear light"
 
 
-def test_frames_without_evidence_are_lost_and_bridged(outcome: finalize.Tracked) -> None:
-    assert torch.nonzero(outcome.health.lost)[:, 0].tolist() == [7, 12]
+def test_frames_without_evidence_are_lost_and_bridged(outcome: PoseResult) -> None:
+    assert torch.nonzero(outcome.quality.lost)[:, 0].tolist() == [7, 12]
     true = tumbling(24).T_cam_obj.rotation.matrix()
     found = outcome.trajectory.T_cam_obj.rotation.matrix().double()
     for k in (7, 12):
         # Halfway between neighbours of a smooth tumble; the first frame fixes the gauge.
         off = SO3.from_matrix(found[k] @ (true[k] @ true[0].T @ found[0]).T).angle()
         assert off.rad2deg() < 3
-    assert outcome.health.gap[~outcome.health.lost & ~outcome.health.gap.isnan()].max() < 1
-    kept = ~outcome.health.lost
-    assert outcome.health.overlap[kept].min() > 0.85
-    assert outcome.health.inliers[12] == 0
-    assert outcome.health.residual[12].isnan()
+    assert outcome.quality.gap[~outcome.quality.lost & ~outcome.quality.gap.isnan()].max() < 1
+    kept = ~outcome.quality.lost
+    assert outcome.quality.overlap[kept].min() > 0.85
+    assert outcome.quality.inliers[12] == 0
+    assert outcome.quality.residual[12].isnan()
 
 
 def test_the_ball_about_a_cube_leaves_a_stray_point_out() -> None:
@@ -81,7 +81,7 @@ def test_frames_beyond_a_leap_are_lost() -> None:
     R = scene.T_cam_obj.rotation.matrix().clone()
     R[:2] = R[:2] @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE, torch.zeros(24))
-    health = finalize.finished(scene.capture, tracks, frontier_points.outlines(scene.capture), solution).health
+    health = finalize.finished(scene.capture, tracks, frontier_points.outlines(scene.capture), solution).quality
     assert torch.nonzero(health.lost)[:, 0].tolist() == [0, 1]
     assert health.verdict == "warn"
 
@@ -110,7 +110,7 @@ def test_texture_on_one_axis_leaves_the_turn_about_it_unseen(monkeypatch: pytest
     capture, tracks, solution = on_an_axis()
     sharp = 10 * torch.eye(2, dtype=torch.float64).expand(len(tracks), 2, 2)
     monkeypatch.setattr(finalize.texture_information, "information", lambda capture, tracks: sharp)
-    health = finalize.finished(capture, tracks, frontier_points.outlines(capture), solution).health
+    health = finalize.finished(capture, tracks, frontier_points.outlines(capture), solution).quality
     seen = health.observability
     assert seen.unseen
     assert not seen.plain
@@ -125,7 +125,7 @@ def test_texture_on_one_axis_leaves_the_turn_about_it_unseen(monkeypatch: pytest
 def test_a_plain_ball_shows_no_turn() -> None:
     """Grey pictures, round outlines: whatever the matches say, it is not to be believed."""
     capture, tracks, solution = on_an_axis()
-    health = finalize.finished(capture, tracks, frontier_points.outlines(capture), solution).health
+    health = finalize.finished(capture, tracks, frontier_points.outlines(capture), solution).quality
     assert health.observability.plain
     assert health.verdict == "bad"
     assert health.sentence.startswith("Rotation is not observable")

@@ -56,7 +56,7 @@ def test_points_are_found_again_under_another_angle_though_the_poses_are_off() -
     z = torch.tensor([0.0, 0.0, TWIST])
     T = truth.T_cam_obj
     wrong = torch.cat([T.rotation[:HALF].wxyz, (T.rotation[HALF:] @ SO3.exp(z)).wxyz])
-    found = comebacks(capture, Trajectory(SE3(wrong, T.xyz), "camera"), count=20, gap=HALF - 1)
+    found = comebacks(capture, Trajectory(SE3(wrong, T.xyz), "camera"), "mixed", count=20, gap=HALF - 1)
     wide = [match for match in found if match.i < HALF <= match.j]
     assert len(wide) >= HALF / 2, "every view from above has one from below, and neighbours stand for each other"
     assert len({(match.i, match.j) for match in found}) == len(found) <= 20
@@ -76,24 +76,24 @@ def test_only_frames_that_share_a_side_are_matched() -> None:
     capture, truth = film()
     far = looking([0.0] * 2, [0.0, math.pi])
     T = SE3.from_rotation(far, truth.T_cam_obj.xyz[:2])
-    assert comebacks(capture.select([0, 1]), Trajectory(T, "camera"), count=20, gap=0) == []
+    assert comebacks(capture.select([0, 1]), Trajectory(T, "camera"), "mixed", count=20, gap=0) == []
 
 
 def test_poses_that_leave_nothing_of_the_object_have_no_comeback() -> None:
     capture, truth = film()
     away = SE3(truth.T_cam_obj.wxyz, truth.T_cam_obj.xyz + torch.linspace(-1.5, 1.5, 2 * HALF)[:, None])
-    assert comebacks(capture, Trajectory(away, "camera"), count=20, gap=3) == []
+    assert comebacks(capture, Trajectory(away, "camera"), "mixed", count=20, gap=3) == []
 
 
 def test_the_graph_route_takes_them_for_points_of_a_body_of_revolution(monkeypatch: pytest.MonkeyPatch) -> None:
     """In its own unit, the mean distance; every point is seen by two frames, in places that the truth agrees with."""
     capture, truth = film()
     monkeypatch.setattr(stage, "AGAIN", HALF - 1)
-    inputs, cfg, T = stage.gather(capture, []), stage.Config(), truth.T_cam_obj
+    inputs, cfg, T = stage.gather(capture, [], "mixed"), stage.Config(), truth.T_cam_obj
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
     known = torch.zeros((), dtype=torch.float64)
     state.params = stage.Poses(T.rotation.matrix().double(), T.xyz.double() / DISTANCE, known)
-    state.step = next(k for k, (phase, _, _) in enumerate(stage.plan(cfg)) if phase == "loops")
+    state.step = stage.schedule(cfg).index(stage.Step(stage.CloseLoops()))
     stage.step(cfg, inputs, state)
     point, frame, uv = (state.memory[f"loop_{name}"] for name in ("point", "frame", "uv"))
     off = []

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from tests.lopsided import Tumble, truth, tumbling
-from tumble.engine.loop import Stage, drive
+from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
+from tumble.poses.result import PoseResult
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.finalize import Tracked
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
 
@@ -29,40 +29,40 @@ def scene() -> Tumble:
 
 
 @pytest.fixture(scope="module")
-def tracked(scene: Tumble) -> Tracked:
-    return drive(stage, QUICK, stage.gather(scene.capture, matches(scene)), seed=0)
+def tracked(scene: Tumble) -> PoseResult:
+    return drive(stage, QUICK, stage.gather(scene.capture, matches(scene), "mixed"), seed=0)
 
 
 def test_it_is_a_stage() -> None:
     assert isinstance(stage, Stage)
 
 
-def test_rotations_are_found(scene: Tumble, tracked: Tracked) -> None:
+def test_rotations_are_found(scene: Tumble, tracked: PoseResult) -> None:
     """170 degrees of tumbling, 0.2 pixels of noise, every seventh match wrong."""
     scores = metrics.rotation_scores(tracked.trajectory, truth(scene))
     assert scores["rotation_median_degrees"] < 1.5
     assert scores["rotation_below_5_percent"] == 100
 
 
-def test_distances_are_found(scene: Tumble, tracked: Tracked) -> None:
+def test_distances_are_found(scene: Tumble, tracked: PoseResult) -> None:
     aligned = metrics.align(tracked.trajectory, truth(scene)).to_truth(tracked.trajectory)
     reach = float(truth(scene).camera_positions.norm(dim=-1).mean())
     assert metrics.position_scores(aligned, truth(scene), tolerance=0.1 * reach)["auc_percent"] > 80
 
 
-def test_health_tells_good_from_bad(scene: Tumble, tracked: Tracked) -> None:
-    assert not tracked.health.lost.any()
-    assert tracked.health.overlap.min() > 0.85
-    assert tracked.health.residual.max() < 1
-    assert not tracked.health.observability.unseen
+def test_health_tells_good_from_bad(scene: Tumble, tracked: PoseResult) -> None:
+    assert not tracked.quality.lost.any()
+    assert tracked.quality.overlap.min() > 0.85
+    assert tracked.quality.residual.max() < 1
+    assert not tracked.quality.observability.unseen
 
 
-def test_a_guessed_focal_length_is_found_and_a_known_one_kept(scene: Tumble, tracked: Tracked) -> None:
+def test_a_guessed_focal_length_is_found_and_a_known_one_kept(scene: Tumble, tracked: PoseResult) -> None:
     """A fifth too short, in 20 frames and few rounds, towards which the guess still pulls: two thirds of it are mended,
     which is what the rotations need."""
     short = replace(scene.capture, camera=scene.capture.camera.zoomed(0.8))
-    guess = drive(stage, QUICK, stage.gather(replace(short, focal_guessed=True), matches(scene)), seed=0)
-    known = drive(stage, QUICK, stage.gather(short, matches(scene)), seed=0)
+    guess = drive(stage, QUICK, stage.gather(replace(short, focal_guessed=True), matches(scene), "mixed"), seed=0)
+    known = drive(stage, QUICK, stage.gather(short, matches(scene), "mixed"), seed=0)
     focal = float(scene.capture.camera.fx_fy_cx_cy[0])
     assert float(guess.camera.fx_fy_cx_cy[0]) == pytest.approx(focal, rel=0.07)
     assert torch.equal(guess.camera.fx_fy_cx_cy[2:], scene.capture.camera.fx_fy_cx_cy[2:])
@@ -78,8 +78,8 @@ def test_a_frame_without_the_object_is_lost(scene: Tumble) -> None:
     masks[9] = 0
     capture = replace(scene.capture, masks=masks)
     some = tuple(m for m in matches(scene) if 9 not in (m.i, m.j))
-    out = drive(stage, QUICK, stage.gather(capture, some), seed=0)
-    assert torch.nonzero(out.health.lost)[:, 0].tolist() == [9]
+    out = drive(stage, QUICK, stage.gather(capture, some, "mixed"), seed=0)
+    assert torch.nonzero(out.quality.lost)[:, 0].tolist() == [9]
     others = [k for k in range(20) if k != 9]
     scores = metrics.rotation_scores(out.trajectory.select(others), truth(scene).select(others))
     assert scores["rotation_median_degrees"] < 2
@@ -87,29 +87,29 @@ def test_a_frame_without_the_object_is_lost(scene: Tumble) -> None:
 
 def test_what_does_not_settle_begins_anew_and_the_best_is_kept(scene: Tumble) -> None:
     """The second way to begin has smaller windows, and outlines without weight."""
-    inputs = stage.gather(scene.capture, matches(scene))
+    inputs = stage.gather(scene.capture, matches(scene), "mixed")
     other = (stage.Start((4,), 0.0),)
     state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))
     cfg = replace(QUICK, others=other, settled=0.0)
     kept = []
-    for state.step, (phase, _, start) in enumerate(stage.plan(cfg)):
+    for state.step, now in enumerate(stage.schedule(cfg)):
         found = stage.step(cfg, inputs, state)
-        if phase == "keep":
-            kept.append((start, float(state.memory["loss"]), state.params.R))
-        assert found or start == 0
+        if isinstance(now.phase, stage.KeepBest):
+            kept.append((now.start, float(state.memory["loss"]), state.params.R))
+        assert found or now.start == 0
     assert [start for start, _, _ in kept] == [0, 1]
     assert kept[1][1] <= kept[0][1]
     assert torch.equal(kept[1][2], kept[0][2]) == (kept[1][1] == kept[0][1])
     # Once settled, no time is spent on other ways.
     cfg = replace(cfg, settled=float("inf"))
-    state.step = stage.plan(cfg).index(("pairs", 0.0, 1))
+    state.step = stage.schedule(cfg).index(stage.Step(stage.AverageRotations(), 1))
     assert stage.step(cfg, inputs, state) == {}
 
 
 def test_no_object_is_an_error(scene: Tumble) -> None:
     blank = replace(scene.capture, masks=torch.zeros_like(scene.capture.masks))
     with pytest.raises(ValueError, match="no mask has an object pixel"):
-        stage.gather(blank, ())
+        stage.gather(blank, (), "mixed")
 
 
 def test_a_stopped_run_goes_on_as_if_never_stopped(scene: Tumble, tmp_path: Path) -> None:
@@ -120,12 +120,12 @@ def test_a_stopped_run_goes_on_as_if_never_stopped(scene: Tumble, tmp_path: Path
         masks=scene.capture.masks[:6],
         names=scene.capture.names[:6],
     )
-    inputs = stage.gather(few, tuple(m for m in matches(scene) if m.j < 6))
+    inputs = stage.gather(few, tuple(m for m in matches(scene) if m.j < 6), "mixed")
     short = replace(QUICK, rounds=(3.0, 1.0), relocations=1, again=(1.0,))
     whole = drive(stage, short, inputs, seed=3)
 
-    def stop(record: dict) -> None:
-        if record["step"] == 1:
+    def stop(progress: Progress) -> None:
+        if progress.step == 1:
             raise RuntimeError("stopped")
 
     with pytest.raises(RuntimeError, match="stopped"):

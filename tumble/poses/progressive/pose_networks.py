@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import gelu, pad
 
-from tumble.maths.se3 import SE3, SO3
+from tumble.maths import SE3, SO3
 
 CODE_SPREAD = 10.0
 """Standard deviation of the frequencies of a frame's code (FMOV): neighbours in time have unrelated codes."""

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.maths.images import Box, crop_box
+from tumble.maths import Box, crop_box
 from tumble.poses.progressive.virtual_camera import Aim
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture
 
 
 @dataclass(frozen=True)

@@ -1,44 +1,46 @@
-"""Stage 1, the paper's route, with the outcome of the graph route: `track`, lifted and judged alike.
+"""Stage 1 by the paper's progressive route: a neural shape that grows while the object is followed frame by frame.
 
-The two routes are compared on the same captures in `benchmarks/poses.md`; the graph route is the default.
+The tracker finds poses in the virtual camera; they are lifted to the true camera in closed form. How far they can be
+trusted is judged by whatever judges the other route, which is handed in.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 
-from tumble.engine.loop import State
+from tumble.engine import State
 from tumble.poses.progressive import tracker, virtual_camera
-from tumble.poses.progressive.lift import lift
-from tumble.poses.progressive.tracker import Config
-from tumble.poses.sfm import stage
-from tumble.poses.sfm.finalize import Tracked
-from tumble.scene.capture import Capture
-from tumble.scene.match import Match
+from tumble.poses.result import PoseResult
+from tumble.scene import Capture, Match, Trajectory
 
-VERSION = 3
+VERSION = 4
 AIM = 128
 """Size of the virtual frames [pixels]."""
 
 
 @dataclass(frozen=True)
+class Config(tracker.Config):
+    """Settings of the tracker: the route has no others."""
+
+
+@dataclass(frozen=True)
 class Inputs:
-    """A capture as either route wants it; `gather` makes it."""
+    """A capture without poses, as `gather` makes it."""
 
     track: tracker.Inputs
-    graph: stage.Inputs
+    judged: Callable[[Trajectory], PoseResult]
+    """Adds points, quality and lost frames to poses in the camera frame."""
 
 
-def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
-    """What is needed to track a capture, and to judge the outcome.
+def gather(capture: Capture, matches: Sequence[Match], judged: Callable[[Trajectory], PoseResult]) -> Inputs:
+    """Aim the virtual camera at the silhouettes.
 
     Raises:
         ValueError: No frame shows the object.
     """
-    judging = stage.gather(capture, matches)
     aim = virtual_camera.aim_at(capture.masks, capture.camera, size=AIM)
-    return Inputs(tracker.Inputs(capture, tuple(matches), aim), judging)
+    return Inputs(tracker.Inputs(capture, tuple(matches), aim), judged)
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
@@ -53,7 +55,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, torch.Tensor | 
     return tracker.step(cfg, inputs.track, state)
 
 
-def finish(cfg: Config, inputs: Inputs, state: State) -> Tracked:
-    """Poses in the true camera, by the closed form, as the graph route hands them on."""
+def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
+    """Poses in the true camera, judged."""
     found = tracker.finish(cfg, inputs.track, state)
-    return stage.judged(inputs.graph, lift(found.aim, found.T_aim_obj, inputs.track.capture.light))
+    return inputs.judged(virtual_camera.lift(found.aim, found.T_aim_obj, inputs.track.capture.light))

@@ -12,7 +12,7 @@ On purpose unlike the paper and FMOV:
 - Poses have all six degrees of freedom (so have FMOV's in its second phase). The paper's four hold the object's centre
   to the middle of its silhouette's box; a box that turns by ten degrees moves by 0.04 radii against it, which looks
   like four degrees of turn. On a shape that is right, errors then grow to 14 degrees in ten frames; with six, to 2.
-- Rays are cut inside a ball (`volume.sections`); the first frame's pose never moves, it is the gauge.
+- Rays are cut inside a ball (`neus.sections`); the first frame's pose never moves, it is the gauge.
 - The first distance is that of the largest silhouette of all frames, not of the first: an object that is first seen
   end-on does not outgrow the ball.
 """
@@ -26,27 +26,75 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.engine import optim
-from tumble.engine.loop import State
+from tumble.engine import State, optim
 from tumble.io import tree
-from tumble.maths.se3 import SE3, SO3, angle_between
-from tumble.poses.progressive import neus, pose_networks, ray_sampling, schedule, sdf_field, virtual_camera
-from tumble.poses.progressive.neus import Glimpse
+from tumble.maths import SE3, SO3, angle_between, iou
+from tumble.poses.progressive import neus, pose_networks, ray_sampling, sdf_field, virtual_camera
+from tumble.poses.progressive.neus import Glimpse, Rendered
 from tumble.poses.progressive.pose_networks import PoseSource
 from tumble.poses.progressive.ray_sampling import Pixels
-from tumble.poses.progressive.schedule import Phases, Place
 from tumble.poses.progressive.sdf_field import Fields, Sdf, Sizes
 from tumble.poses.progressive.virtual_camera import Aim
-from tumble.poses.progressive.volume import Rendered
-from tumble.scene.capture import OBJECT, Capture
-from tumble.scene.match import Match
+from tumble.scene import OBJECT, Capture, Match
 
-VERSION = 2
+VERSION = 3
 OBJECT_PIXELS = 160
 """Match residuals are in pixels of a frame in which the object has this diameter, about that of HO3D at 640 x 480, for
 which FMOV's weight was chosen: frames of all sizes are then alike."""
 HEALTH_RAYS = 512
 """Pixels that a frame's health is measured at."""
+
+
+Phase = Literal["shape", "pose", "joint"]
+
+
+@dataclass(frozen=True)
+class Phases:
+    """Steps of each phase."""
+
+    shape: int
+    pose: int
+    joint: int
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in the schedule a step is."""
+
+    turn: int
+    """Frames tracked before this one."""
+    phase: Phase
+    progress: float
+    """Of the phase, in [0, 1)."""
+    tracked: float
+    """Share of this frame's tracking that is done, in [0, 1)."""
+    first: bool
+    """The first step of the frame's tracking."""
+    last: bool
+    """The last step of the turn."""
+
+
+def n_steps(phases: Phases, n_frames: int) -> int:
+    """Steps of all turns."""
+    return n_frames * phases.shape + (n_frames - 1) * (phases.pose + phases.joint)
+
+
+def place(phases: Phases, step: int) -> Place:
+    """What step number `step` is for."""
+    tracking = phases.pose + phases.joint
+    if step < phases.shape:
+        return Place(0, "shape", step / phases.shape, 0.0, first=False, last=step == phases.shape - 1)
+    turn, at = divmod(step - phases.shape, phases.shape + tracking)
+    if at < phases.shape:
+        return Place(turn + 1, "shape", at / phases.shape, 0.0, first=False, last=False)
+    at -= phases.shape
+    phase, before, of = ("pose", 0, phases.pose) if at < phases.pose else ("joint", phases.pose, phases.joint)
+    return Place(turn + 1, phase, (at - before) / of, at / tracking, first=at == 0, last=at == tracking - 1)
+
+
+def order(start: int, n_frames: int) -> list[int]:
+    """Frames as they are tracked: forward from the first one, then backward from it."""
+    return [*range(start, n_frames), *range(start - 1, -1, -1)]
 
 
 @dataclass(frozen=True)
@@ -148,7 +196,7 @@ class Params:
 
 
 @dataclass(frozen=True)
-class Health:
+class FrameFit:
     """How well each frame fitted when it had been tracked; a frame of bad numbers is probably lost."""
 
     match: Float[Tensor, " t"]
@@ -160,7 +208,7 @@ class Health:
 
 
 @dataclass(frozen=True)
-class Tracked:
+class ProgressiveResult:
     """The outcome of stage 1."""
 
     T_aim_obj: SE3
@@ -168,12 +216,12 @@ class Tracked:
     aim: Aim
     sdf: Sdf
     """The last shape: of all frames, but best of those since its start."""
-    health: Health
+    fit: FrameFit
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
     """Every frame has room to start the shape over; the steps are skipped where that is not needed."""
-    return schedule.length(cfg.phases, len(inputs.capture))
+    return n_steps(cfg.phases, len(inputs.capture))
 
 
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
@@ -218,8 +266,8 @@ def poses(params: Params, memory: dict[str, Tensor], frames: list[int]) -> SE3:
 
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     assert state.optimizer is not None, "init makes one"
-    here, memory = schedule.place(cfg.phases, state.step), state.memory
-    frames = schedule.order(int(memory["start"]), len(inputs.capture))
+    here, memory = place(cfg.phases, state.step), state.memory
+    frames = order(int(memory["start"]), len(inputs.capture))
     # memory["began"] says in which turn the shape was begun; it is not begun anew unless that is this turn.
     if here.phase == "shape" and int(memory["began"]) != here.turn:
         return {}
@@ -371,14 +419,12 @@ def _pick(state: State, n: int) -> int:
 
 
 def _health(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> Tensor:
-    """Match residual, silhouette's IoU and colour error of the newest frame; see `Health`."""
+    """Match residual, silhouette's IoU and colour error of the newest frame; see `FrameFit`."""
     frame, net = known[-1], state.params.fields
     box = ray_sampling.around(inputs.capture, frame, cfg.margin)
     part = ray_sampling.draw(inputs.capture, inputs.aim, frame, HEALTH_RAYS, box=box, block=1, rng=state.rng)
     glimpse = _glimpse(state, frame, part, moves=False)
     seen = neus.look(net, [glimpse], cfg.samples, bound=cfg.bound, rng=None)
-    covered, given = seen.opacity > 0.5, part.mask > 0.5
-    iou = (covered & given).sum() / (covered | given).sum().clamp_min(1)
     colour = ((seen.rgb - part.rgb).abs().mean(-1) * part.mask).sum() / part.mask.sum().clamp_min(1)
     residuals = []
     for match in inputs.matches:
@@ -391,12 +437,13 @@ def _health(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> Tens
             residual, weight = _match_residual(inputs, met, (at[0].T_aim_obj, at[1].T_aim_obj), match)
             residuals.append(residual.norm(dim=-1)[weight > 0])
     residual = torch.cat(residuals) if residuals else colour.new_zeros(0)
-    return torch.stack([residual.median() if len(residual) else colour.new_tensor(math.inf), iou, colour])
+    far = residual.median() if len(residual) else colour.new_tensor(math.inf)
+    return torch.stack([far, iou(seen.opacity > 0.5, part.mask > 0.5), colour])
 
 
 @torch.no_grad()
-def finish(cfg: Config, inputs: Inputs, state: State) -> Tracked:
+def finish(cfg: Config, inputs: Inputs, state: State) -> ProgressiveResult:
     """Poses in the aim frame; `lift` takes them to the camera's."""
     T_aim_obj = poses(state.params, state.memory, list(range(len(inputs.capture))))
-    health = Health(*state.memory["health"].unbind(-1))
-    return Tracked(T_aim_obj, inputs.aim, tree.detach(state.params.fields.sdf), health)
+    fit = FrameFit(*state.memory["health"].unbind(-1))
+    return ProgressiveResult(T_aim_obj, inputs.aim, tree.detach(state.params.fields.sdf), fit)

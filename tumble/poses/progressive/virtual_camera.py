@@ -8,21 +8,28 @@ frame, those of the camera follow in closed form, translation included: `T_cam_o
 In the aim frame neither the object nor the light of a still camera stands still: shade in `cam`, only track in here.
 """
 
-import math
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from tumble.maths.images import linear_from_srgb, photograph
-from tumble.maths.se3 import SO3
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT
+from tumble.maths import SE3, SO3
+from tumble.poses.progressive import sdf_field
+from tumble.poses.progressive.sdf_field import Sdf
+from tumble.scene import OBJECT, Camera, Light, Trajectory, visual_hull
 
 FILL = 0.8
 """Part of the virtual frame that the largest silhouette takes: room for what its bounding box cuts off-centre."""
+
+
+THRESHOLD = 3.0
+"""Reprojection error up to which RANSAC takes a point for good [pixels] (FMOV)."""
+ITERATIONS = 1000
+"""Of RANSAC (FMOV: 100)."""
 
 
 @dataclass(frozen=True)
@@ -80,42 +87,66 @@ def out_of_aim(aim: Aim, camera: Camera, frame: int, uv: Float[Tensor, "*b 2"]) 
     return camera.project(aim.R_cam_aim[frame] @ aim.camera.unproject(uv, torch.ones_like(uv[..., 0])))
 
 
-def warp_images(images: UInt8[Tensor, "t h w 3"], camera: Camera, aim: Aim) -> UInt8[Tensor, "t size size 3"]:
-    """The virtual camera's photographs, sRGB code values over black; black where the camera did not look.
-
-    Light is averaged, not code values: bilinear, over as many points per pixel as the virtual frame is coarser.
-    """
-    steps = max(1, math.ceil(float(camera.fx_fy_cx_cy[0] / aim.camera.fx_fy_cx_cy[0]) - 0.01))
-    fine = aim.camera.resized(steps * aim.camera.height, steps * aim.camera.width)
-    warped = []
-    for frame, image in enumerate(images):
-        at, within = _grid(Aim(aim.R_cam_aim, fine), camera, frame, images.device)
-        linear = linear_from_srgb(image.permute(2, 0, 1)[None] / 255)
-        light = functional.grid_sample(linear, at, padding_mode="border", align_corners=False) * within
-        warped.append(photograph(functional.avg_pool2d(light, steps)[0].permute(1, 2, 0)))
-    return torch.stack(warped)
-
-
-def warp_masks(masks: UInt8[Tensor, "t h w"], camera: Camera, aim: Aim) -> UInt8[Tensor, "t size size"]:
-    """The virtual camera's masks by the nearest pixel, so of the same three values; BACKGROUND off the frame."""
-    warped = []
-    for frame, mask in enumerate(masks):
-        at, within = _grid(aim, camera, frame, masks.device)
-        nearest = functional.grid_sample(
-            mask[None, None].float(), at, mode="nearest", padding_mode="border", align_corners=False
-        )
-        warped.append(torch.where(within, nearest[0, 0], BACKGROUND).to(torch.uint8))
-    return torch.stack(warped)
-
-
 def _turn(toward: Float[Tensor, "*b 3"]) -> SO3:
     """The shortest rotation that takes the z axis to directions in front of it."""
     x, y, z = functional.normalize(toward, dim=-1).unbind(-1)
     return SO3.from_wxyz(torch.stack([1 + z, -y, x, torch.zeros_like(z)], -1))
 
 
-def _grid(aim: Aim, camera: Camera, frame: int, device: torch.device) -> tuple[Float[Tensor, "1 h w 2"], Tensor]:
-    """Where the centres of the virtual pixels lie in the frame, in grid_sample's units, and whether they do."""
-    uv = out_of_aim(aim, camera, frame, aim.camera.pixel_centers())
-    at = (2 * uv / uv.new_tensor([camera.width, camera.height]) - 1).to(device)
-    return at[None], (at.abs() <= 1).all(-1)
+# Back to the true camera ----------------------------------------------------------------------------------------------
+
+
+def lift(aim: Aim, T_aim_obj: SE3, light: Light) -> Trajectory:
+    """Poses in the true camera, in closed form; differentiable."""
+    R_cam_aim = aim.R_cam_aim
+    return Trajectory(SE3.from_rotation(R_cam_aim @ T_aim_obj.rotation, R_cam_aim @ T_aim_obj.xyz), light)
+
+
+@torch.no_grad()
+def surface_points(sdf: Sdf, n: int, rng: torch.Generator, *, resolution: int = 64) -> Float[Tensor, "n 3"]:
+    """About `n` points on a shape, object frame [object radius].
+
+    Args:
+        resolution: Cells per side of the grid (FMOV's mesh for lifting: 64).
+
+    Raises:
+        ValueError: There is no surface in the unit ball.
+    """
+    like = sdf.layers.weights["bias0"]
+    ticks = (torch.arange(resolution, dtype=like.dtype, device=like.device) + 0.5) / resolution * 2 - 1
+    x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    distance = torch.cat([sdf_field.distance(sdf, part) for part in x_obj.split(1 << 16)])
+    # As shares of a cell, inside 1: what `hull` takes for silhouettes.
+    inside = (0.5 - distance * resolution / 4).clamp(0, 1)
+    inside = torch.where(x_obj.norm(dim=-1) < 1, inside, 0.0)
+    return visual_hull.surface(inside.reshape(resolution, resolution, resolution), n, rng).positions
+
+
+def by_pnp(points: Float[Tensor, "n 3"], aim: Aim, T_aim_obj: SE3, camera: Camera, light: Light) -> Trajectory:
+    """The paper's lifting: project points virtually, find the pixels in the true frames, solve for the pose.
+
+    Points at the back count as well: they are no observations.
+
+    Raises:
+        ValueError: No pose explains a frame's pixels; the message names the frame.
+    """
+    matrix = camera.matrix.double().cpu().numpy()
+    poses = []
+    for frame in range(len(aim)):
+        uv_aim = aim.camera.project(T_aim_obj[frame] @ points)
+        uv = out_of_aim(aim, camera, frame, uv_aim).double().cpu().numpy()
+        found, rvec, tvec, _ = cv2.solvePnPRansac(
+            points.double().cpu().numpy(),
+            uv,
+            matrix,
+            None,
+            iterationsCount=ITERATIONS,
+            reprojectionError=THRESHOLD,
+            flags=cv2.SOLVEPNP_EPNP,
+        )
+        if not found:
+            raise ValueError(f"frame {frame}: no pose explains where the shape's points should be seen")
+        T_cam_obj = np.eye(4)
+        T_cam_obj[:3, :3], T_cam_obj[:3, 3] = cv2.Rodrigues(rvec)[0], tvec[:, 0]
+        poses.append(torch.from_numpy(T_cam_obj).to(points))
+    return Trajectory(SE3.from_matrix(torch.stack(poses)), light)

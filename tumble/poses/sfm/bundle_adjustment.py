@@ -12,15 +12,16 @@ the end of the stage.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble.maths.se3 import SO3
+from tumble.maths import SO3, Damping, Linearised, minimise
 from tumble.poses.sfm.tracks import Tracks
-from tumble.scene.camera import Camera
+from tumble.scene import Camera
 
 NOISE = 0.3
 """Of a good match: what a prior's one sigma weighs against residuals [pixels]."""
@@ -42,7 +43,7 @@ SHORT = 3
 
 
 @dataclass(frozen=True)
-class Scene:
+class BundleState:
     """Poses and points that are adjusted; `g` groups of `f` cameras."""
 
     R: Float[Tensor, "g f 3 3"]
@@ -78,7 +79,7 @@ class Problem:
     """Logarithm of the guessed focal length over the camera's; counts where the scene has one of its own."""
 
 
-def residuals(problem: Problem, scene: Scene) -> tuple[Float[Tensor, "o 2"], Float[Tensor, "o 3"]]:
+def residuals(problem: Problem, scene: BundleState) -> tuple[Float[Tensor, "o 2"], Float[Tensor, "o 3"]]:
     """Projected minus seen positions [pixels], and the points in the camera frames."""
     R, t = scene.R.flatten(0, 1)[problem.tracks.frame], scene.t.flatten(0, 1)[problem.tracks.frame]
     x = torch.einsum("oij,oj->oi", R, scene.X[problem.tracks.point]) + t
@@ -87,7 +88,7 @@ def residuals(problem: Problem, scene: Scene) -> tuple[Float[Tensor, "o 2"], Flo
     return x[:, :2] / z * focal + principal - problem.tracks.uv, x
 
 
-def _focals(problem: Problem, scene: Scene) -> Float[Tensor, "c 2"]:
+def _focals(problem: Problem, scene: BundleState) -> Float[Tensor, "c 2"]:
     """Focal lengths of all cameras [pixels]."""
     g, f = scene.t.shape[:2]
     focal = problem.camera.fx_fy_cx_cy.double()[:2].expand(g * f, 2)
@@ -133,8 +134,8 @@ class _Layout:
 
 
 def adjust(
-    problem: Problem, scene: Scene, *, steps: int, scale: float, tolerance: float = 1e-4
-) -> tuple[Scene, Float[Tensor, " g"]]:
+    problem: Problem, scene: BundleState, *, steps: int, scale: float, tolerance: float = 1e-4
+) -> tuple[BundleState, Float[Tensor, " g"]]:
     """Adjust poses and points of every group; also its final robust cost [pixels^2].
 
     Args:
@@ -144,19 +145,18 @@ def adjust(
         tolerance: A group is done when an iteration lowers its cost by less than this share.
     """
     layout = _layout(problem)
-    damping = torch.full((len(scene.R),), 1e-3, dtype=torch.float64)
-    system = _linearise(problem, scene, scale)
-    done = torch.zeros_like(damping, dtype=torch.bool)
-    for _ in range(steps):
-        moved = _moved(scene, *_solve(problem, scene, system, damping, layout))
-        fresh = _linearise(problem, moved, scale)
-        better = fresh.cost < system.cost
-        done |= better & (system.cost - fresh.cost < tolerance * system.cost)
-        scene, system = _choose(problem, better, (moved, fresh), (scene, system))
-        damping = torch.where(better, 0.2 * damping, 8 * damping).clamp(1e-10, 1e8)
-        if bool((done | (damping > 1e6)).all()):
-            break
-    return scene, system.cost
+
+    def linearised(scene: BundleState) -> Linearised:
+        system = _linearise(problem, scene, scale)
+        return Linearised(system.cost, system)
+
+    def moved(scene: BundleState, system: _System, damping: Tensor) -> BundleState:
+        return _moved(scene, *_solve(problem, scene, system, damping, layout))
+
+    choose = partial(_choose, problem)
+    damping = Damping(least=1e-10, most=1e8)
+    scene, last = minimise(scene, linearised, moved, choose, steps=steps, damping=damping, tolerance=tolerance)
+    return scene, last.cost
 
 
 def _layout(problem: Problem) -> _Layout:
@@ -180,7 +180,7 @@ def _layout(problem: Problem) -> _Layout:
 
 
 def _jacobians(
-    problem: Problem, scene: Scene, x: Float[Tensor, "o 3"]
+    problem: Problem, scene: BundleState, x: Float[Tensor, "o 3"]
 ) -> tuple[Float[Tensor, "o 2 6"], Float[Tensor, "o 2 3"]]:
     """Derivatives of the projections by poses (turn, shift) and by points."""
     focal = _focals(problem, scene)[problem.tracks.frame]
@@ -199,7 +199,7 @@ def _jacobians(
     return torch.cat([J_turn, J_x], -1), J_x @ R
 
 
-def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
+def _linearise(problem: Problem, scene: BundleState, scale: float) -> _System:
     g, f = scene.t.shape[:2]
     residual, x = residuals(problem, scene)
     squared = residual.square().sum(-1) / scale**2
@@ -228,14 +228,14 @@ def _linearise(problem: Problem, scene: Scene, scale: float) -> _System:
     return _System(cost + price, U, V, wJ_cam.mT @ J_point, g_cam, g_point, border)
 
 
-def _hold(problem: Problem, scene: Scene) -> Float[Tensor, "#n 1"]:
+def _hold(problem: Problem, scene: BundleState) -> Float[Tensor, "#n 1"]:
     """Weight of the points' distance from the origin: through a longer lens the object is as much smaller."""
     hold = torch.full((1, 1), (NOISE / problem.reach) ** 2, dtype=torch.float64)
     return hold if scene.log_focal is None else hold * (2 * scene.log_focal).exp()[problem.group, None]
 
 
 def _border(
-    problem: Problem, scene: Scene, x: Tensor, residual: Tensor, wJ_cam: Tensor, wJ_point: Tensor, w: Tensor
+    problem: Problem, scene: BundleState, x: Tensor, residual: Tensor, wJ_cam: Tensor, wJ_point: Tensor, w: Tensor
 ) -> tuple[Float[Tensor, " g"], _Border]:
     """The cost of leaving the guessed focal length, and all derivatives by its logarithm."""
     assert scene.log_focal is not None, "a focal length to find"
@@ -257,7 +257,7 @@ def _border(
     return pull * off.square(), _Border(H, gradient, cam, point)
 
 
-def _camera_priors(problem: Problem, scene: Scene, U: Tensor, g_cam: Tensor) -> Float[Tensor, " g"]:
+def _camera_priors(problem: Problem, scene: BundleState, U: Tensor, g_cam: Tensor) -> Float[Tensor, " g"]:
     """Add the priors of the origin's place to the normal equations in place; their cost."""
     rows, r, _ = _origin(problem, scene)
     U[:, 3:, 3:] += rows.mT @ rows
@@ -265,7 +265,7 @@ def _camera_priors(problem: Problem, scene: Scene, U: Tensor, g_cam: Tensor) -> 
     return r.square().sum(-1).reshape(scene.t.shape[:2]).sum(1)
 
 
-def _origin(problem: Problem, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+def _origin(problem: Problem, scene: BundleState) -> tuple[Tensor, Tensor, Tensor]:
     """Of the origin's place: derivatives of the residuals by it, residuals, derivatives by the logarithmic focal."""
     focal, principal = _focals(problem, scene), problem.camera.fx_fy_cx_cy.double()[2:]
     t = scene.t.flatten(0, 1)
@@ -281,7 +281,7 @@ def _origin(problem: Problem, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _solve(
-    problem: Problem, scene: Scene, system: _System, damping: Float[Tensor, " g"], layout: _Layout
+    problem: Problem, scene: BundleState, system: _System, damping: Float[Tensor, " g"], layout: _Layout
 ) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"], Float[Tensor, " g"] | None]:
     g, f = scene.t.shape[:2]
     lam_cam, lam_point = damping.repeat_interleave(f)[:, None], damping[problem.group][:, None]
@@ -323,21 +323,20 @@ def _solve(
     return d_cam, -(V_inv @ back[..., None])[..., 0], d_focal
 
 
-def _moved(scene: Scene, d_cam: Tensor, d_point: Tensor, d_focal: Tensor | None = None) -> Scene:
+def _moved(scene: BundleState, d_cam: Tensor, d_point: Tensor, d_focal: Tensor | None = None) -> BundleState:
     g, f = scene.t.shape[:2]
     turn = SO3.exp(d_cam[:, :3].clamp(-0.5, 0.5)).matrix().reshape(g, f, 3, 3)
     shift = d_cam[:, 3:].clamp(-0.2, 0.2).reshape(g, f, 3)
     log_focal = None if d_focal is None or scene.log_focal is None else scene.log_focal + d_focal.clamp(-0.1, 0.1)
-    return Scene(turn @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2), log_focal)
+    return BundleState(turn @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2), log_focal)
 
 
-def _choose(
-    problem: Problem, better: Tensor, new: tuple[Scene, _System], old: tuple[Scene, _System]
-) -> tuple[Scene, _System]:
-    """Per group, the new where it is better."""
+def _choose(problem: Problem, better: Tensor, new: Any, old: Any) -> Any:
+    """Per group, the new where it is better: of scenes, and of systems."""
     if bool(better.all()):
         return new
-    camera, point = better.repeat_interleave(old[0].t.shape[1]), better[problem.group]
+    point = better[problem.group]
+    camera = better.repeat_interleave(len(problem.centre.flatten(0, 1)) // len(better))
     masks: dict[str, Tensor] = {"U": camera, "g_cam": camera, "cam": camera, "X": point, "V": point, "g_point": point}
     masks |= {"point": point, "W": point[problem.tracks.point]}
 
@@ -346,10 +345,10 @@ def _choose(
             return None if a is None else type(a)(**{k: pick(k, x, getattr(b, k)) for k, x in vars(a).items()})
         return torch.where(masks.get(name, better).reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
-    return pick("scene", new[0], old[0]), pick("system", new[1], old[1])
+    return pick("", new, old)
 
 
-def information(problem: Problem, scene: Scene, precision: Float[Tensor, "o 2 2"]) -> Float[Tensor, "c 6 6"]:
+def information(problem: Problem, scene: BundleState, precision: Float[Tensor, "o 2 2"]) -> Float[Tensor, "c 6 6"]:
     """Of every pose (turn, shift) with the points held and without priors.
 
     Args:

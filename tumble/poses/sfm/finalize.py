@@ -11,18 +11,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble.maths.images import linear_from_srgb
-from tumble.maths.se3 import SE3, SO3, angle_between, interpolate
-from tumble.poses.result import UNSEEN, Health, Observability
+from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_ball
+from tumble.poses.result import UNSEEN, Observability, PoseQuality, PoseResult
 from tumble.poses.sfm import bundle_adjustment, relocalization, symmetry, texture_information
 from tumble.poses.sfm.frontier_points import Outlines, touch
 from tumble.poses.sfm.relocalization import Judge
 from tumble.poses.sfm.symmetry import Mirrors
 from tumble.poses.sfm.tracks import Tracks
-from tumble.scene import visual_hull
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, UNKNOWN, Capture
-from tumble.scene.trajectory import Trajectory
+from tumble.scene import BACKGROUND, UNKNOWN, Capture, Trajectory, visual_hull
 
 AGREES = 1.5
 """Distance between a match and its point up to which the match is an inlier [pixels]."""
@@ -44,24 +40,12 @@ BARE = 0.03
 """Share of observations with texture that no edge explains under which a body of revolution has no texture: bare cans
 and balls up to 1.4 %, without grain and with it, and 2.7 % with a film's masks; a soup can 21 %, and 7 % under grain of
 25 code values."""
+BALL_STEPS = 299
+"""Of the search for the smallest ball."""
 JUDGED, JUDGES = 24, 16
 """Frames that are asked what their outline would say of a turn, and frames they are compared with."""
 CELLS = 48
 """Of the hull's grid, per side, and of the grid of rays that look at it."""
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """The outcome of the graph route of stage 1."""
-
-    trajectory: Trajectory
-    points: Float[Tensor, "n 3"]
-    """On the surface, object frame."""
-    colours: Float[Tensor, "n 3"]
-    """Linear RGB, median over the frames that show the point: shading included."""
-    health: Health
-    camera: Camera
-    """The capture's; where its focal length is a guess, with the one that was found."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +60,12 @@ class Solution:
     """Angle between what tracks and what outlines would have preferred [radians]."""
 
 
-def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solution) -> Tracked:
+def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solution) -> PoseResult:
     """Judge every frame, fix the gauge, and collect the points that deserve it."""
     R, t, camera = solution.R, solution.t, capture.camera
     reach = torch.full((len(R),), solution.radius, dtype=torch.float64)
     X = bundle_adjustment.triangulate(tracks, R, t, camera, reach)
-    scene = bundle_adjustment.Scene(R[None], t[None], X)
+    scene = bundle_adjustment.BundleState(R[None], t[None], X)
     group, weight = torch.zeros(tracks.n, dtype=torch.long), torch.ones(len(tracks), dtype=torch.float64)
     place = torch.ones(1, len(R), 2, dtype=torch.float64)
     problem = bundle_adjustment.Problem(camera, tracks, group, weight, place, place[..., 0], depth_sigma=1.0, reach=1.0)
@@ -105,8 +89,8 @@ def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solu
     colours = _colours(capture, tracks, residual, sure)
     observability = _observability(capture, outline, solution, problem, scene, residual < AGREES)
     drift, turn = solution.drift.float(), angle_between(T.rotation[:, None], T.rotation).max().float()
-    health = Health(median.float(), inliers.float(), gap.float(), overlap, drift, lost, turn, observability)
-    return Tracked(trajectory, points.float(), colours, health, camera)
+    quality = PoseQuality(median.float(), inliers.float(), gap.float(), overlap, drift, lost, turn, observability)
+    return PoseResult(trajectory, points.float(), colours, quality, camera)
 
 
 def _frontier(
@@ -142,16 +126,14 @@ def _per_frame(residual: Float[Tensor, " o"], frame: Tensor, n: int) -> tuple[Fl
 
 
 def _ball(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Centre and radius of the smallest ball about all points but strays (Badoiu and Clarkson 2003)."""
+    """Centre and radius of the smallest ball about all points but strays."""
     if len(points) < 4:
         return torch.zeros(3, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
     centre = points.median(0).values
     for _ in range(2):
         distance = (points - centre).norm(dim=-1)
         points = points[distance <= STRAY * distance.quantile(0.95)]
-        for k in range(1, 300):
-            far = points[(points - centre).norm(dim=-1).argmax()]
-            centre = centre + (far - centre) / (k + 1)
+        centre = smallest_ball(lambda x, points=points: points - x, centre, steps=BALL_STEPS)
     return centre, (points - centre).norm(dim=-1).max()
 
 
@@ -223,8 +205,7 @@ def _overlap(capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"])
         through = torch.nn.functional.grid_sample(inside[None, None], at, align_corners=False)[0, 0, 0].amax(-1) > 0.5
         mask = capture.masks[frame][rows][:, columns].flatten()
         counted, silhouette = mask != UNKNOWN, mask != BACKGROUND
-        either = ((through | silhouette) & counted).sum()
-        scores.append((through & silhouette & counted).sum() / either.clamp_min(1))
+        scores.append(iou(through, silhouette, counted))
     return torch.stack(scores)
 
 
@@ -240,7 +221,7 @@ def _observability(
     outline: Outlines,
     solution: Solution,
     problem: bundle_adjustment.Problem,
-    scene: bundle_adjustment.Scene,
+    scene: bundle_adjustment.BundleState,
     agrees: Tensor,
 ) -> Observability:
     """Uncertainty of a single frame's rotation by texture and outlines, points held, translation free: typical over

@@ -18,8 +18,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from tumble.poses.sfm.tracks import Tracks
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
 
 CORNERS = 48
 """Of the polygon around each silhouette."""

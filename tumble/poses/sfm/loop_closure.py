@@ -14,16 +14,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize, pad
 
 from tumble import matching
-from tumble.maths.se3 import SE3
+from tumble.maths import SE3
 from tumble.poses.frame_pairs import Pairs, best
-from tumble.scene import visual_hull
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
-from tumble.scene.match import Match, View
-from tumble.scene.trajectory import Trajectory
+from tumble.scene import BACKGROUND, OBJECT, Camera, Capture, Match, Trajectory, View, visual_hull
 
-MATCHER = "mixed"
-"""File name in `matching`."""
 CELLS = 64
 """Of the hull's grid, per side."""
 POINTS = 2000
@@ -46,11 +40,12 @@ class Seen:
     normals: Float[Tensor, "n 3"]
 
 
-def comebacks(capture: Capture, trajectory: Trajectory, *, count: int, gap: int) -> list[Match]:
+def comebacks(capture: Capture, trajectory: Trajectory, matcher: str, *, count: int, gap: int) -> list[Match]:
     """Matches of up to `count` pairs of frames, more than `gap` apart in time, that share most of what they see.
 
     Args:
         trajectory: Right to some pixels; the object lies in the unit ball.
+        matcher: File name in `matching`.
     """
     cells = visual_hull.carve(_bordered(capture), trajectory, resolution=CELLS)
     if not bool((cells > 0.5).any()):
@@ -69,7 +64,7 @@ def comebacks(capture: Capture, trajectory: Trajectory, *, count: int, gap: int)
         seen = shown[i]
         slant = torch.minimum(*(_cosine(eyes[k], seen.x_obj, seen.normals) for k in (i, j)))
         uv = capture.camera.project(trajectory.T_cam_obj[j] @ seen.x_obj)
-        found.append(_through(capture, i, j, seen, uv, slant > STEEP))
+        found.append(_through(capture, matcher, i, j, seen, uv, slant > STEEP))
     return [match for match in found if len(match) >= FEW]
 
 
@@ -125,7 +120,9 @@ def _sampled(volume: Float[Tensor, "x y z c"], x_obj: Float[Tensor, "*b 3"]) -> 
     return found[0, :, 0, 0].T.reshape(*x_obj.shape[:-1], volume.shape[-1])
 
 
-def _through(capture: Capture, i: int, j: int, seen: Seen, uv: Float[Tensor, "n 2"], good: Bool[Tensor, " n"]) -> Match:
+def _through(
+    capture: Capture, matcher: str, i: int, j: int, seen: Seen, uv: Float[Tensor, "n 2"], good: Bool[Tensor, " n"]
+) -> Match:
     """Match frame i with frame j as drawn in i's pixels, and go from there to the places in j that were drawn."""
     camera = capture.camera
     shown = _at(torch.cat([capture.images[j].float(), 255.0 * (capture.masks[j] == OBJECT)[..., None]], -1), uv)
@@ -135,7 +132,7 @@ def _through(capture: Capture, i: int, j: int, seen: Seen, uv: Float[Tensor, "n 
     mask = torch.full_like(capture.masks[i], BACKGROUND)
     mask[seen.at] = torch.where(good, OBJECT, BACKGROUND).to(mask)
     own, other = View(i, capture.images[i], capture.masks[i]), View(j, image, mask)
-    match = matching.match_pairs([own, other], [(0, 1)], MATCHER)[0]
+    match = matching.match_pairs([own, other], [(0, 1)], matcher)[0]
     match = match.select(torch.arange(len(match))[:: 1 + len(match) // MOST])
     drawn = uv.new_zeros(camera.height, camera.width, 2)
     drawn[seen.at] = uv

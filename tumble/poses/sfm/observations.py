@@ -16,8 +16,7 @@ from tumble.poses.sfm import frontier_points, relative_pose
 from tumble.poses.sfm.frontier_points import Outlines
 from tumble.poses.sfm.relative_pose import Silhouettes
 from tumble.poses.sfm.tracks import Tracks, followed
-from tumble.scene.capture import Capture
-from tumble.scene.match import Match
+from tumble.scene import Capture, Match
 
 POINTS = 150
 """Tracks that pass through a frame."""
@@ -36,9 +35,11 @@ class Inputs:
     tracks: Tracks
     radius: float
     """Of the object [its mean distance]."""
+    matcher: str
+    """Of frames that see the same side again: a file of `matching`."""
 
 
-def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
+def gather(capture: Capture, matches: Sequence[Match], matcher: str) -> Inputs:
     """Silhouettes, outlines and tracks of a capture and its matches; its masks without the bands along silhouettes.
 
     Raises:
@@ -55,7 +56,7 @@ def gather(capture: Capture, matches: Sequence[Match]) -> Inputs:
     shapes = relative_pose.mended(shapes, odd)
     tracks = followed(matches, (area / POINTS).sqrt().clamp_min(2.0))
     radius = FULL * float(shapes.radius[shapes.visible].median())
-    return Inputs(capture, matches, shapes, outline, tracks, radius)
+    return Inputs(capture, matches, shapes, outline, tracks, radius, matcher)
 
 
 def focal_length(capture: Capture) -> float:

@@ -18,10 +18,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.maths.se3 import SO3
-from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, Capture
-from tumble.scene.match import Match
+from tumble.maths import SO3, Damping, Linearised, minimise, rowwise
+from tumble.scene import BACKGROUND, Camera, Capture, Match
 
 ROUNDNESS = 1.25
 """Radius of the ball over that of the disc with the silhouette's area: few objects are round."""
@@ -280,21 +278,20 @@ def _descend(
     q: _Problem, R: Tensor, ell: Tensor, *, steps: int
 ) -> tuple[Float[Tensor, "p 3 3"], Float[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, "p 4 4"]]:
     """Levenberg-Marquardt on all problems side by side; also the costs per match and the normal matrices."""
-    damping = torch.full_like(ell, 1e-3)
-    cost, H, g = _normal(q, R, ell)
-    for _ in range(steps):
-        diagonal = H.diagonal(dim1=-2, dim2=-1)
-        damped = H + torch.diag_embed(damping[:, None] * diagonal + 1e-9)
+
+    def moved(state: tuple[Tensor, Tensor], system: tuple[Tensor, Tensor], damping: Tensor) -> tuple[Tensor, Tensor]:
+        (R, ell), (H, g) = state, system
+        damped = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=-2, dim2=-1) + 1e-9)
         step = torch.linalg.solve(damped, -g[..., None])[..., 0].clamp(-0.4, 0.4)
-        R_new = SO3.exp(step[:, :3]).matrix() @ R
-        ell_new = (ell + step[:, 3]).clamp(-0.5, 0.5)
-        cost_new, H_new, g_new = _normal(q, R_new, ell_new)
-        better = cost_new < cost
-        R, H = (torch.where(better[:, None, None], new, old) for new, old in ((R_new, R), (H_new, H)))
-        g = torch.where(better[:, None], g_new, g)
-        ell, cost = torch.where(better, ell_new, ell), torch.where(better, cost_new, cost)
-        damping = torch.where(better, 0.2 * damping, 8 * damping).clamp(1e-9, 1e6)
-    return R, ell, cost / q.weight.sum(1).clamp_min(1), H
+        return SO3.exp(step[:, :3]).matrix() @ R, (ell + step[:, 3]).clamp(-0.5, 0.5)
+
+    def linearised(state: tuple[Tensor, Tensor]) -> Linearised:
+        cost, H, g = _normal(q, *state)
+        return Linearised(cost, (H, g))
+
+    damping = Damping(least=1e-9, most=1e6)
+    (R, ell), last = minimise((R, ell), linearised, moved, rowwise, steps=steps, damping=damping)
+    return R, ell, last.cost / q.weight.sum(1).clamp_min(1), last.system[0]
 
 
 def _normal(q: _Problem, R: Tensor, ell: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble.maths.se3 import SO3, angle_between
+from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, rowwise
 from tumble.poses.sfm.frontier_points import Outlines, touch
-from tumble.scene.camera import Camera
+from tumble.scene import Camera
 
 TURNS = (-0.35, -0.17, 0.17, 0.35)
 """Angles tried about each of 13 axes [radians]."""
@@ -111,11 +111,10 @@ def _refine(
     judge: Judge, R: Tensor, t: Tensor, scale: float, steps: int = 8
 ) -> tuple[tuple[Tensor, Tensor], Float[Tensor, " h"]]:
     """Levenberg-Marquardt on all hypotheses side by side, Jacobians by difference quotients."""
-    damping = torch.full((len(R),), 1e-2, dtype=torch.float64)
-    gaps = judge.gaps(R, t)
-    now = cost(gaps, scale)
     hold = torch.diag(torch.tensor([0.0] * 3 + [HOLD**2] * 3, dtype=torch.float64))
-    for _ in range(steps):
+
+    def moved(pose: Poses, gaps: Tensor, damping: Tensor) -> Poses:
+        R, t = pose
         J = _jacobian(judge, R, t, gaps)
         known = ~(gaps.isnan() | J.isnan().any(-1))
         r, J = torch.where(known, gaps, 0.0), torch.where(known[..., None], J, 0.0)
@@ -124,15 +123,15 @@ def _refine(
         g = torch.einsum("ho,hoi,ho->hi", w, J, r)
         H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-6)
         step = torch.linalg.solve(H, -g[..., None])[..., 0]
-        R_new = SO3.exp(step[:, :3].clamp(-0.2, 0.2)).matrix() @ R
-        t_new = t + step[:, 3:].clamp(-0.05, 0.05)
-        gaps_new = judge.gaps(R_new, t_new)
-        then = cost(gaps_new, scale)
-        better = then < now
-        R, t = torch.where(better[:, None, None], R_new, R), torch.where(better[:, None], t_new, t)
-        gaps, now = torch.where(better[:, None], gaps_new, gaps), torch.where(better, then, now)
-        damping = torch.where(better, 0.3 * damping, 5 * damping)
-    return (R, t), now
+        return SO3.exp(step[:, :3].clamp(-0.2, 0.2)).matrix() @ R, t + step[:, 3:].clamp(-0.05, 0.05)
+
+    def linearised(pose: Poses) -> Linearised:
+        gaps = judge.gaps(*pose)
+        return Linearised(cost(gaps, scale), gaps)
+
+    damping = Damping(start=1e-2, accepted=0.3, rejected=5.0)
+    pose, last = minimise((R, t), linearised, moved, rowwise, steps=steps, damping=damping)
+    return pose, last.cost
 
 
 def information(judge: Judge, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> Float[Tensor, "6 6"]:

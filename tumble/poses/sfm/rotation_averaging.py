@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.maths.se3 import SO3
+from tumble.maths import SO3
 
 CLOSES = 0.17
 """Angle up to which three edges in a row count as closed [radians]."""

@@ -18,11 +18,12 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble.engine.loop import State
-from tumble.maths.se3 import SE3, SO3, angle_between, mean_rotation
+from tumble.engine import State
+from tumble.maths import SE3, SO3, angle_between, mean_rotation
+from tumble.poses.result import PoseResult
 from tumble.poses.sfm import bundle_adjustment, frontier_points, relative_pose
-from tumble.poses.sfm.bundle_adjustment import Problem, Scene
-from tumble.poses.sfm.finalize import Solution, Tracked, finished
+from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
+from tumble.poses.sfm.finalize import Solution, finished
 from tumble.poses.sfm.loop_closure import comebacks
 from tumble.poses.sfm.observations import Inputs, focal_length, on_axis, through
 from tumble.poses.sfm.observations import gather as gather
@@ -30,9 +31,9 @@ from tumble.poses.sfm.relocalization import FEW, LEAP, Judge, cost, hypotheses, 
 from tumble.poses.sfm.rotation_averaging import average
 from tumble.poses.sfm.symmetry import mirrors
 from tumble.poses.sfm.tracks import NONE, Tracks, joined, of_match
-from tumble.scene.trajectory import Trajectory
+from tumble.scene import Trajectory
 
-VERSION = 8
+VERSION = 9
 CONTRADICTS = 1.5
 """Loss of a frame's outline over the median from which the frame is given a second look: alone, with outlines only, a
 good pose gets worse."""
@@ -44,6 +45,8 @@ MOST_LOOPS, AGAIN = 60, 12
 """Pairs of frames that see the same side again, and their least distance in time [frames]."""
 ROOM = 1.3
 """Radius of the ball about the origin in which the object surely lies, over the object's."""
+RELOCALIZED_AT = 0.7
+"""Scale of the robust loss where frames are relocalized [pixels]."""
 STILL = 0.01
 """Weight of the belief that the object does not turn from one frame to the next, of a match 1."""
 
@@ -107,19 +110,73 @@ class Poses:
     """Logarithm of the focal length over the capture's: 0 where that is no guess."""
 
 
-def plan(cfg: Config) -> list[tuple[str, float, int]]:
-    """What each step does: the name of the phase, its number, and the way to begin that it belongs to."""
-    phases: list[tuple[str, float, int]] = []
+@dataclass(frozen=True)
+class AverageRotations:
+    """Fit near pairs one by one and average their rotations."""
+
+
+@dataclass(frozen=True)
+class AdjustWindows:
+    """Adjust overlapping windows of frames, and average the rotations within them."""
+
+    size: int
+    """[frames]"""
+
+
+@dataclass(frozen=True)
+class AdjustAll:
+    """One round of bundle adjustment of the whole capture."""
+
+    scale: float
+    """Of the robust loss [pixels]."""
+
+
+@dataclass(frozen=True)
+class KeepBest:
+    """Keep the poses with the lower loss of these and those of earlier initializations."""
+
+    scale: float
+    """Of the robust loss [pixels]."""
+
+
+@dataclass(frozen=True)
+class CloseLoops:
+    """Match frames of a body of revolution that see the same side again."""
+
+
+@dataclass(frozen=True)
+class Relocalize:
+    """Try other rotations for frames whose contours contradict the others'."""
+
+    scale: float
+    """Of the robust loss [pixels]."""
+
+
+Phase = AverageRotations | AdjustWindows | AdjustAll | KeepBest | CloseLoops | Relocalize
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the schedule."""
+
+    phase: Phase
+    start: int = 0
+    """Initialization that it belongs to: 0 is the first, others follow `Config.others`."""
+
+
+def schedule(cfg: Config) -> list[Step]:
+    """All steps, in order."""
+    steps: list[Step] = []
     for start, windows in enumerate((cfg.windows, *(other.windows for other in cfg.others))):
-        phases += [("pairs", 0.0, start), *(("windows", float(size), start) for size in windows)]
-        phases += [*(("whole", scale, start) for scale in cfg.rounds), ("keep", cfg.rounds[-1], start)]
+        phases = [AverageRotations(), *map(AdjustWindows, windows), *map(AdjustAll, cfg.rounds)]
+        steps += [Step(phase, start) for phase in (*phases, KeepBest(cfg.rounds[-1]))]
     for _ in range(cfg.relocations):
-        phases += [("loops", 0.0, 0), ("relocate", 0.7, 0), *(("whole", scale, 0) for scale in cfg.again)]
-    return phases
+        steps += map(Step, (CloseLoops(), Relocalize(RELOCALIZED_AT), *map(AdjustAll, cfg.again)))
+    return steps
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
-    return len(plan(cfg))
+    return len(schedule(cfg))
 
 
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
@@ -133,15 +190,30 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 @torch.no_grad()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
-    phase, number, start = plan(cfg)[state.step]
-    if start > 0:
+    now = schedule(cfg)[state.step]
+    if now.start > 0:
         if float(state.memory["loss"]) < cfg.settled:
             return {}
-        cfg = replace(cfg, frontier=cfg.others[start - 1].frontier) if phase != "keep" else cfg
-    phases = {"pairs": _pairs, "windows": _windows, "whole": _whole, "keep": _keep, "loops": _loops}
-    phases |= {"relocate": _relocate}
-    state.params, scalars = phases[phase](cfg, through(inputs, state.params.log_focal), state, number)
+        if not isinstance(now.phase, KeepBest):
+            cfg = replace(cfg, frontier=cfg.others[now.start - 1].frontier)
+    state.params, scalars = _carried_out(now.phase, cfg, through(inputs, state.params.log_focal), state)
     return scalars
+
+
+def _carried_out(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "Outcome":
+    match phase:
+        case AverageRotations():
+            return _pairs(cfg, inputs, state)
+        case AdjustWindows(size):
+            return _windows(cfg, inputs, state, size)
+        case AdjustAll(scale):
+            return adjust_all(cfg, inputs, state, scale)
+        case KeepBest(scale):
+            return _keep(cfg, inputs, state, scale)
+        case CloseLoops():
+            return _loops(inputs, state)
+        case Relocalize(scale):
+            return _relocate(inputs, state, scale)
 
 
 # Phases ---------------------------------------------------------------------------------------------------------------
@@ -149,7 +221,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 Outcome = tuple[Poses, dict[str, Tensor | float]]
 
 
-def _pairs(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
+def _pairs(cfg: Config, inputs: Inputs, state: State) -> Outcome:
     """Fit near pairs one by one and average their rotations."""
     near = [m for m in inputs.matches if abs(m.j - m.i) <= cfg.reach and len(m) >= relative_pose.LEAST]
     if not near:
@@ -167,9 +239,9 @@ def _pairs(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
     return poses, {"pairs": float(len(fits))}
 
 
-def _windows(cfg: Config, inputs: Inputs, state: State, number: float) -> Outcome:
+def _windows(cfg: Config, inputs: Inputs, state: State, size: int) -> Outcome:
     """Adjust overlapping windows, each also from its mirror image, and average the rotations within them."""
-    n, size = len(inputs.capture), min(int(number), len(inputs.capture))
+    n, size = len(inputs.capture), min(size, len(inputs.capture))
     first = sorted({*range(0, n - size + 1, max(1, size // 4)), n - size})
     frames = torch.tensor(first)[:, None] + torch.arange(size)
     tracks, group = _cut(inputs.tracks, frames, cfg.window_points, state.rng)
@@ -178,7 +250,7 @@ def _windows(cfg: Config, inputs: Inputs, state: State, number: float) -> Outcom
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
     best, least = R, torch.full((len(frames),), torch.inf, dtype=R.dtype)
     for start in (R, flip @ R @ middle.mT @ flip @ middle):
-        scene = Scene(start, on_axis(inputs.capture, inputs.shapes)[frames], torch.zeros(0, 3, dtype=R.dtype))
+        scene = BundleState(start, on_axis(inputs.capture, inputs.shapes)[frames], torch.zeros(0, 3, dtype=R.dtype))
         for scale in cfg.schedule:
             scene, price = _round(cfg, inputs, scene, tracks, group, frames, scale)
         best = torch.where((price < least)[:, None, None, None], scene.R, best)
@@ -206,12 +278,12 @@ def _cut(tracks: Tracks, frames: Int64[Tensor, "g f"], most: int, rng: torch.Gen
     return joined(*parts), torch.cat(groups)
 
 
-def _whole(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
+def adjust_all(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
     """One round of adjusting all frames together."""
     poses = state.params
     frames = torch.arange(len(inputs.capture))[None]
     free = torch.zeros(1, dtype=poses.R.dtype) if inputs.capture.focal_guessed else None
-    scene = Scene(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype), free)
+    scene = BundleState(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype), free)
     tracks = inputs.tracks
     if len(state.memory.get("loop_point", ())):
         tracks = joined(tracks, Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv"))))
@@ -226,19 +298,19 @@ def _whole(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
 def _keep(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
     """The better of these poses and those of other ways to begin."""
     alone = State(0, state.params, None, torch.Generator().manual_seed(0))
-    loss, memory = torch.as_tensor(_whole(cfg, inputs, alone, scale)[1]["loss"]), state.memory
+    loss, memory = torch.as_tensor(adjust_all(cfg, inputs, alone, scale)[1]["loss"]), state.memory
     if float(loss) < float(memory["loss"]):
         memory |= {**vars(state.params), "loss": loss}
     return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
 
 
-def _loops(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
+def _loops(inputs: Inputs, state: State) -> Outcome:
     """Points that are seen again when a body of revolution comes round: its outlines do not tell how it turned."""
     if not mirrors(inputs.capture.masks).revolves:
         return state.params, {}
     R, t = state.params.R.float(), state.params.t.float() / (ROOM * inputs.radius)
     trajectory = Trajectory(SE3.from_rotation(SO3.from_matrix(R), t), inputs.capture.light)
-    found = comebacks(inputs.capture, trajectory, count=MOST_LOOPS, gap=AGAIN)
+    found = comebacks(inputs.capture, trajectory, inputs.matcher, count=MOST_LOOPS, gap=AGAIN)
     for name, x in vars(joined(NONE, *(of_match(match) for match in found))).items():
         state.memory[f"loop_{name}"] = x
     return state.params, {"loops": float(len(found))}
@@ -247,14 +319,14 @@ def _loops(cfg: Config, inputs: Inputs, state: State, _: float) -> Outcome:
 def _round(
     cfg: Config,
     inputs: Inputs,
-    scene: Scene,
+    scene: BundleState,
     tracks: Tracks,
     group: Tensor,
     frames: Int64[Tensor, "g f"],
     scale: float,
     rng: torch.Generator | None = None,
     guess: float = 0.0,
-) -> tuple[Scene, Float[Tensor, " g"]]:
+) -> tuple[BundleState, Float[Tensor, " g"]]:
     """Find the frontier, triangulate, adjust; also the loss per observation of every group [pixels^2]."""
     g, f = frames.shape
     R, t, camera = scene.R.flatten(0, 1), scene.t.flatten(0, 1), inputs.capture.camera
@@ -278,7 +350,7 @@ def _round(
     return moved, price / total.clamp_min(1)
 
 
-def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcome:
+def _relocate(inputs: Inputs, state: State, scale: float) -> Outcome:
     """Try other rotations for every frame that contradicts the rest, outwards from those that agree best."""
     R, t = state.params.R.clone(), state.params.t.clone()
     n, camera = len(R), inputs.capture.camera
@@ -320,7 +392,7 @@ def _relocate(cfg: Config, inputs: Inputs, state: State, scale: float) -> Outcom
     return replace(state.params, R=R, t=t), {"relocated": float(changed)}
 
 
-def judged(inputs: Inputs, trajectory: Trajectory) -> Tracked:
+def judged(inputs: Inputs, trajectory: Trajectory) -> PoseResult:
     """Poses of another route as if this one had found them."""
     T_cam_obj = trajectory.T_cam_obj
     t = T_cam_obj.xyz.double()
@@ -329,7 +401,7 @@ def judged(inputs: Inputs, trajectory: Trajectory) -> Tracked:
 
 
 @torch.no_grad()
-def finish(cfg: Config, inputs: Inputs, state: State) -> Tracked:
+def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     """Poses in the object's own unit and frame, its points, and how far to trust them."""
     drift, inputs = _drift(cfg, inputs, state), through(inputs, state.params.log_focal)
     solution = Solution(state.params.R, state.params.t, inputs.radius, drift)
@@ -343,7 +415,7 @@ def _drift(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
         alone = State(0, state.params, None, torch.Generator().manual_seed(0), state.memory)
         for scale in cfg.preferring:
             seen = through(inputs, alone.params.log_focal)
-            alone.params, _ = _whole(replace(cfg, frontier=weight), seen, alone, scale)
+            alone.params, _ = adjust_all(replace(cfg, frontier=weight), seen, alone, scale)
         preferred.append(SO3.from_matrix(alone.params.R).inverse())
     a, b = preferred
     return angle_between(b, mean_rotation(b @ a.inverse()) @ a)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from tumble.scene.capture import OBJECT, UNKNOWN
+from tumble.scene import OBJECT, UNKNOWN
 
 GRID = 64
 """Silhouettes are compared on a grid of this size."""

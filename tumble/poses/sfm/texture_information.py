@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from tumble.poses.sfm.tracks import Tracks
-from tumble.scene.capture import OBJECT, Capture
+from tumble.scene import OBJECT, Capture
 
 GRAINS, BLUR = 3, 9
 """Windows whose means are compared: what stands out, and its surroundings [pixels]."""

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.scene.match import Match
+from tumble.scene import Match
 
 NEAR = 2.2
 """How far around a point a match speaks for it [pixels]."""

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble.maths.directions import texel_directions
-from tumble.scene.environment import Environment
+from tumble.maths import texel_directions
+from tumble.scene import Environment
 
 FINE = 4
 """Rays per texel, each way."""

@@ -68,7 +68,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Mesh:
+class PotMesh:
     """Triangles with a normal and a place on the atlas per vertex; y up, metres."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -112,7 +112,7 @@ GRIP: Points = [(0.033, 0.089), (0.056, 0.100), (0.087, 0.096), (0.090, 0.062), 
 """Axis of the handle, (x, y) from body to body [metres]."""
 
 
-def parts() -> dict[str, Mesh]:
+def parts() -> dict[str, PotMesh]:
     """The solids of the pot, each closed: body, lid, knob, spout and handle."""
     below_mouth, grip = _lengths(_smooth(NOZZLE, 200))[-1], _lengths(_smooth(GRIP, 200))[-1]
     return {
@@ -141,14 +141,14 @@ def parts() -> dict[str, Mesh]:
     }
 
 
-def _turned(rows: dict[str, int], columns: int) -> Mesh:
+def _turned(rows: dict[str, int], columns: int) -> PotMesh:
     """A closed surface around the upright axis from PROFILES, by their names and numbers of rings."""
     tallest = 0.16
     stretches = [Stretch([(r, tallest - y) for r, y in PROFILES[name]], n, name) for name, n in rows.items()]
     return _solid([(0.0, tallest), (0.0, 0.0)], stretches, columns)
 
 
-def _solid(axis: Points, stretches: list[Stretch], columns: int, *, flatness: float = 1.0) -> Mesh:
+def _solid(axis: Points, stretches: list[Stretch], columns: int, *, flatness: float = 1.0) -> PotMesh:
     """A closed surface around an axis in the plane z = 0.
 
     Args:
@@ -229,7 +229,7 @@ def _grid_faces(rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
     return np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
 
 
-def _welded(vertices: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Mesh:
+def _welded(vertices: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> PotMesh:
     """Normals shared by all vertices at one place, and no triangles without area."""
     _, place = np.unique(np.round(vertices * 1e7).astype(np.int64), axis=0, return_inverse=True)
     place = place.reshape(-1)
@@ -241,7 +241,7 @@ def _welded(vertices: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> Mesh:
     for corner in range(3):
         np.add.at(summed, place[faces[:, corner]], normal)
     summed /= np.linalg.norm(summed, axis=1, keepdims=True)
-    return Mesh(vertices, summed[place], uv, faces)
+    return PotMesh(vertices, summed[place], uv, faces)
 
 
 # The file -------------------------------------------------------------------------------------------------------------

@@ -1,14 +1,14 @@
 """The schedule of stage 1, counted out by hand."""
 
-from tumble.poses.progressive import schedule
-from tumble.poses.progressive.schedule import Phases
+from tumble.poses.progressive import tracker
+from tumble.poses.progressive.tracker import Phases
 
 
 def test_every_frame_gets_its_phases() -> None:
     phases = Phases(shape=2, pose=3, joint=4)
-    n = schedule.length(phases, 5)
+    n = tracker.n_steps(phases, 5)
     assert n == 2 + 4 * 9
-    places = [schedule.place(phases, step) for step in range(n)]
+    places = [tracker.place(phases, step) for step in range(n)]
     assert [p.phase for p in places[:11]] == ["shape"] * 4 + ["pose"] * 3 + ["joint"] * 4
     assert [p.turn for p in places] == [0, 0] + [turn for turn in range(1, 5) for _ in range(9)]
     assert [i for i, p in enumerate(places) if p.first] == [4, 13, 22, 31]
@@ -19,11 +19,11 @@ def test_every_frame_gets_its_phases() -> None:
 
 def test_a_phase_may_be_left_out() -> None:
     phases = Phases(shape=1, pose=0, joint=2)
-    places = [schedule.place(phases, step) for step in range(schedule.length(phases, 3))]
+    places = [tracker.place(phases, step) for step in range(tracker.n_steps(phases, 3))]
     assert [p.phase for p in places] == ["shape", "shape", "joint", "joint", "shape", "joint", "joint"]
     assert [p.first for p in places] == [False, False, True, False, False, True, False]
 
 
 def test_frames_go_both_ways_from_the_start() -> None:
-    assert schedule.order(0, 4) == [0, 1, 2, 3]
-    assert schedule.order(2, 5) == [2, 3, 4, 1, 0]
+    assert tracker.order(0, 4) == [0, 1, 2, 3]
+    assert tracker.order(2, 5) == [2, 3, 4, 1, 0]

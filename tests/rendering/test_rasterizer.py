@@ -8,8 +8,7 @@ from torch import Tensor
 
 from tests.surfaces import GAMMA, look_at, sphere
 from tumble.maths.se3 import SE3, SO3
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.rasterize import rasterize
+from tumble.rendering.rasterizer import Buffers, rasterize
 from tumble.scene.camera import Camera
 from tumble.scene.gaussians import Gaussians, constant_sh
 

@@ -11,10 +11,10 @@ from torch import Tensor
 from tests.surfaces import GAMMA, look_at, sphere, sphere_mesh, torus, torus_mesh
 from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_directions
 from tumble.maths.se3 import SE3, SO3
-from tumble.rendering import brdf, importance_sampling, shade
-from tumble.rendering.prefilter import prefilter
-from tumble.rendering.rasterize import rasterize
-from tumble.rendering.shade import Bounce, Surface
+from tumble.rendering import brdf, importance_sampling, shading
+from tumble.rendering.prefiltered_light import prefilter
+from tumble.rendering.rasterizer import rasterize
+from tumble.rendering.shading import Bounce, Surface
 from tumble.rendering.trace import Visibility, build, open_sky, transfer, visibility
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
@@ -64,7 +64,7 @@ def rms(x: Tensor) -> float:
 
 def test_the_surface_of_a_sphere_lies_on_it_and_looks_back_at_the_camera() -> None:
     T_cam_obj = look_at([1, -4, 2])
-    seen = shade.surface(rasterize(sphere(4000), GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
+    seen = shading.surface(rasterize(sphere(4000), GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
     eye = T_cam_obj.inverse().xyz
     # Flat overlapping discs stand a little above their sphere, and the nearer of them win (2 degrees at 4000).
     assert (seen.points.norm(dim=-1) - 1).abs().max() < 0.01
@@ -76,8 +76,8 @@ def test_the_surface_of_a_sphere_lies_on_it_and_looks_back_at_the_camera() -> No
 def test_chosen_pixels_are_those_of_the_whole() -> None:
     T_cam_obj = look_at([1, -4, 2])
     view = rasterize(sphere(400), GAMMA, T_cam_obj, CAMERA, {})
-    whole = shade.surface(view, T_cam_obj, CAMERA)
-    some = shade.surface(view, T_cam_obj, CAMERA, pixels=whole.pixels[10:20])
+    whole = shading.surface(view, T_cam_obj, CAMERA)
+    some = shading.surface(view, T_cam_obj, CAMERA, pixels=whole.pixels[10:20])
     for one, two in zip(vars(some).values(), vars(whole).values(), strict=True):
         # Where the vectors of a product end depends on how many there are: the last digit is not the same everywhere.
         torch.testing.assert_close(one, two[10:20], atol=1e-6, rtol=0)
@@ -88,7 +88,7 @@ def test_chosen_pixels_are_those_of_the_whole() -> None:
 
 def test_chalk_in_a_uniform_light_sends_back_its_albedo() -> None:
     seen = ball(400)
-    found = shade.diffuse(seen, grey(seen)[0], uniform(2.0), torch.eye(3), open_sky(fibonacci_sphere(2048), 200))
+    found = shading.diffuse(seen, grey(seen)[0], uniform(2.0), torch.eye(3), open_sky(fibonacci_sphere(2048), 200))
     # 2048 directions resolve a cosine to a few parts in ten thousand.
     torch.testing.assert_close(found, torch.full((200, 3), 1.0), rtol=2e-3, atol=0)
 
@@ -98,7 +98,7 @@ def test_an_eye_behind_the_surface_sees_the_diffuse_lobe_alone() -> None:
     torch.manual_seed(0)
     seen, directions = ball(400, torch.float64), fibonacci_sphere(256, dtype=torch.float64)
     environment = Environment(torch.randn(8, 16, 3, dtype=torch.float64))
-    found = shade.diffuse(seen, grey(seen)[0], environment, torch.eye(3).double(), open_sky(directions, 200))
+    found = shading.diffuse(seen, grey(seen)[0], environment, torch.eye(3).double(), open_sky(directions, 200))
     cosine = (seen.normals @ directions.T).clamp(min=0)
     expected = 0.5 / math.pi * 4 * math.pi / 256 * cosine @ environment.lookup(directions)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
@@ -111,8 +111,8 @@ def test_both_estimators_know_the_reflectance_of_a_uniform_light(roughness: floa
     nov = (seen.normals * seen.views).sum(-1, keepdim=True)
     expected = F0 * brdf.split_sum(brdf.split_sum_table(), nov, rough)
     sky, R = open_sky(fibonacci_sphere(1 << 14), 200), torch.eye(3)
-    summed = shade.shade(seen, albedo, rough, uniform(), R, sky, f0=F0)
-    split = shade.shade_split(seen, albedo, rough, prefilter(uniform()), R, sky, f0=F0)
+    summed = shading.shade(seen, albedo, rough, uniform(), R, sky, f0=F0)
+    split = shading.shade_split(seen, albedo, rough, prefilter(uniform()), R, sky, f0=F0)
     # The table is bilinear on 64 entries; 16384 directions resolve a lobe of roughness 0.3 to a percent.
     torch.testing.assert_close(summed, expected.expand(-1, 3), rtol=0.02, atol=0)
     torch.testing.assert_close(split, expected.expand(-1, 3), rtol=1e-3, atol=1e-5)
@@ -125,7 +125,7 @@ def test_the_split_sum_shows_a_smooth_mirror_the_light_itself() -> None:
     R = random_rotation(torch.Generator().manual_seed(0))
     sky = open_sky(fibonacci_sphere(64), 50)
     albedo = torch.zeros(50, 3)
-    found = shade.shade_split(seen, albedo, rough, prefilter(environment), R, sky, f0=0.04)
+    found = shading.shade_split(seen, albedo, rough, prefilter(environment), R, sky, f0=0.04)
     mirrored = 2 * (seen.normals * seen.views).sum(-1, keepdim=True) * seen.normals - seen.views
     nov = (seen.normals * seen.views).sum(-1, keepdim=True)
     share = brdf.split_sum(brdf.split_sum_table(), nov, rough)
@@ -136,12 +136,12 @@ def test_the_split_sum_shows_a_smooth_mirror_the_light_itself() -> None:
 def test_a_white_torus_that_bounces_light_vanishes_in_a_white_furnace() -> None:
     """What is not seen of the light is seen of the torus, which under this light is as bright."""
     gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
-    seen = shade.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
+    seen = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
     sees = visibility(build(gaussians, GAMMA), seen.points, seen.normals, fibonacci_sphere(256), blockers=True)
     white = grey(seen, 1.0)[0]
     bounce = Bounce(torch.ones(1000, 3), seen_by_all(gaussians))
-    found = shade.diffuse(seen, white, uniform(), torch.eye(3), sees, bounce=bounce)
-    black = shade.diffuse(seen, white, uniform(), torch.eye(3), sees)
+    found = shading.diffuse(seen, white, uniform(), torch.eye(3), sees, bounce=bounce)
+    black = shading.diffuse(seen, white, uniform(), torch.eye(3), sees)
     assert black.min() < 0.7, "some of the torus must be in its own shade for this to say anything"
     torch.testing.assert_close(found, torch.ones_like(found), atol=0.03, rtol=0)
 
@@ -156,7 +156,7 @@ def test_a_shadow_dims_the_mirror_that_shows_it() -> None:
     half = Visibility(directions, bits, None)
     assert torch.equal(half.unpacked()[0], ~closed)
     mirrored = 2 * (seen.normals * seen.views).sum(-1, keepdim=True) * seen.normals - seen.views
-    share = shade.lobe_visibility(seen, torch.full((400, 1), 0.2), half)[:, 0]
+    share = shading.lobe_visibility(seen, torch.full((400, 1), 0.2), half)[:, 0]
     # Neighbouring directions lie 0.22 apart.
     assert share[mirrored[:, 0] > 0.5].min() > 0.95
     assert share[mirrored[:, 0] < -0.5].max() < 0.05
@@ -167,7 +167,7 @@ def test_the_horizon_casts_no_shadow_on_a_mirror() -> None:
     seen = ball(800)
     sees = visibility(build(sphere(500), GAMMA), 1.02 * seen.points, seen.normals, fibonacci_sphere(256))
     for roughness in (0.1, 0.5, 1.0):
-        share = shade.lobe_visibility(seen, torch.full((400, 1), roughness), sees)
+        share = shading.lobe_visibility(seen, torch.full((400, 1), roughness), sees)
         torch.testing.assert_close(share, torch.ones_like(share))
 
 
@@ -196,12 +196,12 @@ def test_gradients_reach_surface_material_light_and_rotation() -> None:
         surface = Surface(seen.pixels, seen.points, x[0], x[1])
         bounce = Bounce(x[6], transfer([sees], seen.normals)[:3])
         R_env_obj = (SO3.exp(x[5]) @ turned).matrix()
-        return shade.shade(surface, x[2], x[3], Environment(x[4]), R_env_obj, sees, f0=F0, bounce=bounce)
+        return shading.shade(surface, x[2], x[3], Environment(x[4]), R_env_obj, sees, f0=F0, bounce=bounce)
 
     def split(*x: Tensor) -> Tensor:
         surface = Surface(seen.pixels, seen.points, x[0], x[1])
         R_env_obj, sky = (SO3.exp(x[5]) @ turned).matrix(), open_sky(directions, 8)
-        return shade.shade_split(surface, x[2], x[3], prefilter(Environment(x[4])), R_env_obj, sky, f0=F0)
+        return shading.shade_split(surface, x[2], x[3], prefilter(Environment(x[4])), R_env_obj, sky, f0=F0)
 
     inputs = [x.clone().requires_grad_() for x in inputs]
     assert torch.autograd.gradcheck(summed, inputs, fast_mode=True)
@@ -213,11 +213,11 @@ def test_shading_in_parts_is_shading_at_once() -> None:
     seen, sky = ball(800), open_sky(fibonacci_sphere(128), 400)
     albedo, rough = grey(seen)
     environment, R = lamp([0.3, 0.5, 0.8]), torch.eye(3)
-    whole = shade.shade(seen, albedo, rough, environment, R, sky, f0=F0)
+    whole = shading.shade(seen, albedo, rough, environment, R, sky, f0=F0)
     parts = []
     for index in torch.arange(400).split(77):
         part = Surface(*(x[index] for x in vars(seen).values()))
-        parts.append(shade.shade(part, albedo[index], rough[index], environment, R, sky.gather(index), f0=F0))
+        parts.append(shading.shade(part, albedo[index], rough[index], environment, R, sky.gather(index), f0=F0))
     torch.testing.assert_close(torch.cat(parts), whole)
 
 
@@ -232,7 +232,7 @@ def albedo_gradient(environment: Environment, trajectory: Trajectory) -> Tensor:
     sky = open_sky(fibonacci_sphere(512), 100)
     loss = torch.zeros(())
     for R_env_obj in trajectory.R_env_obj:
-        found, wanted = (shade.diffuse(seen, x, environment, R_env_obj, sky) for x in (albedo, truth))
+        found, wanted = (shading.diffuse(seen, x, environment, R_env_obj, sky) for x in (albedo, truth))
         loss = loss + (found - wanted).square().sum()
     return torch.autograd.grad(loss, albedo)[0]
 
@@ -268,11 +268,11 @@ def test_turning_object_camera_and_light_together_changes_nothing() -> None:
     found = []
     for shape, Q in ((gaussians, identity), (turned, Q_new_old)):
         T = T_cam_obj @ SE3.from_rotation(Q.inverse(), torch.zeros(3))
-        seen = shade.surface(rasterize(shape, GAMMA, T, CAMERA, {}), T, CAMERA)
+        seen = shading.surface(rasterize(shape, GAMMA, T, CAMERA, {}), T, CAMERA)
         sees = visibility(build(shape, GAMMA), seen.points, seen.normals, Q @ directions, blockers=True)
         bounce = Bounce(torch.full((1000, 3), 0.5), seen_by_all(shape))
         R = (R_env_obj @ Q.inverse()).matrix()
-        found.append(seen.paint(shade.shade(seen, *grey(seen), environment, R, sees, f0=F0, bounce=bounce), 48, 48))
+        found.append(seen.paint(shading.shade(seen, *grey(seen), environment, R, sees, f0=F0, bounce=bounce), 48, 48))
     # A ray in a hundred thousand meets a threshold from the other side.
     assert (found[0] - found[1]).abs().mean() < 1e-3 * found[0].mean()
     assert found[0].max() > 0.1
@@ -296,7 +296,7 @@ def judged(shape: str, environment: Environment, albedo: float = 0.6, depth: int
     camera, T_cam_obj = Camera.from_fov(0.6, size, size), look_at([2.5, 1, 2.5])
     R_env_obj = SO3.exp(torch.tensor([-1.2, 0.3, 0.2])).matrix()
     view = rasterize(gaussians, GAMMA, T_cam_obj, camera, {})
-    seen = shade.surface(view, T_cam_obj, camera, alpha_min=0.9)
+    seen = shading.surface(view, T_cam_obj, camera, alpha_min=0.9)
     light, tracer = importance_sampling.light_sampler(environment), build(gaussians, GAMMA)
     generator = torch.Generator().manual_seed(0)
     diffuse = Bounce(torch.full((n, 3), albedo), seen_by_all(gaussians))
@@ -316,7 +316,7 @@ def judged(shape: str, environment: Environment, albedo: float = 0.6, depth: int
     material = {"albedo": albedo, "roughness": roughness, "f0": F0}
     scene = mitsuba_brdf.scene(mesh, environment, **material, depth=depth)
     truth, coverage = pathtracer.radiance(scene, T_cam_obj, camera, R_env_obj, samples=1024, seed=0)
-    model = pathtracer.Model((mesh,), T_cam_obj.matrix().double().numpy())
+    model = pathtracer.ObjectModel((mesh,), T_cam_obj.matrix().double().numpy())
     maps = pathtracer.maps(pathtracer.unlit_scenes(model, None), T_cam_obj, camera, samples=64)
     normals = torch.nn.functional.normalize(view.normal, dim=-1)
     agree = (torch.from_numpy(coverage) > 0.999) & (view.alpha > 0.95)
@@ -373,5 +373,5 @@ def test_a_wide_lobe_is_that_of_the_path_tracer(theta: float) -> None:
     eye = torch.tensor([[math.sin(theta), 0.0, math.cos(theta)]])
     point = Surface(torch.zeros(1, dtype=torch.long), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), eye)
     black, rough, sky_of = torch.zeros(1, 3), torch.full((1, 1), 0.5), prefilter(environment)
-    ours = shade.shade_split(point, black, rough, sky_of, torch.eye(3), open_sky(w.float(), 1), f0=F0)
+    ours = shading.shade_split(point, black, rough, sky_of, torch.eye(3), open_sky(w.float(), 1), f0=F0)
     assert ours[0, 0].item() == pytest.approx(truth, rel=0.02)

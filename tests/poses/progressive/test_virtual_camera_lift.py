@@ -4,8 +4,9 @@ import math
 
 import torch
 
+from tests.oracles.virtual_camera import disagreement
 from tumble.maths.se3 import SE3, SO3
-from tumble.poses.progressive import lift, sdf_field, virtual_camera
+from tumble.poses.progressive import sdf_field, virtual_camera
 from tumble.poses.progressive.sdf_field import Sizes
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT
@@ -30,8 +31,8 @@ def test_closed_form_equals_the_true_pose() -> None:
     aim, camera, truth = scene()
     R_aim_cam = aim.R_cam_aim.inverse()
     T_aim_obj = SE3.from_rotation(R_aim_cam @ truth.T_cam_obj.rotation, R_aim_cam @ truth.T_cam_obj.xyz)
-    lifted = lift.lift(aim, T_aim_obj, "camera")
-    angle, shift = lift.disagreement(lifted, truth)
+    lifted = virtual_camera.lift(aim, T_aim_obj, "camera")
+    angle, shift = disagreement(lifted, truth)
     # Quaternion products in float32.
     assert angle < 1e-3 * math.degrees(1)
     assert shift < 1e-5
@@ -49,10 +50,10 @@ def test_epnp_from_points_of_the_shape_agrees() -> None:
     T_aim_obj = SE3.from_rotation(R_aim_cam @ truth.T_cam_obj.rotation, R_aim_cam @ truth.T_cam_obj.xyz)
     rng = torch.Generator().manual_seed(0)
     net = sdf_field.sphere(Sizes(width=48, depth=3, skip=0, features=4, octaves=2, colour_width=8, colour_depth=1), rng)
-    points = lift.surface_points(net.sdf, 500, rng, resolution=32)
+    points = virtual_camera.surface_points(net.sdf, 500, rng, resolution=32)
     # The start is a sphere of radius 0.5, to a tenth.
     assert (points.norm(dim=-1) - 0.5).abs().mean() < 0.05
-    angle, shift = lift.disagreement(lift.by_pnp(points, aim, T_aim_obj, camera, "camera"), truth)
+    angle, shift = disagreement(virtual_camera.by_pnp(points, aim, T_aim_obj, camera, "camera"), truth)
     # Pixels in float32 at 5 radii distance: 1e-4 of a pixel over 15 pixels of depth relief.
     assert angle < 0.05
     assert shift < 0.01
@@ -61,4 +62,4 @@ def test_epnp_from_points_of_the_shape_agrees() -> None:
 def test_disagreement_is_measured() -> None:
     _, _, truth = scene()
     turned = Trajectory(SE3(truth.T_cam_obj.wxyz, truth.T_cam_obj.xyz + torch.tensor([0.0, 0.3, 0.4])), "camera")
-    assert abs(lift.disagreement(turned, truth)[1] - 0.5) < 1e-5
+    assert abs(disagreement(turned, truth)[1] - 0.5) < 1e-5

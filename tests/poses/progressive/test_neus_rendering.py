@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from tumble.poses.progressive import volume
+from tumble.poses.progressive import neus
 
 RADIUS = 0.6
 
@@ -26,11 +26,11 @@ def rays(n: int = 41) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.tensor([0.1, 0.0, -3.0], dtype=torch.float64).expand(n, 3), directions
 
 
-def look(n_sections: int, sharpness: float) -> tuple[volume.Rendered, torch.Tensor, torch.Tensor]:
+def look(n_sections: int, sharpness: float) -> tuple[neus.Rendered, torch.Tensor, torch.Tensor]:
     origins, directions = rays()
-    along = volume.sections(origins, directions, n_sections, bound=1.0)
+    along = neus.sections(origins, directions, n_sections, bound=1.0)
     sharp = torch.tensor(sharpness, dtype=torch.float64)
-    seen = volume.render(ball_sdf, position, sharp, origins, directions, along)
+    seen = neus.render(ball_sdf, position, sharp, origins, directions, along)
     closest = -(origins * directions).sum(-1)
     miss = (origins + closest[:, None] * directions).norm(dim=-1)
     entry = closest - (RADIUS**2 - miss**2).clamp_min(0).sqrt()
@@ -63,7 +63,7 @@ def test_opacity_of_a_grazing_ray_is_the_fall_of_the_logistic() -> None:
 
 def test_compositing_equals_a_loop() -> None:
     alpha = torch.rand(3, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    weights = volume.composite(alpha)
+    weights = neus.composite(alpha)
     for r in range(3):
         free = 1.0
         for k in range(7):
@@ -74,25 +74,25 @@ def test_compositing_equals_a_loop() -> None:
 def test_leaving_the_object_hides_nothing() -> None:
     """Distance that rises along the ray has no opacity, or the back side would show."""
     sdf, length = torch.linspace(-0.5, 0.5, 10)[None], torch.full((1, 10), 0.1)
-    assert (volume.opacities(sdf, torch.ones(1, 10), length, torch.tensor(50.0)) == 0).all()
-    assert volume.opacities(-sdf, -torch.ones(1, 10), length, torch.tensor(50.0)).max() > 0.9
+    assert (neus.opacities(sdf, torch.ones(1, 10), length, torch.tensor(50.0)) == 0).all()
+    assert neus.opacities(-sdf, -torch.ones(1, 10), length, torch.tensor(50.0)).max() > 0.9
 
 
 def test_sections_tile_the_chord_and_jitter_moves_them_together() -> None:
     origins, directions = torch.tensor([[0.0, 0.3, -2.0], [0.0, 3.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]] * 2)
-    along = volume.sections(origins, directions, 4, bound=0.5)
+    along = neus.sections(origins, directions, 4, bound=0.5)
     half = math.sqrt(0.25 - 0.09)
     assert torch.allclose(along.lengths[0], torch.full((4,), half / 2))
     assert torch.allclose(along.middles[0], torch.tensor([-0.75, -0.25, 0.25, 0.75]) * half + 2)
     assert (along.lengths[1] == 0).all()
-    moved = volume.sections(origins, directions, 4, bound=0.5, jitter=torch.tensor([0.25, 0.25]))
+    moved = neus.sections(origins, directions, 4, bound=0.5, jitter=torch.tensor([0.25, 0.25]))
     assert torch.allclose(moved.middles[0] - along.middles[0], torch.full((4,), 0.25 * half / 2))
 
 
 def test_a_ray_that_misses_the_ball_sees_nothing() -> None:
     origins, directions = torch.tensor([[0.0, 3.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])
-    along = volume.sections(origins, directions, 8, bound=1.0)
-    seen = volume.render(ball_sdf, position, torch.tensor(20.0), origins, directions, along)
+    along = neus.sections(origins, directions, 8, bound=1.0)
+    seen = neus.render(ball_sdf, position, torch.tensor(20.0), origins, directions, along)
     assert float(seen.opacity) == 0
     assert (seen.rgb == 0).all()
 
@@ -100,11 +100,11 @@ def test_a_ray_that_misses_the_ball_sees_nothing() -> None:
 def test_gradients_reach_the_ray() -> None:
     """Moving the origin sideways moves the entry point: against differences, in double precision."""
     origins, directions = rays(5)
-    along = volume.sections(origins, directions, 64, bound=1.0)
+    along = neus.sections(origins, directions, 64, bound=1.0)
     sharp = torch.tensor(40.0, dtype=torch.float64)
 
     def picture(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        return volume.render(ball_sdf, position, sharp, origins, directions, along).rgb
+        return neus.render(ball_sdf, position, sharp, origins, directions, along).rgb
 
     inputs = (origins.clone().requires_grad_(), directions.clone().requires_grad_())
     # eps times the curvature of a logistic of sharpness 40: 1e-6 * 40^2.

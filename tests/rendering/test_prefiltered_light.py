@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_directions
-from tumble.rendering import prefilter as filtering
+from tumble.rendering import prefiltered_light as filtering
 from tumble.scene.environment import Environment
 
 

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, grid_sample
 
-from tumble.maths.directions import equirect_from_direction, texel_directions, texel_solid_angles
-from tumble.scene.environment import Environment, bilinear
+from tumble.maths import equirect_from_direction, texel_directions, texel_solid_angles
+from tumble.scene import Environment, bilinear
 
 LEVELS = 9
 ROWS = 64

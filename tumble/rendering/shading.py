@@ -21,15 +21,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble import backends
-from tumble.maths import spherical_harmonics
-from tumble.maths.directions import reflect
-from tumble.maths.se3 import SE3
+from tumble.maths import SE3, reflect, spherical_harmonics
 from tumble.rendering import brdf
-from tumble.rendering.buffers import Buffers
-from tumble.rendering.prefilter import Prefiltered
+from tumble.rendering.prefiltered_light import Prefiltered
+from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.trace import Visibility
-from tumble.scene.camera import Camera
-from tumble.scene.environment import Environment
+from tumble.scene import Camera, Environment
 
 NARROW = (0.3, 0.45)
 """Roughness up to which a few hundred directions cannot resolve the specular lobe, and from which they can."""

@@ -1,0 +1,125 @@
+"""A textured mesh as a GLB: glTF 2.0 binary, one JSON document and one buffer, written by hand."""
+
+import io
+import json
+import math
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from tumble import __version__
+from tumble.export.bake import Textures
+from tumble.export.mesh import Unwrapped
+from tumble.io import files
+from tumble.scene import DIELECTRIC
+
+FLOAT, SHORT, INT = 5126, 5123, 5125
+ARRAY, ELEMENTS = 34962, 34963
+"""Numbers of glTF 2.0, sections 3.6.2 and 5.11."""
+
+
+@dataclass(frozen=True)
+class _Buffer:
+    """The binary chunk as it grows, and the views and accessors into it."""
+
+    data: bytearray = field(default_factory=bytearray)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+
+    def view(self, values: bytes, **more: int) -> int:
+        self.data.extend(b"\0" * (-len(self.data) % 4))
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(values), **more})
+        self.data.extend(values)
+        return len(self.views) - 1
+
+    def accessor(self, values: np.ndarray, kind: str, component: int, *, target: int, bounds: bool = False) -> int:
+        about = {"componentType": component, "count": len(values), "type": kind}
+        if bounds:
+            about |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        self.accessors.append({"bufferView": self.view(values.tobytes(), target=target), **about})
+        return len(self.accessors) - 1
+
+    def png(self, values: UInt8[np.ndarray, "h w *c"]) -> dict[str, Any]:
+        file = io.BytesIO()
+        Image.fromarray(values).save(file, "PNG", optimize=False, compress_level=9)
+        return {"bufferView": self.view(file.getvalue()), "mimeType": "image/png"}
+
+
+def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, metres: float) -> None:
+    """A glTF 2.0 binary with one mesh and one dielectric metallic-roughness material.
+
+    Reflectance at normal incidence goes into KHR_materials_ior, below 0.04 into KHR_materials_specular; viewers without
+    them show 0.04.
+    Tangents are those that the normal map was baked with.
+    """
+    buffer = _Buffer()
+    rough = textures.roughness
+    red, blue = np.full_like(rough, 255), np.zeros_like(rough)
+    images = [buffer.png(x) for x in (textures.base_color, np.stack([red, rough, blue], -1), textures.normal)]
+    vertices = (flat.vertices * metres).astype(np.float32)
+    few = len(vertices) < 65535
+    attributes = {
+        "POSITION": buffer.accessor(vertices, "VEC3", FLOAT, target=ARRAY, bounds=True),
+        "NORMAL": buffer.accessor(_unit32(flat.normals), "VEC3", FLOAT, target=ARRAY),
+        "TANGENT": buffer.accessor(_tangents32(flat.tangents), "VEC4", FLOAT, target=ARRAY),
+        "TEXCOORD_0": buffer.accessor(flat.uv.astype(np.float32), "VEC2", FLOAT, target=ARRAY),
+    }
+    indices = flat.faces.astype(np.uint16 if few else np.uint32).reshape(-1, 1)
+    material: dict[str, Any] = {
+        "name": "object",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {"index": 1},
+            "metallicFactor": 0.0,
+        },
+        "normalTexture": {"index": 2},
+    }
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"tumble {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "object"}],
+        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
+        "materials": [material],
+        "textures": [{"source": i, "sampler": 0} for i in range(3)],
+        # Linear filters with mipmaps; clamped to the edge.
+        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        "images": images,
+    }
+    document["meshes"][0]["primitives"][0]["indices"] = buffer.accessor(
+        indices, "SCALAR", SHORT if few else INT, target=ELEMENTS
+    )
+    if abs(f0 - DIELECTRIC) > 1e-4:
+        name, value = specular(f0)
+        material["extensions"], document["extensionsUsed"] = {name: value}, [name]
+    document |= {"bufferViews": buffer.views, "accessors": buffer.accessors, "buffers": [{}]}
+    binary = bytes(buffer.data) + b"\0" * (-len(buffer.data) % 4)
+    document["buffers"][0]["byteLength"] = len(binary)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
+    whole = (
+        header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    )
+    files.write_whole(path, lambda partial: partial.write_bytes(whole))
+
+
+def specular(f0: float) -> tuple[str, dict[str, float]]:
+    """What glTF says for a reflectance at normal incidence: below glass a dimmed highlight (as `brdf.fresnel` has it,
+    grazing angles too), above it an index."""
+    if f0 < DIELECTRIC:
+        return "KHR_materials_specular", {"specularFactor": f0 / DIELECTRIC}
+    return "KHR_materials_ior", {"ior": (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))}
+
+
+def _unit32(x: Float[np.ndarray, "n 3"]) -> np.ndarray:
+    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _tangents32(x: Float[np.ndarray, "n 4"]) -> np.ndarray:
+    return np.concatenate([_unit32(x[:, :3]), x[:, 3:].astype(np.float32)], 1)
