@@ -92,4 +92,4 @@ def _row(
 
 
 if __name__ == "__main__":
-    of_runs.main(__file__, __doc__, dark_print)
+    of_runs.main(__file__, __doc__ or "", dark_print)

@@ -129,13 +129,14 @@ def measured(path: Path, out: Path, recipe: Recipe, device: torch.device | str) 
     begun = time.perf_counter()
     asset = reconstruct(path, out / "runs" / name, recipe, device=device)
     seconds = {r["name"]: r["seconds"] for r in run.records(out / "runs" / name) if r.get("event") == "done"}
+    steps = recipe.decompose.steps if isinstance(recipe.decompose, decompose.Config) else 0
     row: dict[str, Any] = {
         "capture": path.name,
         "seconds": seconds,
         "run_seconds": round(time.perf_counter() - begun, 1),
         "steps_per_second": {
             "refine": round(recipe.refine.steps / seconds["refine"], 1),
-            "decompose": round(recipe.decompose.steps / seconds["decompose"], 1),
+            "decompose": round(steps / seconds["decompose"], 1),
         },
         "gaussians": len(asset.gaussians),
         "peak_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,

@@ -79,12 +79,12 @@ def rasterizing(
     rows = []
     for n, size in sizes:
         for c in (0, FEATURES):
-            inputs = [*shell(n), torch.rand(n, 1, 3) + 0.5, torch.rand(n, 4, c), *camera(size)]
-            inputs = [x.to(device).requires_grad_() for x in inputs]
-            mask = torch.ones(1, 1, device=device)
+            drawn = [*shell(n), torch.rand(n, 1, 3) + 0.5, torch.rand(n, 4, c), *camera(size)]
+            inputs: Any = [x.to(device).requires_grad_() for x in drawn]
+            arguments: Any = [*inputs, size, size, torch.ones(1, 1, device=device)]
             with torch.no_grad():
-                forward = median(partial(backend.rasterize, *inputs, size, size, mask), threads, runs, device)
-            view = backend.rasterize(*inputs, size, size, mask)[:6]
+                forward = median(partial(backend.rasterize, *arguments), threads, runs, device)
+            view = backend.rasterize(*arguments)[:6]
             seeds = [torch.randn_like(x) for x in view]
             adjoint = partial(torch.autograd.grad, view, inputs, seeds, retain_graph=True)
             backward = median(adjoint, threads, runs, device)
@@ -129,14 +129,15 @@ def shading(backend: Backend, name: str, threads: int, *, device: torch.device =
     rng = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 0.3 * torch.randn(p, 3, generator=rng), dim=-1)
-    surface = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
-    surface = [x.to(device).requires_grad_() for x in surface]
+    drawn = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
+    surface = [x.to(device).requires_grad_() for x in drawn]
     light, directions = torch.rand(DIRECTIONS, 3).to(device).requires_grad_(), fibonacci(DIRECTIONS).to(device)
     seen = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
     rest = seen, seen.new_full((1, 1), -1), light.new_zeros(0, 3), 0.04
+    arguments: Any = [*surface, directions, light, *rest]
     with torch.no_grad():
-        forward = median(partial(backend.shade, *surface, directions, light, *rest), threads, RUNS, device)
-    shaded = backend.shade(*surface, directions, light, *rest)
+        forward = median(lambda: backend.shade(*arguments), threads, RUNS, device)
+    shaded = backend.shade(*arguments)
     adjoint = partial(torch.autograd.grad, shaded, [*surface, light], torch.randn_like(shaded), retain_graph=True)
     backward = median(adjoint, threads, RUNS, device)
     million = p * DIRECTIONS / 1e6

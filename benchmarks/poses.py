@@ -13,6 +13,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,10 +84,11 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     matches = matching.match_pairs(matching.views_of(capture), neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()
     if route == "graph":
-        tracked = drive(graph, DRAFT.track, graph.gather(capture, matches, "mixed"), seed=0)
+        tracked = drive(graph, DRAFT.track, graph.gather(capture, matches, DRAFT.matcher), seed=0)
     else:
         recipe = progressive_poses(DRAFT)
-        tracked = drive(progressive, recipe.track, progressive.gather(capture, matches), seed=0)
+        judged = partial(graph.judged, graph.gather(capture, matches, DRAFT.matcher))
+        tracked = drive(progressive, recipe.track, progressive.gather(capture, matches, judged), seed=0)
     seconds = time.perf_counter() - begun
     health = tracked.quality
     return {

@@ -74,8 +74,7 @@ def main() -> None:
 
 
 def about(run: Path, asset: Asset) -> dict[str, object]:
-    recipe = files.read_json(run / RECIPE)
-    return {"capture": Path(recipe["capture"]["path"]).name, "gaussians": len(asset.gaussians)}
+    return {"capture": runs.source(run).name, "gaussians": len(asset.gaussians)}
 
 
 def part(page: str, name: str) -> bytes:
@@ -120,7 +119,7 @@ def panel(report: Path, dropped: Environment) -> dict[str, np.ndarray]:
                 tab.value(SETTLED)
                 url = tab.value('document.getElementById("view").toDataURL("image/png")')
                 values = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
-                picture = cv2.imdecode(values, cv2.IMREAD_UNCHANGED)
+                picture = np.asarray(cv2.imdecode(values, cv2.IMREAD_UNCHANGED))
                 shown[name] = np.ascontiguousarray(picture[..., [2, 1, 0, 3]])
             return shown
 

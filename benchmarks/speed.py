@@ -10,7 +10,7 @@ foreground PSNR after the scale per channel, as everywhere [dB, sRGB].
 
 import argparse
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -55,7 +55,12 @@ class Clock:
     """Counts work, not scoring, and what parts of it take; a part within a part counts for the outer one alone."""
 
     def __init__(self) -> None:
-        self.begun, self.paused, self.inside, self.parts = time.perf_counter(), 0.0, False, Counter[str]()
+        self.begun, self.paused, self.inside, self.parts = (
+            time.perf_counter(),
+            0.0,
+            False,
+            defaultdict[str, float](float),
+        )
 
     def now(self) -> float:
         return time.perf_counter() - self.begun - self.paused
@@ -81,7 +86,7 @@ class Clock:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))

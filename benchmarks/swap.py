@@ -42,7 +42,7 @@ ROWS = 32
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--given", choices=GIVEN, nargs="+", default=GIVEN)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
@@ -68,8 +68,9 @@ def _known(capture: Capture) -> Any:
 
 def material(capture: Capture, truth: Any, refined: refine.Refined, given: str) -> Asset:
     """Stage 3 with what is given held at its true value."""
-    cfg, rates = DRAFT.decompose, DRAFT.decompose.rates
+    cfg = DRAFT.decompose
     assert isinstance(cfg, decompose.Config), "DRAFT is the method, not a baseline"
+    rates = cfg.rates
     if given in ("roughness", "both", "all"):
         rough = float(truth.roughness[truth.foreground].mean())
         cfg, rates = replace(cfg, roughness=rough), replace(rates, roughness=0.0)

@@ -43,4 +43,4 @@ def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
 
 
 if __name__ == "__main__":
-    of_runs.main(__file__, __doc__, errors)
+    of_runs.main(__file__, __doc__ or "", errors)

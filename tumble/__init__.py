@@ -36,6 +36,7 @@ from tumble._lazy import lazily
 
 if TYPE_CHECKING:
     from tumble.actions import evaluate, export_asset, relight, render
+    from tumble.demo import demo_clip
     from tumble.engine import Progress
     from tumble.evaluation import Report
     from tumble.maths import SE3
@@ -62,6 +63,7 @@ __all__ = [
     "SE3",
     "STANDARD",
     "Trajectory",
+    "demo_clip",
     "estimate_poses",
     "evaluate",
     "export_asset",
@@ -76,6 +78,7 @@ __getattr__ = lazily(
     __name__,
     {
         "actions": ("evaluate", "export_asset", "relight", "render"),
+        "demo": ("demo_clip",),
         "engine": ("Progress",),
         "evaluation": ("Report",),
         "maths": ("SE3",),

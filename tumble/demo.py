@@ -26,6 +26,11 @@ def bundled() -> Path:
     return Path(str(resources.files("tumble"))) / "data" / "demo"
 
 
+def demo_clip(out: Path | str) -> Path:
+    """Write the bundled clip as a capture folder without poses, with its truth; returns `out`."""
+    return unpack(Path(out))
+
+
 def unpack(out: Path) -> Path:
     """The bundled clip as a capture folder: its films' frames become pictures. Returns the folder."""
     if (out / "transforms.json").exists():

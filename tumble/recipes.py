@@ -14,17 +14,15 @@ from tumble.poses import progressive, sfm
 
 @dataclass(frozen=True)
 class Recipe:
-    """The configurations of all stages."""
+    """The configurations of all stages; that of another stage puts it in the place of ours."""
 
     matcher: str = "mixed"
     """Of pixels between frames, for captures without poses: a file of `matching`."""
-    track: sfm.Config | progressive.Config = field(default_factory=sfm.Config)
+    track: Any = field(default_factory=sfm.Config)
     """Stage 1, for captures without poses: by the graph route, or by the paper's (`progressive`)."""
-    refine: inverse_rendering.refine.Config = field(default_factory=inverse_rendering.refine.Config)
+    refine: Any = field(default_factory=inverse_rendering.refine.Config)
     """Its pose rate and realignments count where poses are estimated; known ones stay as they are."""
-    decompose: inverse_rendering.decompose.Config | mean_colour_baseline.Config = field(
-        default_factory=inverse_rendering.decompose.Config
-    )
+    decompose: Any = field(default_factory=inverse_rendering.decompose.Config)
     """Of the method, or of the baseline that takes its place."""
     relight: rendering.relight.Config = field(default_factory=rendering.relight.Config)
     seed: int = 0
@@ -137,7 +135,8 @@ QUALITIES = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
 def known_poses(recipe: Recipe) -> Recipe:
     """For captures whose poses are given: they stay as they are."""
     second, third = recipe.refine, recipe.decompose
-    second = replace(second, rates=replace(second.rates, poses=0.0), realignments=0)
+    if isinstance(second, inverse_rendering.refine.Config):
+        second = replace(second, rates=replace(second.rates, poses=0.0), realignments=0)
     if isinstance(third, inverse_rendering.decompose.Config):
         third = replace(third, rates=replace(third.rates, poses=0.0))
     return replace(recipe, refine=second, decompose=third)

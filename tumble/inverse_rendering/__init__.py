@@ -3,7 +3,7 @@
 With their losses, densification, and the baseline that needs no inverse rendering.
 """
 
-from tumble.inverse_rendering import decompose, densify, losses, mean_colour_baseline, refine, specular_fit
+from tumble.inverse_rendering import decompose, densify, losses, mean_colour_baseline, refine, sh_lighting, specular_fit
 from tumble.inverse_rendering.refine import Refined
 
 __all__ = [
@@ -13,5 +13,6 @@ __all__ = [
     "losses",
     "mean_colour_baseline",
     "refine",
+    "sh_lighting",
     "specular_fit",
 ]

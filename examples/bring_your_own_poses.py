@@ -1,0 +1,32 @@
+"""Poses from elsewhere, such as a tracker or a robot's arm: stage 1 is left out, the poses stay as they are.
+
+$ python -m examples.bring_your_own_poses OUT           (minutes on two CPU cores)
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import torch
+
+import tumble
+
+
+def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> tumble.Report:
+    clip = tumble.demo_clip(out / "clip")
+    capture = tumble.read_capture(clip)
+
+    # Camera to object, 4 x 4, OpenGL camera axes; the object lies in the unit ball about the origin.
+    known = json.loads((clip / "truth" / "poses.json").read_text())
+    matrices = torch.tensor([known[name] for name in capture.names])
+    poses = tumble.Trajectory.from_camera_to_object(matrices, light="camera")
+
+    asset = tumble.reconstruct(capture, out / "run", recipe, poses=poses)
+    tumble.export_asset(asset, out / "export", "splat", names=list(capture.names))
+    scores = tumble.evaluate(asset, clip, out=out / "scores", cfg=recipe.relight)
+    print(f"albedo {scores['regions']['shared']['albedo.psnr_fg_srgb']:.1f} dB on the object")
+    return scores
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,35 @@
+"""From a clip to pictures under another light, in Python: what `tumble run` and `tumble relight` do.
+
+$ python -m examples.reconstruct_and_relight OUT        (minutes on two CPU cores)
+"""
+
+import sys
+from pathlib import Path
+
+import tumble
+from tumble.io import files
+from tumble.maths import photograph
+
+
+def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> tumble.Asset:
+    clip = tumble.demo_clip(out / "clip")  # or tumble.film_to_capture("clip.mp4", out / "clip")
+    capture = tumble.read_capture(clip)
+
+    def tell(progress: tumble.Progress) -> None:
+        print(f"{progress.name}: step {progress.step} of {progress.of}, {progress.eta:.0f} s to go")
+
+    found = tumble.estimate_poses(capture, recipe, progress=tell)
+    print(found.quality.sentence)
+    asset = tumble.reconstruct(capture, recipe=recipe, poses=found, progress=tell)
+
+    maps = tumble.render(asset, 0)  # from where the camera saw the first frame
+    files.write_png(out / "albedo.png", photograph(maps.features["albedo"] * maps.alpha[..., None]).numpy())
+    light = tumble.Environment.read(clip / "truth" / "lights" / "sunset.hdr")
+    first = tumble.Trajectory(asset.trajectory.T_cam_obj[:1], light="object")
+    for linear in tumble.relight(asset, light, first, cfg=recipe.relight):
+        files.write_png(out / "sunset.png", photograph(linear).numpy())
+    return asset
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
