@@ -25,7 +25,7 @@ from tumble.datasets import folder
 from tumble.evaluation import metrics
 from tumble.io import tree
 from tumble.maths import fibonacci_sphere, linear_from_srgb, srgb_from_linear
-from tumble.rendering import antialiased, open_sky, prefilter, shade_split, surface
+from tumble.rendering import antialiased, prefilter, shade_split, surface, unoccluded
 from tumble.scene import DIELECTRIC, Asset, env_from_obj
 
 DARK, GRAZING = 0.02, 0.5
@@ -50,7 +50,7 @@ def dark_print(path: Path, run: Path) -> dict[str, Any]:
         inner = -max_pool2d(-truth.foreground[i][None].float(), 5, 1, 2)[0] > 0.5
         pixels = torch.where((inner & (mine.alpha > 0.5)).flatten())[0]
         R_env_obj = env_from_obj(T_cam_obj, truth.trajectory.light)
-        sky = open_sky(fibonacci_sphere(DIRECTIONS), len(pixels))
+        sky = unoccluded(fibonacci_sphere(DIRECTIONS), len(pixels))
         lobes: list[Tensor] = []
         for view, light in zip((exact, mine), lights, strict=True):
             points = surface(view, T_cam_obj, capture.camera, pixels=pixels)

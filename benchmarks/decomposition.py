@@ -20,7 +20,7 @@ from tumble.engine import run as runs
 from tumble.io import files
 from tumble.pipeline import reconstruct
 from tumble.recipes import ABLATIONS, QUALITIES, Recipe
-from tumble.synthetic import NOTE
+from tumble.synthetic import SETTINGS_FILE
 
 KEPT = (
     "albedo.psnr_fg_srgb",
@@ -77,7 +77,7 @@ def measure(capture: Path, run: Path, recipe: Recipe, about: dict[str, Any]) -> 
     seconds = sum({r["name"]: r["seconds"] for r in runs.records(run) if r.get("event") == "done"}.values())
     begun = time.perf_counter()
     report = evaluate_run(run, capture)
-    note = files.read_json(capture / NOTE)
+    note = files.read_json(capture / SETTINGS_FILE)
     regions = {
         region: {key: round(scores[key], 4) for key in KEPT if key in scores}
         for region, scores in report["regions"].items()

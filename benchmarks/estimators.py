@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from tumble.maths import fibonacci_sphere, random_rotation
-from tumble.rendering import Surface, open_sky, prefilter, shade, shade_split
+from tumble.rendering import Surface, prefilter, shade, shade_split, unoccluded
 from tumble.scene import Environment
 
 ROUGHNESS = (0.1, 0.2, 0.3, 0.5, 0.8)
@@ -60,14 +60,14 @@ def errors(environment: Environment, roughness: float) -> dict[str, float]:
     def dense(black: float) -> Tensor:
         total, n = torch.zeros_like(albedo), 1 << (20 if roughness < 0.25 else 17)
         for part in fibonacci_sphere(n).split(1 << 15):
-            sky = open_sky(part, len(albedo))
+            sky = unoccluded(part, len(albedo))
             total += len(part) / n * shade(seen, black * albedo, rough, environment, R, sky, f0=F0)
         return total
 
     truth, specular = dense(1.0), dense(0.0)
     generator, found = torch.Generator().manual_seed(0), {"sum": [], "split": [], "shine": []}
     for _ in range(TURNS):
-        sky = open_sky(fibonacci_sphere(DIRECTIONS) @ random_rotation(generator).mT, len(albedo))
+        sky = unoccluded(fibonacci_sphere(DIRECTIONS) @ random_rotation(generator).mT, len(albedo))
         found["sum"].append(shade(seen, albedo, rough, environment, R, sky, f0=F0))
         found["split"].append(shade_split(seen, albedo, rough, prefiltered, R, sky, f0=F0))
         found["shine"].append(shade_split(seen, 0 * albedo, rough, prefiltered, R, sky, f0=F0))

@@ -87,8 +87,8 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
         tracked = drive(graph, DRAFT.track, graph.gather(capture, matches, DRAFT.matcher), seed=0)
     else:
         recipe = progressive_poses(DRAFT)
-        judged = partial(graph.judged, graph.gather(capture, matches, DRAFT.matcher))
-        tracked = drive(progressive, recipe.track, progressive.gather(capture, matches, judged), seed=0)
+        assess = partial(graph.assess, graph.gather(capture, matches, DRAFT.matcher))
+        tracked = drive(progressive, recipe.track, progressive.gather(capture, matches, assess), seed=0)
     seconds = time.perf_counter() - begun
     health = tracked.quality
     return {

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import tumble
 from tumble.io import files
-from tumble.maths import photograph
+from tumble.maths import to_srgb8
 
 
 def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> tumble.Asset:
-    clip = tumble.demo_clip(out / "clip")  # or tumble.film_to_capture("clip.mp4", out / "clip")
+    clip = tumble.demo_clip(out / "clip")  # or tumble.video_to_capture("clip.mp4", out / "clip")
     capture = tumble.read_capture(clip)
 
     def tell(progress: tumble.Progress) -> None:
@@ -23,11 +23,11 @@ def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> tumble.Asset:
     asset = tumble.reconstruct(capture, recipe=recipe, poses=found, progress=tell)
 
     maps = tumble.render(asset, 0)  # from where the camera saw the first frame
-    files.write_png(out / "albedo.png", photograph(maps.features["albedo"] * maps.alpha[..., None]).numpy())
+    files.write_png(out / "albedo.png", to_srgb8(maps.features["albedo"] * maps.alpha[..., None]).numpy())
     light = tumble.Environment.read(clip / "truth" / "lights" / "sunset.hdr")
     first = tumble.Trajectory(asset.trajectory.T_cam_obj[:1], light="object")
     for linear in tumble.relight(asset, light, first, cfg=recipe.relight):
-        files.write_png(out / "sunset.png", photograph(linear).numpy())
+        files.write_png(out / "sunset.png", to_srgb8(linear).numpy())
     return asset
 
 

@@ -80,7 +80,7 @@ def _cloud(rng: np.random.Generator, sigma: float) -> np.ndarray:
 def _demo(n: int) -> tuple[np.ndarray, np.ndarray]:
     """The first frames of the bundled clip and their coverage in [0, 1], made smaller."""
     clip = [frame for frame, _ in zip(video.read_clip(bundled() / "clip.mp4"), range(n), strict=False)]
-    masks = [files.read_picture(bundled() / "masks" / f"{i:04d}.png")[..., 0] / 255.0 for i in range(n)]
+    masks = [files.read_image(bundled() / "masks" / f"{i:04d}.png")[..., 0] / 255.0 for i in range(n)]
     small = [cv2.resize(f.astype(np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA) for f in clip]
     shares = [cv2.resize(m, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for m in masks]
     # The clip is over black: its border pixels are darkened by their coverage already.

@@ -32,7 +32,7 @@ def short_clip(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_clip_becomes_pictures_under_another_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asset = reconstruct_and_relight.main(tmp_path, RECIPE)
     assert torch.isfinite(asset.environment.radiance).all()
-    assert all(files.read_picture(tmp_path / name).max() > 30 for name in ("albedo.png", "sunset.png"))
+    assert all(files.read_image(tmp_path / name).max() > 30 for name in ("albedo.png", "sunset.png"))
     assert "refine: step 30 of 30" in capsys.readouterr().out
 
 

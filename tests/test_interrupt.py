@@ -311,7 +311,7 @@ def test_lights_of_the_same_name_get_folders_of_their_own(whole: Path, tmp_path:
         Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
     folders = [actions.relight_run(out, light, fast=True) for light in (*lights, lights[0])]
     assert [path.name for path in folders] == ["studio", "studio-2", "studio"]
-    dark = files.read_picture(folders[0] / "0000.png").mean()
+    dark = files.read_image(folders[0] / "0000.png").mean()
     actions.relight_run(out, lights[0], fast=True, exposure=1.0)
-    bright = files.read_picture(folders[0] / "0000.png").mean()
+    bright = files.read_image(folders[0] / "0000.png").mean()
     assert bright > 1.2 * dark

@@ -269,7 +269,7 @@ def test_a_run_can_be_put_under_another_light(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, fast: bool
 ) -> None:
     actions.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
-    pictures = [files.read_picture(path) for path in sorted(tmp_path.iterdir())]
+    pictures = [files.read_image(path) for path in sorted(tmp_path.iterdir())]
     assert len(pictures) == 8
     assert all(0 < picture.mean() < 255 for picture in pictures)
 
@@ -286,7 +286,7 @@ def test_a_turning_object_is_in_the_middle_of_its_film(
     tree.save(dataclasses.replace(finished[1], camera=beside), out / runs.ASSET)
     light = capture / "truth" / "lights" / "sun.hdr"
     for number, run in enumerate((finished[0], out)):
-        actions.film_run(run, light, tmp_path / f"{number}.mp4", fast=True)
+        actions.relight_turntable(run, light, tmp_path / f"{number}.mp4", fast=True)
     films = [np.stack(list(video.read_clip(tmp_path / f"{number}.mp4"))) for number in range(2)]
     assert films[0].max() > 60
     assert (films[0] == films[1]).all()

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from tumble.engine import Progress
     from tumble.evaluation import Report
     from tumble.maths import SE3
-    from tumble.pipeline import estimate_poses, film_to_capture, read_capture, reconstruct
+    from tumble.pipeline import estimate_poses, read_capture, reconstruct, video_to_capture
     from tumble.poses import PoseResult
     from tumble.preprocess import FootageOptions
     from tumble.recipes import DRAFT, PAPER, STANDARD, Recipe
@@ -67,7 +67,7 @@ __all__ = [
     "estimate_poses",
     "evaluate",
     "export_asset",
-    "film_to_capture",
+    "video_to_capture",
     "read_capture",
     "reconstruct",
     "relight",
@@ -82,7 +82,7 @@ __getattr__ = lazily(
         "engine": ("Progress",),
         "evaluation": ("Report",),
         "maths": ("SE3",),
-        "pipeline": ("estimate_poses", "film_to_capture", "read_capture", "reconstruct"),
+        "pipeline": ("estimate_poses", "video_to_capture", "read_capture", "reconstruct"),
         "poses": ("PoseResult",),
         "preprocess": ("FootageOptions",),
         "recipes": ("DRAFT", "PAPER", "STANDARD", "Recipe"),

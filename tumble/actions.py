@@ -22,8 +22,8 @@ from tumble.engine import run
 from tumble.evaluation import Report, Subject, align_views, predict_views, read_subject, score
 from tumble.export import PresetName, write_asset
 from tumble.io import files, named, video
-from tumble.maths import SE3, photograph
-from tumble.preprocess import PROVENANCE, FootageOptions, picked
+from tumble.maths import SE3, to_srgb8
+from tumble.preprocess import PROVENANCE, FootageOptions, pick_box
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased, usable_device
 from tumble.rendering import relight as relighting
@@ -172,7 +172,7 @@ def run_capture(
     """
     place = usable_device(device)
     named("matching", recipe.matcher)  # before a film is cut up for it
-    options = picked(path, options, out / run.CAPTURE) if pick else options
+    options = pick_box(path, options, out / run.CAPTURE) if pick else options
     capture = pipeline.ingested(path, out, options)
     pipeline.reconstruct(capture, out, recipe, poses=poses, device=place)
     return write_report(out, capture=capture)
@@ -254,7 +254,7 @@ def relight_run(out: Path, env: Path, pictures: Path | None = None, *, fast: boo
     pictures = pictures or _relit_folder(out, env)
     n = len(asset.trajectory)
     for number, linear in enumerate(track(views, f"relighting under {env.stem}", n, transient=True)):
-        files.write_png(pictures / f"{number:04}.png", photograph(2**exposure * linear).numpy())
+        files.write_png(pictures / f"{number:04}.png", to_srgb8(2**exposure * linear).numpy())
     return pictures
 
 
@@ -269,7 +269,7 @@ def _relit_folder(out: Path, env: Path) -> Path:
     raise AssertionError("numbers do not end")
 
 
-def film_run(out: Path, env: Path, film: Path, *, fast: bool, exposure: float = 0.0) -> Path:
+def relight_turntable(out: Path, env: Path, film: Path, *, fast: bool, exposure: float = 0.0) -> Path:
     """Write a film of a run's object that turns once about its +y axis under another light; returns its path.
 
     Light and camera stand still; at the first frame the light's frame is the object's.
@@ -290,7 +290,7 @@ def film_run(out: Path, env: Path, film: Path, *, fast: bool, exposure: float = 
     camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     views = relight(asset, light.rotated(R_gl_obj), turning, camera, cfg=cfg, fast=fast)
     frames = track(views, f"turning under {env.stem}", FILM_FRAMES, transient=True)
-    video.write_clip(film, (photograph(2**exposure * linear).cpu().numpy() for linear in frames))
+    video.write_clip(film, (to_srgb8(2**exposure * linear).cpu().numpy() for linear in frames))
     return film
 
 

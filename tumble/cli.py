@@ -71,14 +71,14 @@ def check(
         out: Where the preview of the masks goes; runs/check/NAME when left out.
         pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
     """
-    from tumble.preprocess import PREVIEW, check_footage, go
+    from tumble.preprocess import PREVIEW, check_footage, passes
 
     folder = out or Path("runs/check") / film.stem
     findings = check_footage(film, folder, options, pick=pick)
     for finding in findings:
         mark = {"good": "+", "warn": "!", "stop": "x"}[finding.verdict]
         _say(mark, finding.subject, finding.state, finding.advice, width=10)
-    fit = go(findings)
+    fit = passes(findings)
     print(f"{'GO' if fit else 'NO-GO'}: masks are shown in {folder / PREVIEW}")
     if not fit:
         raise SystemExit(1)
@@ -154,10 +154,10 @@ def relight(
         fast: Prefiltered light without shadows, instead of rays.
         exposure: How much brighter the pictures are than the light makes them [stops].
     """
-    from tumble.actions import film_run, relight_run
+    from tumble.actions import relight_run, relight_turntable
 
     if turntable is not None:
-        print(film_run(run, env, turntable, fast=fast, exposure=exposure))
+        print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure))
     else:
         print(relight_run(run, env, out, fast=fast, exposure=exposure))
 

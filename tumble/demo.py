@@ -64,7 +64,7 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
 
     $ python -c "from tumble.demo import build; build()"
     """
-    from tumble.synthetic import NOTE, SynthOptions, render_capture
+    from tumble.synthetic import SETTINGS_FILE, SynthOptions, render_capture
 
     with tempfile.TemporaryDirectory() as folder_name:
         work = Path(folder_name)
@@ -82,7 +82,7 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
             video=True,
         )
         made = render_capture(work / "pot.glb", work / "capture", options)
-        (made / NOTE).unlink()
+        (made / SETTINGS_FILE).unlink()
         for frame in capture_folder.load(made).names:
             (made / "images" / frame).unlink()
         shutil.rmtree(out, ignore_errors=True)

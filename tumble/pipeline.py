@@ -19,7 +19,7 @@ from tumble.io import BadFile, files, tree
 from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
-from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, kind_of, origin, to_capture
+from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, input_kind, origin, to_capture
 from tumble.recipes import DRAFT, Recipe
 from tumble.scene import Asset, Capture, Trajectory, content_key
 
@@ -33,15 +33,15 @@ def read_capture(path: Path | str) -> Capture:
     """Read the training frames of a capture: a folder of docs/format.md, or another layout that `datasets` knows.
 
     Raises:
-        BadFile: There is no capture, or it breaks a rule. A film has to become one first: `film_to_capture`.
+        BadFile: There is no capture, or it breaks a rule. A film has to become one first: `video_to_capture`.
     """
     path = Path(path)
-    if kind_of(path) in FOOTAGE:
-        raise BadFile(path, "is footage and no capture yet", "tumble.film_to_capture makes one of it")
+    if input_kind(path) in FOOTAGE:
+        raise BadFile(path, "is footage and no capture yet", "tumble.video_to_capture makes one of it")
     return which(path).load(path)
 
 
-def film_to_capture(path: Path | str, out: Path | str, options: FootageOptions | None = None) -> Path:
+def video_to_capture(path: Path | str, out: Path | str, options: FootageOptions | None = None) -> Path:
     """Make a capture folder of a film, a folder of pictures, or one with a COLMAP model; returns `out`.
 
     Raises:
@@ -56,7 +56,7 @@ def ingested(path: Path, out: Path, options: FootageOptions) -> Path:
     Raises:
         BadFile: The footage cannot become a capture, or `out` holds that of other footage or of other options.
     """
-    if kind_of(path) not in FOOTAGE:
+    if input_kind(path) not in FOOTAGE:
         return path
     made = out / run.CAPTURE
     with run.alone(out):
@@ -101,7 +101,7 @@ def reconstruct(
     Frames whose pose is lost are left out of all that follows stage 1.
 
     Args:
-        capture: Read before, or where it is; footage has to become one first (`film_to_capture`).
+        capture: Read before, or where it is; footage has to become one first (`video_to_capture`).
         out: A run directory, where every finished stage is kept, a stopped one goes on from its checkpoint, and
             `asset.safetensors`, `light.exr` and `poses.json` are written. None keeps nothing.
         recipe: All settings. Another stage is a module with a `Config` of its own in the place of ours.
@@ -178,7 +178,7 @@ def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tupl
     try:
         inputs: Any = sfm.gather(capture, matches, recipe.matcher)
         if route is progressive:
-            inputs = progressive.gather(capture, matches, partial(sfm.judged, inputs))
+            inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:
         raise BadFile(where, str(error), "give masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]

@@ -383,7 +383,7 @@ def test_nothing_is_printed_without_a_terminal(capfd: pytest.CaptureFixture[str]
 
 def test_a_preview_lies_beside_the_checkpoint_and_changes_nothing(tmp_path: Path) -> None:
     output = drive(Previewed, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state", every=3)
-    assert files.read_picture(tmp_path / "preview.png").shape == (4, 5, 3)
+    assert files.read_image(tmp_path / "preview.png").shape == (4, 5, 3)
     assert bits(output) == whole()
 
 

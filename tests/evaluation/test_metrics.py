@@ -55,7 +55,7 @@ def test_full_picture_psnr_exceeds_that_of_the_foreground_by_the_share_of_backgr
     """With no error off the object, the two differ by -10 log10(share): why a table must say which one it shows."""
     mask = disc()
     y = GREY * mask[..., None].float().expand(-1, -1, 3)
-    scores = metrics.picture_scores(y * 1.1, y, mask, everywhere(mask), [])
+    scores = metrics.image_scores(y * 1.1, y, mask, everywhere(mask), [])
     share = float(mask.float().mean())
     assert scores["psnr_fg_srgb"] == pytest.approx(-20 * math.log10(0.1 * GREY), abs=1e-4)
     assert scores["psnr_full_srgb"] - scores["psnr_fg_srgb"] == pytest.approx(-10 * math.log10(share), abs=1e-4)
@@ -64,7 +64,7 @@ def test_full_picture_psnr_exceeds_that_of_the_foreground_by_the_share_of_backgr
 def test_ssim_is_that_of_scikit_image_on_picture_and_crop() -> None:
     x, y = pictures()
     mask = disc(radius=4.5)
-    scores = metrics.picture_scores(x, y, mask, everywhere(mask), [])
+    scores = metrics.image_scores(x, y, mask, everywhere(mask), [])
 
     def expected(x: Tensor, y: Tensor) -> float:
         how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
@@ -83,7 +83,7 @@ def test_unknown_pixels_change_no_score() -> None:
     unknown[10:20, 10:50] = True
     spoilt = torch.where(unknown[..., None], 1 - x, x)
     network = lpips.read()
-    before, after = (metrics.picture_scores(p, y, mask & ~unknown, ~unknown, [network]) for p in (x, spoilt))
+    before, after = (metrics.image_scores(p, y, mask & ~unknown, ~unknown, [network]) for p in (x, spoilt))
     assert before == after
 
 

@@ -11,7 +11,7 @@ from tumble.inverse_rendering.self_shadowing import Sky, look_around
 from tumble.inverse_rendering.sh_lighting import CoarseLight
 from tumble.maths import spherical_harmonics
 from tumble.maths.directions import fibonacci_sphere
-from tumble.rendering.trace import open_sky, transfer
+from tumble.rendering.trace import transfer, unoccluded
 from tumble.scene.gaussians import Gaussians
 
 EVEN = CoarseLight.constant(0.4, torch.zeros(1))
@@ -29,7 +29,7 @@ def skies(normals: torch.Tensor, blocked: torch.Tensor) -> Sky:
     directions = fibonacci_sphere(4096)
     cosine = (normals @ directions.T).clamp(min=0) * (directions @ blocked <= 0)
     seen = 4 * math.pi / len(directions) * cosine @ spherical_harmonics.basis(directions, 2)
-    return Sky(seen, transfer([open_sky(directions, len(normals))], normals))
+    return Sky(seen, transfer([unoccluded(directions, len(normals))], normals))
 
 
 def test_half_an_even_sky_is_half_the_light() -> None:

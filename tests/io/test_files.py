@@ -15,8 +15,8 @@ RNG = np.random.default_rng(0)
 def test_png_keeps_every_code_value(tmp_path: Path, channels: int) -> None:
     values = RNG.integers(0, 256, (5, 7, channels), dtype=np.uint8)
     files.write_png(tmp_path / "a" / "x.png", values)
-    assert np.array_equal(files.read_picture(tmp_path / "a" / "x.png"), values)
-    assert files.picture_size(tmp_path / "a" / "x.png") == (5, 7)
+    assert np.array_equal(files.read_image(tmp_path / "a" / "x.png"), values)
+    assert files.image_size(tmp_path / "a" / "x.png") == (5, 7)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -55,7 +55,7 @@ def test_json_has_no_nan_in_either_direction(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["x.exr", "x.hdr", "x.png", "x.json"])
 def test_junk_and_missing_files_are_named(tmp_path: Path, name: str) -> None:
-    read = {".png": files.read_picture, ".json": files.read_json}.get(Path(name).suffix, files.read_radiance)
+    read = {".png": files.read_image, ".json": files.read_json}.get(Path(name).suffix, files.read_radiance)
     with pytest.raises(BadFile, match=f"{name}: is missing"):
         read(tmp_path / name)
     (tmp_path / name).write_bytes(b"\x00junk" * 50)
@@ -71,7 +71,7 @@ def test_a_file_cut_off_in_the_middle_is_refused(tmp_path: Path, name: str) -> N
     )(tmp_path / name, values)
     whole = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(whole[: len(whole) // 2])
-    read = files.read_picture if name.endswith("png") else files.read_radiance
+    read = files.read_image if name.endswith("png") else files.read_radiance
     with pytest.raises(BadFile, match=name):
         read(tmp_path / name)
 
@@ -93,7 +93,7 @@ def test_sixteen_bit_pictures_are_refused_with_the_fix(tmp_path: Path) -> None:
 
     Image.fromarray(np.zeros((2, 2), np.uint16)).save(tmp_path / "x.png")
     with pytest.raises(BadFile, match="8-bit sRGB"):
-        files.read_picture(tmp_path / "x.png")
+        files.read_image(tmp_path / "x.png")
 
 
 @pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x"])

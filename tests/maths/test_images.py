@@ -14,12 +14,12 @@ from tumble.maths.images import (
     edge_aware,
     gradients,
     linear_from_srgb,
-    photograph,
     resize,
     resize_area,
     srgb_from_linear,
     ssim,
     ssim_map,
+    to_srgb8,
 )
 
 DOUBLE = torch.float64
@@ -201,4 +201,4 @@ def test_crop_box_of_an_empty_mask_is_an_error() -> None:
 def test_a_photograph_saturates_and_rounds() -> None:
     linear = torch.tensor([-0.1, 0.0, 0.2158605, 1.0, 7.0])
     # 128 / 255 is 0.502 in sRGB, and ((0.502 + 0.055) / 1.055)^2.4 = 0.21586.
-    assert photograph(linear).tolist() == [0, 0, 128, 255, 255]
+    assert to_srgb8(linear).tolist() == [0, 0, 128, 255, 255]

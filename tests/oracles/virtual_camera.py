@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from tumble.maths.images import linear_from_srgb, photograph
+from tumble.maths.images import linear_from_srgb, to_srgb8
 from tumble.poses.progressive.virtual_camera import Aim, out_of_aim
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND
@@ -26,7 +26,7 @@ def warp_images(images: UInt8[Tensor, "t h w 3"], camera: Camera, aim: Aim) -> U
         at, within = _grid(Aim(aim.R_cam_aim, fine), camera, frame, images.device)
         linear = linear_from_srgb(image.permute(2, 0, 1)[None] / 255)
         light = functional.grid_sample(linear, at, padding_mode="border", align_corners=False) * within
-        warped.append(photograph(functional.avg_pool2d(light, steps)[0].permute(1, 2, 0)))
+        warped.append(to_srgb8(functional.avg_pool2d(light, steps)[0].permute(1, 2, 0)))
     return torch.stack(warped)
 
 

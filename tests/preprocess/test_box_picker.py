@@ -148,11 +148,11 @@ def test_a_run_asks_once_and_then_knows(
     path, box = film(tmp_path), scene().box(3)
     asked = []
     monkeypatch.setattr(box_picker, "ask", lambda frame, tell: asked.append(frame.number) or box)
-    options = box_picker.picked(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
+    options = box_picker.pick_box(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
     assert (options.box, options.at) == (box, 3)
     assert capsys.readouterr().out == f"--box {' '.join(map(str, box))} --at 3\n"
     pipeline.ingested(path, tmp_path / "run", options)
-    again = box_picker.picked(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
+    again = box_picker.pick_box(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
     assert again == options
     assert asked == [3]
     # The same as the words that were said.
@@ -163,11 +163,11 @@ def test_where_masks_or_hints_are_nobody_is_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     with pytest.raises(ValueError, match="--pick asks for what"):
-        box_picker.picked(tmp_path, FootageOptions(box=(0, 0, 9, 9)), tmp_path)
+        box_picker.pick_box(tmp_path, FootageOptions(box=(0, 0, 9, 9)), tmp_path)
     files.write_png(tmp_path / "c" / "images" / "0.png", scene().pictures[0])
     files.write_png(tmp_path / "c" / "masks" / "0.png", scene().object[0][..., None] * np.uint8(255))
     with pytest.raises(BadFile, match="has masks"):
-        box_picker.picked(tmp_path / "c", FootageOptions(), tmp_path / "none")
+        box_picker.pick_box(tmp_path / "c", FootageOptions(), tmp_path / "none")
     monkeypatch.setattr("sys.argv", ["tumble", "check", str(tmp_path / "nowhere"), "--pick"])
     with pytest.raises(SystemExit) as end:
         cli.main()

@@ -11,7 +11,7 @@ from tests.films import scene, written
 from tumble import cli
 from tumble.io import files
 from tumble.preprocess import check as checking
-from tumble.preprocess.check import Finding, check_footage, go
+from tumble.preprocess.check import Finding, check_footage, passes
 from tumble.preprocess.options import FootageOptions
 
 
@@ -27,7 +27,7 @@ OPTIONS = FootageOptions(box=scene().box(), focal=300.0)
 
 def test_a_good_film_is_a_go(tmp_path: Path) -> None:
     found = findings(scene().pictures, tmp_path, OPTIONS)
-    assert go(list(found.values()))
+    assert passes(list(found.values()))
     for subject in ("film", "camera", "masks", "framing", "sharpness", "exposure", "highlights"):
         assert found[subject].verdict == "good", found[subject]
 
@@ -78,7 +78,7 @@ def test_the_command_prints_a_verdict_and_ends_with_it(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    film = written(scene(still=still).pictures, tmp_path / "mein Film.mp4")
+    film = written(scene(still=still).pictures, tmp_path / "mein Video.mp4")
     box = [str(v) for v in scene().box()]
     words = ["tumble", "check", str(film), "--box", *box, "--focal", "300", "-o", str(tmp_path / "o")]
     monkeypatch.setattr(sys, "argv", words)

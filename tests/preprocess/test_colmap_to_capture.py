@@ -22,7 +22,7 @@ from tumble.io import files
 from tumble.io.files import BadFile
 from tumble.preprocess import check, colmap_to_capture
 from tumble.preprocess.options import FootageOptions
-from tumble.preprocess.source import kind_of
+from tumble.preprocess.source import input_kind
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
 CENTRE, UNIT = np.array([3.0, -1.0, 7.0]), 2.5
@@ -288,6 +288,6 @@ def test_a_broken_folder_is_refused_by_file_and_rule(name: str, tmp_path: Path) 
 
 def test_a_capture_folder_with_a_model_beside_it_is_a_capture(tmp_path: Path) -> None:
     path = write(tmp_path)
-    assert kind_of(path) == "posed pictures"
+    assert input_kind(path) == "posed pictures"
     (path / folder.TRANSFORMS).write_text(json.dumps({}))
-    assert kind_of(path) == "capture"
+    assert input_kind(path) == "capture"

@@ -76,7 +76,7 @@ def test_pictures_are_turned_upright(tmp_path: Path, orientation: int) -> None:
 
 
 def test_masks_of_a_film_are_one_per_frame_in_order(tmp_path: Path) -> None:
-    film = tmp_path / "ein Film.mp4"
+    film = tmp_path / "ein Video.mp4"
     video.write_clip(film, [CORNERS] * 3)
     for i in range(3):
         files.write_png(tmp_path / "m" / f"{i}.png", np.full((66, 80, 1), 255 * (i == 1), np.uint8))

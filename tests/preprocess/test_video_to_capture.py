@@ -23,7 +23,7 @@ SHOWN = FootageOptions(box=scene().box())
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A film, in a folder with a difficult name, and its capture."""
     root = tmp_path_factory.mktemp("drei Dinge – ä")
-    film = written(scene().pictures, root / "mein Film.mp4")
+    film = written(scene().pictures, root / "mein Video.mp4")
     return film, video_to_capture.capture_from_video(
         film, root / "capture", FootageOptions(box=scene().box(), focal=300.0)
     )
@@ -36,7 +36,7 @@ def test_a_capture_can_be_loaded_and_has_no_poses(made: tuple[Path, Path]) -> No
     assert len(capture) >= 8
     assert (made[1] / video_to_capture.PREVIEW).is_file()
     assert len(list(video.read_clip(made[1] / video_to_capture.PREVIEW))) == 20
-    assert sorted(p.name for p in made[1].parent.iterdir()) == ["capture", "mein Film.mp4"]
+    assert sorted(p.name for p in made[1].parent.iterdir()) == ["capture", "mein Video.mp4"]
 
 
 def test_pixels_masks_and_principal_point_belong_together(made: tuple[Path, Path]) -> None:

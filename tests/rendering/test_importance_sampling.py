@@ -13,7 +13,7 @@ from tumble.rendering import importance_sampling, shading
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import rasterize
 from tumble.rendering.shading import Bounce
-from tumble.rendering.trace import build, open_sky
+from tumble.rendering.trace import build, unoccluded
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
 
@@ -30,7 +30,7 @@ def quadrature(seen: shading.Surface, roughness: float, environment: Environment
     """Both lobes over 2^17 even directions, nothing in the way."""
     total, n = torch.zeros_like(seen.points), 1 << 17
     for directions in fibonacci_sphere(n).split(1 << 14):
-        sky = open_sky(directions, len(seen.pixels))
+        sky = unoccluded(directions, len(seen.pixels))
         part = shading.shade(seen, *grey(seen, 0.5, roughness), environment, R_env_obj, sky, f0=F0)
         total += len(directions) / n * part
     return total

@@ -15,7 +15,7 @@ from tumble.rendering import brdf, importance_sampling, shading
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import rasterize
 from tumble.rendering.shading import Bounce, Surface
-from tumble.rendering.trace import Visibility, build, open_sky, transfer, visibility
+from tumble.rendering.trace import Visibility, build, transfer, unoccluded, visibility
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
@@ -88,7 +88,7 @@ def test_chosen_pixels_are_those_of_the_whole() -> None:
 
 def test_chalk_in_a_uniform_light_sends_back_its_albedo() -> None:
     seen = ball(400)
-    found = shading.diffuse(seen, grey(seen)[0], uniform(2.0), torch.eye(3), open_sky(fibonacci_sphere(2048), 200))
+    found = shading.diffuse(seen, grey(seen)[0], uniform(2.0), torch.eye(3), unoccluded(fibonacci_sphere(2048), 200))
     # 2048 directions resolve a cosine to a few parts in ten thousand.
     torch.testing.assert_close(found, torch.full((200, 3), 1.0), rtol=2e-3, atol=0)
 
@@ -98,7 +98,7 @@ def test_an_eye_behind_the_surface_sees_the_diffuse_lobe_alone() -> None:
     torch.manual_seed(0)
     seen, directions = ball(400, torch.float64), fibonacci_sphere(256, dtype=torch.float64)
     environment = Environment(torch.randn(8, 16, 3, dtype=torch.float64))
-    found = shading.diffuse(seen, grey(seen)[0], environment, torch.eye(3).double(), open_sky(directions, 200))
+    found = shading.diffuse(seen, grey(seen)[0], environment, torch.eye(3).double(), unoccluded(directions, 200))
     cosine = (seen.normals @ directions.T).clamp(min=0)
     expected = 0.5 / math.pi * 4 * math.pi / 256 * cosine @ environment.lookup(directions)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
@@ -110,7 +110,7 @@ def test_both_estimators_know_the_reflectance_of_a_uniform_light(roughness: floa
     albedo, rough = grey(seen, 0.0, roughness)
     nov = (seen.normals * seen.views).sum(-1, keepdim=True)
     expected = F0 * brdf.split_sum(brdf.split_sum_table(), nov, rough)
-    sky, R = open_sky(fibonacci_sphere(1 << 14), 200), torch.eye(3)
+    sky, R = unoccluded(fibonacci_sphere(1 << 14), 200), torch.eye(3)
     summed = shading.shade(seen, albedo, rough, uniform(), R, sky, f0=F0)
     split = shading.shade_split(seen, albedo, rough, prefilter(uniform()), R, sky, f0=F0)
     # The table is bilinear on 64 entries; 16384 directions resolve a lobe of roughness 0.3 to a percent.
@@ -123,7 +123,7 @@ def test_the_split_sum_shows_a_smooth_mirror_the_light_itself() -> None:
     environment = lamp([0.3, 0.5, 0.8], 0.5)
     _, rough = grey(seen, 0.0, 0.05)
     R = random_rotation(torch.Generator().manual_seed(0))
-    sky = open_sky(fibonacci_sphere(64), 50)
+    sky = unoccluded(fibonacci_sphere(64), 50)
     albedo = torch.zeros(50, 3)
     found = shading.shade_split(seen, albedo, rough, prefilter(environment), R, sky, f0=0.04)
     mirrored = 2 * (seen.normals * seen.views).sum(-1, keepdim=True) * seen.normals - seen.views
@@ -149,7 +149,7 @@ def test_a_white_torus_that_bounces_light_vanishes_in_a_white_furnace() -> None:
 def test_a_shadow_dims_the_mirror_that_shows_it() -> None:
     """Half of the sky is closed: mirrors that look into the one half keep their light, the others lose it."""
     seen, directions = ball(800), fibonacci_sphere(256)
-    bits = open_sky(directions, 400).bits.clone()
+    bits = unoccluded(directions, 400).bits.clone()
     closed = directions[:, 0] < 0
     for j in torch.where(closed)[0].tolist():
         bits[:, j // 32] &= ~(1 << (j % 32)) if j % 32 < 31 else 0x7FFFFFFF
@@ -200,7 +200,7 @@ def test_gradients_reach_surface_material_light_and_rotation() -> None:
 
     def split(*x: Tensor) -> Tensor:
         surface = Surface(seen.pixels, seen.points, x[0], x[1])
-        R_env_obj, sky = (SO3.exp(x[5]) @ turned).matrix(), open_sky(directions, 8)
+        R_env_obj, sky = (SO3.exp(x[5]) @ turned).matrix(), unoccluded(directions, 8)
         return shading.shade_split(surface, x[2], x[3], prefilter(Environment(x[4])), R_env_obj, sky, f0=F0)
 
     inputs = [x.clone().requires_grad_() for x in inputs]
@@ -210,7 +210,7 @@ def test_gradients_reach_surface_material_light_and_rotation() -> None:
 
 
 def test_shading_in_parts_is_shading_at_once() -> None:
-    seen, sky = ball(800), open_sky(fibonacci_sphere(128), 400)
+    seen, sky = ball(800), unoccluded(fibonacci_sphere(128), 400)
     albedo, rough = grey(seen)
     environment, R = lamp([0.3, 0.5, 0.8]), torch.eye(3)
     whole = shading.shade(seen, albedo, rough, environment, R, sky, f0=F0)
@@ -229,7 +229,7 @@ def albedo_gradient(environment: Environment, trajectory: Trajectory) -> Tensor:
     seen = ball(200)
     albedo = grey(seen)[0].requires_grad_()
     truth = grey(seen, 0.3)[0]
-    sky = open_sky(fibonacci_sphere(512), 100)
+    sky = unoccluded(fibonacci_sphere(512), 100)
     loss = torch.zeros(())
     for R_env_obj in trajectory.R_env_obj:
         found, wanted = (shading.diffuse(seen, x, environment, R_env_obj, sky) for x in (albedo, truth))
@@ -285,7 +285,9 @@ def real_light(shared_data: Any) -> Environment:
     return Environment.read(shared_data / "hdri" / "venice_sunset_1k.hdr").resampled(64, 128)
 
 
-def judged(shape: str, environment: Environment, albedo: float = 0.6, depth: int = 2) -> tuple[Tensor, Tensor, Tensor]:
+def compared(
+    shape: str, environment: Environment, albedo: float = 0.6, depth: int = 2
+) -> tuple[Tensor, Tensor, Tensor]:
     """Our picture, Mitsuba's of the same mesh and BRDF, and where the geometry of both agrees; with all light between
     parts of the object, or with direct light alone at depth 2."""
     from tests.rendering import mitsuba_brdf
@@ -332,7 +334,7 @@ def test_a_path_tracer_agrees_to_three_percent(shape: str, light: str, shared_da
     """Direct light with shadows, the same BRDF written a second time for Mitsuba."""
     # In the object frame the lamp stands low at +x: one side of the torus lies in the shade of the other.
     lights = {"constant": uniform, "lamp": lambda: lamp([0.87, 0.28, -0.41]), "real": lambda: real_light(shared_data)}
-    ours, truth, agree = judged(shape, lights[light]())
+    ours, truth, agree = compared(shape, lights[light]())
     assert agree.sum() > 1000
     assert rms((ours - truth)[agree]) < 0.03 * rms(truth[agree])
 
@@ -342,7 +344,7 @@ def test_a_path_tracer_agrees_to_three_percent(shape: str, light: str, shared_da
 def test_light_between_parts_is_that_of_a_path_tracer(albedo: float, shared_data: Any) -> None:
     """All bounces. Lit from everywhere, what stands in the way would send on 1.13 times as much at albedo 0.3."""
     light = real_light(shared_data)
-    (ours, truth, agree), (direct, lit, _) = judged("torus", light, albedo, 12), judged("torus", light, albedo)
+    (ours, truth, agree), (direct, lit, _) = compared("torus", light, albedo, 12), compared("torus", light, albedo)
     found, between = (ours - direct)[agree], (truth - lit)[agree]
     assert found.mean().item() == pytest.approx(between.mean().item(), rel=0.07)
     assert rms(found - between) < 0.2 * rms(between)
@@ -366,12 +368,12 @@ def test_a_wide_lobe_is_that_of_the_path_tracer(theta: float) -> None:
     # The sky is bright towards +x, where the mirror image of the eye is not, and behind it where it is.
     sky = 1 + 0.9 * -w[:, 0]
     above = w[:, 2] > 0
-    judged = [np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*d))).ravel()[0] for d in w[above].tolist()]
-    truth = float((torch.tensor(judged) * sky[above]).sum() * 4 * math.pi / len(w))
+    compared = [np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*d))).ravel()[0] for d in w[above].tolist()]
+    truth = float((torch.tensor(compared) * sky[above]).sum() * 4 * math.pi / len(w))
 
     environment = Environment.from_radiance((1 - 0.9 * texel_directions(32, 64)[..., :1]).expand(32, 64, 3))
     eye = torch.tensor([[math.sin(theta), 0.0, math.cos(theta)]])
     point = Surface(torch.zeros(1, dtype=torch.long), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), eye)
     black, rough, sky_of = torch.zeros(1, 3), torch.full((1, 1), 0.5), prefilter(environment)
-    ours = shading.shade_split(point, black, rough, sky_of, torch.eye(3), open_sky(w.float(), 1), f0=F0)
+    ours = shading.shade_split(point, black, rough, sky_of, torch.eye(3), unoccluded(w.float(), 1), f0=F0)
     assert ours[0, 0].item() == pytest.approx(truth, rel=0.02)

@@ -98,7 +98,7 @@ def test_bits_lie_where_the_contract_says() -> None:
 
 
 def test_an_open_sky_hides_nothing() -> None:
-    sky = tracing.open_sky(fibonacci_sphere(70), 3)
+    sky = tracing.unoccluded(fibonacci_sphere(70), 3)
     assert sky.bits.shape == (3, 3)
     assert sky.unpacked().shape == (3, 70)
     assert sky.unpacked().all()
@@ -175,10 +175,10 @@ def test_transfer_is_the_irradiance_of_what_is_seen() -> None:
         [sum((1 << j) - (1 << 32) * (j == 31) for j in range(32) if word[j]) for word in bright.unflatten(0, (-1, 32))]
     )
     half = tracing.Visibility(directions, closed.int().expand(9, -1), None)
-    for sky, seen in ((tracing.open_sky(directions, 9), torch.ones(4096)), (half, bright.float())):
+    for sky, seen in ((tracing.unoccluded(directions, 9), torch.ones(4096)), (half, bright.float())):
         truth = 4 * math.pi / 4096 * (cosine * seen) @ light
         torch.testing.assert_close(tracing.transfer([sky], normals) @ coefficients, truth, atol=1e-3, rtol=0)
-    opened = tracing.transfer([tracing.open_sky(directions, 9)], normals) @ coefficients
+    opened = tracing.transfer([tracing.unoccluded(directions, 9)], normals) @ coefficients
     series = spherical_harmonics.series(irradiance_coefficients(coefficients), normals)
     torch.testing.assert_close(opened, series, atol=0.01, rtol=0)
 

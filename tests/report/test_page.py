@@ -20,7 +20,7 @@ from tests.surfaces import sphere
 from tumble.export import asset as export
 from tumble.export import confidence
 from tumble.io.files import BadFile
-from tumble.maths.images import linear_from_srgb, photograph, srgb_from_linear
+from tumble.maths.images import linear_from_srgb, srgb_from_linear, to_srgb8
 from tumble.maths.se3 import SE3
 from tumble.poses.result import Observability, PoseQuality
 from tumble.report import health_card, preset_lights, svg, training_views
@@ -68,7 +68,7 @@ def capture(asset: Asset) -> Capture:
     images, masks = [], []
     for number in range(N):
         linear, view = training_views.render(scene, number, asset.camera)
-        images.append(photograph(linear))
+        images.append(to_srgb8(linear))
         masks.append(torch.where(view.alpha >= 0.5, OBJECT, BACKGROUND).to(torch.uint8))
     names = tuple(f"{i:04}.png" for i in range(N))
     return Capture(torch.stack(images), torch.stack(masks), asset.camera, names, "camera", asset.trajectory)

@@ -334,7 +334,7 @@ def test_the_written_light_is_the_light_of_the_photographs(captures: dict[str, P
     pose = SE3(capture.trajectory.T_cam_obj.wxyz[1], capture.trajectory.T_cam_obj.xyz[1])
     pixels, _ = pathtracer.radiance(scene, pose, capture.camera, capture.trajectory.R_env_obj[1], samples=64, seed=5)
     solid = capture.masks[1].numpy() == 255
-    error = images.photograph(torch.from_numpy(pixels)).numpy()[solid].astype(float) - capture.images[1].numpy()[solid]
+    error = images.to_srgb8(torch.from_numpy(pixels)).numpy()[solid].astype(float) - capture.images[1].numpy()[solid]
     # Sixteen samples a pixel leave noise of some code values, and no bias.
     assert abs(error.mean()) < 1.5
     assert np.abs(error).mean() < 12
@@ -378,7 +378,7 @@ def test_a_pose_free_film_under_a_white_light(pebble: Path, tmp_path: Path) -> N
     # mix with the background, so they are left out.
     solid = -torch.nn.functional.max_pool2d(-(truth.masks == 255).float(), 3, 1, 1) == 1
     light = truth.light.radiance[0, 0]
-    expected = images.photograph(truth.albedo[solid] * light).numpy()
+    expected = images.to_srgb8(truth.albedo[solid] * light).numpy()
     assert np.abs(expected.astype(float) - truth.images[solid].numpy()).mean() < 2
 
 

@@ -14,7 +14,7 @@ from tumble.scene import BACKGROUND, Camera, Capture, Light
 def camera(K: np.ndarray, picture: Path) -> Camera:
     """The camera of a matrix that puts the centre of the first pixel at (0, 0), as OpenCV does, and of a picture."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
-    return Camera(torch.tensor([fx, fy, cx, cy]).float(), *files.picture_size(picture))
+    return Camera(torch.tensor([fx, fy, cx, cy]).float(), *files.image_size(picture))
 
 
 def capture(
@@ -37,7 +37,7 @@ def capture(
 
 
 def _photograph(path: Path, mask: UInt8[np.ndarray, "h w"], camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
-    pixels = files.read_picture(path)
+    pixels = files.read_image(path)
     for shape, what in ((pixels.shape[:2], "is"), (mask.shape, "has a mask of")):
         if shape != (camera.height, camera.width):
             found = f"{what} {shape[1]} x {shape[0]} pixels"

@@ -114,9 +114,9 @@ def _picture(root: Path, frame: int) -> Path:
 
 def _mask(root: Path, frame: int, place: int) -> UInt8[np.ndarray, "h w"]:
     name = f"{frame:06}_{place:06}.png"
-    visible = files.read_picture(root / "mask_visib" / name)[..., 0] > 0
+    visible = files.read_image(root / "mask_visib" / name)[..., 0] > 0
     whole = root / "mask" / name
-    hidden = files.read_picture(whole)[..., 0] > 0 if whole.exists() else visible
+    hidden = files.read_image(whole)[..., 0] > 0 if whole.exists() else visible
     if hidden.shape != visible.shape:
         raise BadFile(whole, "is not of the size of the one in mask_visib/")
     return np.select([visible, hidden], [OBJECT, UNKNOWN], BACKGROUND).astype(np.uint8)

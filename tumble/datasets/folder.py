@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from tumble.io import BadFile, files
-from tumble.maths import linear_from_srgb, photograph
+from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.scene import (
     BACKGROUND,
     LIGHTS,
@@ -167,7 +167,7 @@ class _Lens:
 def _lens(document: _Document, frame: dict[str, Any]) -> _Lens:
     _same_intrinsics(document)
     image = _image_path(document, frame)
-    height, width = files.picture_size(image)
+    height, width = files.image_size(image)
     for name, value in (("w", width), ("h", height)):
         if (stated := _number(document, frame, name)) is not None and stated != value:
             raise BadFile(image, f"is {width} x {height} pixels, {TRANSFORMS} says {name} = {stated:g}")
@@ -223,14 +223,14 @@ def _photographs(
 
 def _photograph(document: _Document, frame: dict[str, Any], lens: _Lens) -> tuple[np.ndarray, np.ndarray]:
     path = _image_path(document, frame)
-    picture = _sized(files.read_picture(path), path, lens.camera)
+    picture = _sized(files.read_image(path), path, lens.camera)
     image = np.repeat(picture, 3, 2) if picture.shape[2] == 1 else picture[..., :3]
     mask = np.full(picture.shape[:2], OBJECT, np.uint8)
     if picture.shape[2] == 4:
         image, mask = over_black(picture), mask_from_alpha(picture[..., 3])
     if "mask_path" in frame:
         mask_path = files.inside(document.root, frame["mask_path"])
-        mask = three_valued(_sized(files.read_picture(mask_path), mask_path, lens.camera)[..., 0], mask_path)
+        mask = three_valued(_sized(files.read_image(mask_path), mask_path, lens.camera)[..., 0], mask_path)
         image = cut_out(image, mask)
     if lens.undistort is not None:
         image, mask = lens.undistort(image, cv2.INTER_LINEAR), lens.undistort(mask, cv2.INTER_NEAREST)
@@ -250,7 +250,7 @@ def _sized(pixels: np.ndarray, path: Path, camera: Camera) -> np.ndarray:
 def over_black(rgba: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """Straight sRGB colour with alpha, composited over black in linear light, back to sRGB code values."""
     linear = linear_from_srgb(torch.from_numpy(rgba[..., :3] / 255.0)) * torch.from_numpy(rgba[..., 3:] / 255.0)
-    return photograph(linear).numpy()
+    return to_srgb8(linear).numpy()
 
 
 def cut_out(image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -387,7 +387,7 @@ def _light_names(document: _Document, frames: list[dict[str, Any]]) -> list[str]
 
 def _relit(document: _Document, frames: list[dict[str, Any]], light: str, camera: Camera) -> Tensor:
     paths = [_truth_path(document, f, f"relit/{light}", f.get("relit", {}).get(light)) for f in frames]
-    return torch.from_numpy(np.stack([_sized(files.read_picture(path), path, camera)[..., :3] for path in paths]))
+    return torch.from_numpy(np.stack([_sized(files.read_image(path), path, camera)[..., :3] for path in paths]))
 
 
 def _light(document: _Document) -> Environment | None:

@@ -142,13 +142,13 @@ def _mask(root: Path, picture: Path) -> UInt8[np.ndarray, "h w"] | None:
     seg = root / "seg" / f"{picture.stem}.png"
     mask = None
     if own.exists():
-        values = files.read_picture(own)[..., 0]
+        values = files.read_image(own)[..., 0]
         mask = three_valued(values, own) if values.any() else values
     elif (path := tracked / root.name / f"{int(picture.stem):05}.png").exists():
         hand = tracked / f"{root.name}_hand" / f"{int(picture.stem):04}.png"
-        mask = _from_parts(files.read_picture(path), files.read_picture(hand) if hand.exists() else None)
+        mask = _from_parts(files.read_image(path), files.read_image(hand) if hand.exists() else None)
     elif seg.exists():
-        mask = _from_colours(files.read_picture(seg), picture)
+        mask = _from_colours(files.read_image(seg), picture)
     return mask if mask is not None and (mask == OBJECT).any() else None
 
 
@@ -163,7 +163,7 @@ def _from_colours(seg: UInt8[np.ndarray, "h w c"], picture: Path) -> UInt8[np.nd
     """Green as object, blue as unknown, both enlarged to the picture's size; what lies between is unknown."""
     if seg.shape[2] < 3:
         raise BadFile(picture, "has a segmentation without colours", "green is object, blue is hand")
-    height, width = files.picture_size(picture)
+    height, width = files.image_size(picture)
     # Pixels are areas for cv2.resize: it keeps their edges where they are.
     large = cv2.resize(seg[..., 1:3], (width, height), interpolation=cv2.INTER_LINEAR)
     mask = mask_from_alpha(large[..., 0])

@@ -262,7 +262,7 @@ def _view_scores(
         scores.update({f"{part}.{key}": value for key, value in values.items()})
 
     def pictures(x: Tensor, y: Tensor) -> dict[str, float]:
-        return metrics.picture_scores(x[i] / 255, y[i] / 255, foreground, counted, networks)
+        return metrics.image_scores(x[i] / 255, y[i] / 255, foreground, counted, networks)
 
     if predicted.albedo is not None and truth.albedo is not None and scale is not None:
         assert predicted.silhouettes is not None, "albedo tells where the object is"

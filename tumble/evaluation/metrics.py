@@ -77,7 +77,7 @@ def iou(x: Bool[Tensor, "h w"], y: Bool[Tensor, "h w"], counted: Bool[Tensor, "h
     return float(mask_iou(x, y, counted)) if bool(((x | y) & counted).any()) else 1.0
 
 
-def picture_scores(
+def image_scores(
     x: Float[Tensor, "h w 3"],
     y: Float[Tensor, "h w 3"],
     foreground: Bool[Tensor, "h w"],
@@ -145,7 +145,7 @@ def albedo_scores(
     scaled, unscaled, truth = (a.clamp(0, 1) for a in (predicted * scale, predicted, truth))
     shown = scaled * silhouette[..., None]
     return {
-        **picture_scores(srgb_from_linear(shown), srgb_from_linear(truth), foreground, counted, networks),
+        **image_scores(srgb_from_linear(shown), srgb_from_linear(truth), foreground, counted, networks),
         "psnr_fg_srgb": psnr(srgb_from_linear(scaled), srgb_from_linear(truth), foreground),
         "psnr_fg_linear": psnr(scaled, truth, foreground),
         "psnr_full_linear": psnr(shown, truth, counted),

@@ -191,11 +191,11 @@ def _roughness(path: Path) -> np.ndarray:
 
 
 def _mask(path: Path) -> np.ndarray:
-    return _channels(path, files.read_picture(path), 1)
+    return _channels(path, files.read_image(path), 1)
 
 
 def _picture(path: Path) -> np.ndarray:
-    return _channels(path, files.read_picture(path), 3)
+    return _channels(path, files.read_image(path), 3)
 
 
 def _read_poses(path: Path, capture: Capture) -> tuple[tuple[str, ...], Trajectory | None]:

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from tumble.evaluation import metrics
 from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
-from tumble.maths import SO3, photograph
+from tumble.maths import SO3, to_srgb8
 from tumble.rendering import antialiased, relight
 from tumble.scene import Asset, Capture, Environment, Trajectory, Truth
 
@@ -130,4 +130,4 @@ def _pictures(
     cfg: relight.Config, asset: Asset, light: Environment, views: Trajectory, capture: Capture
 ) -> UInt8[Tensor, "v h w 3"]:
     linear = torch.stack(list(relight.relight(cfg, asset, light, views, capture.camera)))
-    return photograph(linear)
+    return to_srgb8(linear)

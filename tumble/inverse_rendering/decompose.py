@@ -27,14 +27,14 @@ from tumble.rendering import (
     Visibility,
     buffers_of,
     build,
-    moved,
-    open_sky,
+    displacement,
     prefilter,
     shade_split,
     surface,
     surface_points,
     threads_for_kernels,
     transfer,
+    unoccluded,
     visibility,
 )
 from tumble.scene import (
@@ -266,7 +266,7 @@ def _look_again(cfg: Config, inputs: Inputs, state: State) -> None:
     if not cfg.visibility or state.step < cfg.warmup or state.step % LOOK_EVERY:
         return
     traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
-    if moved(traced, state.params.gaussians) > MOVED:
+    if displacement(traced, state.params.gaussians) > MOVED:
         _look_around(cfg, inputs, state)
 
 
@@ -367,7 +367,7 @@ def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:
     memory, which = state.memory, state.step % cfg.sets
     directions = memory["directions"][which]
     if not cfg.visibility:
-        return open_sky(directions, len(index))
+        return unoccluded(directions, len(index))
     blocker = memory["blocker"][which] if cfg.bounce != "none" else None
     return Visibility(directions, memory["bits"][which], blocker).gather(index)
 

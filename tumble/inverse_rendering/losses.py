@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from tumble.maths import SE3, edge_aware, planes, srgb_from_linear, ssim_map
+from tumble.maths import SE3, channels_first, edge_aware, srgb_from_linear, ssim_map
 from tumble.rendering import Buffers
 from tumble.scene import Camera, Gaussians
 
@@ -98,7 +98,7 @@ def normal_consistency(
             round off or fill.
     """
     # One plane per axis: sums over short rows are slow.
-    a, b = planes(normal), planes(from_depth)
+    a, b = channels_first(normal), channels_first(from_depth)
     cosine = (a * b).sum(0) / a.square().sum(0).clamp_min(1e-24).sqrt()
     apart = 1 - cosine
     return (apart / (1 + crease * apart) * known).mean()

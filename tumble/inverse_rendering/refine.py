@@ -18,7 +18,7 @@ from tumble.inverse_rendering import densify, losses, sh_lighting
 from tumble.inverse_rendering.photometric_alignment import realign
 from tumble.inverse_rendering.self_shadowing import Sky, look_around
 from tumble.inverse_rendering.sh_lighting import CoarseLight
-from tumble.maths import SE3, crop, crop_box, planes
+from tumble.maths import SE3, channels_first, crop, crop_box
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
     Camera,
@@ -317,9 +317,11 @@ def _window(view: Buffers, truth: TargetView, camera: Camera) -> tuple[Buffers, 
     cut = replace(
         view,
         **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
-        rgb=planes(crop(view.rgb, box)).movedim(0, -1),
+        rgb=channels_first(crop(view.rgb, box)).movedim(0, -1),
     )
-    seen = TargetView(planes(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box))
+    seen = TargetView(
+        channels_first(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box)
+    )
     return cut, seen, camera.cropped(*box), box[2] * box[3] / shown.numel()
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tumble.inverse_rendering.sh_lighting import CoarseLight
 from tumble.maths import SE3, fibonacci_sphere, spherical_harmonics
-from tumble.rendering import build, in_own_shade, open_sky, surface_points, transfer, visibility
+from tumble.rendering import build, self_shadowed_irradiance, surface_points, transfer, unoccluded, visibility
 from tumble.scene import Camera, Gaussians
 
 DIRECTIONS = 256
@@ -44,7 +44,7 @@ class Sky:
         radiance = light.glossy(directions @ R_env_obj.mT)
         coefficients = projection @ radiance
         floor = FLOOR * math.pi * radiance.mean(0)
-        shaded, whole = (in_own_shade(t, coefficients, albedo) + floor for t in (self.seen, self.whole))
+        shaded, whole = (self_shadowed_irradiance(t, coefficients, albedo) + floor for t in (self.seen, self.whole))
         return (shaded / whole.clamp_min(1e-12)).clamp_max(BRIGHTEST)
 
 
@@ -66,4 +66,4 @@ def look_around(gaussians: Gaussians, gamma: Float[Tensor, ""], poses: Sequence[
     points, normals = surface_points(gaussians, gamma, poses, camera), gaussians.normals
     directions = fibonacci_sphere(DIRECTIONS).to(points)
     seen = visibility(build(gaussians, gamma), points, normals, directions)
-    return Sky(transfer([seen], normals), transfer([open_sky(directions, len(points))], normals))
+    return Sky(transfer([seen], normals), transfer([unoccluded(directions, len(points))], normals))

@@ -139,13 +139,13 @@ def write_json(path: Path, document: Any) -> None:
     write_whole(path, lambda partial: partial.write_text(text + "\n", "utf-8"))
 
 
-def picture_size(path: Path) -> tuple[int, int]:
+def image_size(path: Path) -> tuple[int, int]:
     """Height and width of an 8-bit picture, without decoding it."""
     with _open(path) as picture:
         return picture.height, picture.width
 
 
-def read_picture(path: Path) -> UInt8[np.ndarray, "h w c"]:
+def read_image(path: Path) -> UInt8[np.ndarray, "h w c"]:
     """Code values of an 8-bit PNG or JPEG: 1, 3 or 4 channels as stored (a palette becomes RGB or RGBA)."""
     with _open(path) as picture:
         if picture.mode in ("I", "F") or picture.mode.startswith("I;16"):

@@ -31,7 +31,7 @@ KEPT_SHARE = 0.9
 
 
 @dataclass(frozen=True)
-class Film:
+class Video:
     """What a film's header says."""
 
     n_frames: int
@@ -105,7 +105,7 @@ def timed_frames(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]
         raise BadFile(path, f"is cut off: it holds {number} of {announced} frames", "copy it again from the camera")
 
 
-def probe(path: Path) -> Film:
+def probe(path: Path) -> Video:
     """What the header of a film says, without decoding it.
 
     Raises:
@@ -121,7 +121,7 @@ def probe(path: Path) -> Film:
             codec = stream.codec_context
             hdr = HDR_CURVES.get(int(codec.color_trc))
             tags = {**film.metadata, **stream.metadata}
-            return Film(stream.frames, codec.width, codec.height, codec.name, hdr, tags)
+            return Video(stream.frames, codec.width, codec.height, codec.name, hdr, tags)
     except av.error.FFmpegError as error:
         raise BadFile(path, f"is not a readable film: {error}", "tumble reads mp4, mov, mkv, webm") from None
 

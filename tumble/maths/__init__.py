@@ -17,17 +17,17 @@ from tumble.maths.directions import (
 )
 from tumble.maths.images import (
     Box,
+    channels_first,
     crop,
     crop_box,
     edge_aware,
     iou,
     linear_from_srgb,
-    photograph,
-    planes,
     resize_area,
     srgb_from_linear,
     ssim,
     ssim_map,
+    to_srgb8,
 )
 from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, rowwise
 from tumble.maths.points import nearest, smallest_ball
@@ -54,8 +54,8 @@ __all__ = [
     "mean_rotation",
     "minimise",
     "nearest",
-    "photograph",
-    "planes",
+    "to_srgb8",
+    "channels_first",
     "random_rotation",
     "reflect",
     "resize_area",

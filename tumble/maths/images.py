@@ -49,7 +49,7 @@ def linear_from_srgb(srgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     return torch.where(srgb <= SRGB_KNEE, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def photograph(linear: Float[Tensor, "*b"]) -> UInt8[Tensor, "*b"]:
+def to_srgb8(linear: Float[Tensor, "*b"]) -> UInt8[Tensor, "*b"]:
     """What a camera stores of linear values: saturated at 1, along the sRGB curve, rounded to 8 bits."""
     return (srgb_from_linear(linear.clamp(0, 1)) * 255).round().to(torch.uint8)
 
@@ -91,7 +91,7 @@ def ssim_map(
     if min(x.shape[:2]) < window:
         raise ValueError(f"a picture of {x.shape[1]} x {x.shape[0]} is smaller than the window of {window} pixels")
     c1, c2 = ((k * range) ** 2 for k in STABILISERS)
-    return _Similarity.apply(planes(x), planes(y), _gaussian(window, sigma), c1, c2).movedim(0, -1)
+    return _Similarity.apply(channels_first(x), channels_first(y), _gaussian(window, sigma), c1, c2).movedim(0, -1)
 
 
 class _Similarity(torch.autograd.Function):
@@ -136,7 +136,7 @@ def iou(x: Bool[Tensor, "*b"], y: Bool[Tensor, "*b"], counted: Bool[Tensor, "*b"
     return both.sum() / either.sum().clamp_min(1)
 
 
-def planes(x: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "c h w"]:
+def channels_first(x: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "c h w"]:
     """Each channel by itself in memory: whatever mixes channels is then several times as fast."""
     return x.movedim(-1, 0).contiguous()
 

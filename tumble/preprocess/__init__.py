@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from tumble._lazy import lazily
 
 if TYPE_CHECKING:
-    from tumble.preprocess.box_picker import picked
-    from tumble.preprocess.check import check_footage, go
+    from tumble.preprocess.box_picker import pick_box
+    from tumble.preprocess.check import check_footage, passes
     from tumble.preprocess.options import FootageOptions
-    from tumble.preprocess.source import FOOTAGE, kind_of, to_capture
+    from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
     from tumble.preprocess.video_to_capture import PREVIEW, PROVENANCE, origin
 
 __all__ = [
@@ -20,20 +20,20 @@ __all__ = [
     "PREVIEW",
     "PROVENANCE",
     "check_footage",
-    "go",
-    "kind_of",
+    "passes",
+    "input_kind",
     "origin",
-    "picked",
+    "pick_box",
     "to_capture",
 ]
 
 __getattr__ = lazily(
     __name__,
     {
-        "box_picker": ("picked",),
-        "check": ("check_footage", "go"),
+        "box_picker": ("pick_box",),
+        "check": ("check_footage", "passes"),
         "options": ("FootageOptions",),
-        "source": ("FOOTAGE", "kind_of", "to_capture"),
+        "source": ("FOOTAGE", "input_kind", "to_capture"),
         "video_to_capture": ("PREVIEW", "PROVENANCE", "origin"),
     },
 )

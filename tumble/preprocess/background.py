@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
-from tumble.maths import linear_from_srgb, photograph
+from tumble.maths import linear_from_srgb, to_srgb8
 
 SAMPLES = 41
 """Frames the median is taken over; odd, so that it is a value that was there."""
@@ -118,7 +118,7 @@ def drift(
 def compensate(picture: UInt8[np.ndarray, "h w 3"], gain: Float32[np.ndarray, "3"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture as the camera would have taken it without the drift; what it clipped stays clipped."""
     values = torch.from_numpy(_linear()[:, None] / gain)
-    table = photograph(values).numpy()
+    table = to_srgb8(values).numpy()
     table[255] = 255
     return cv2.LUT(picture, table[None])
 

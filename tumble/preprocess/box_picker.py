@@ -22,7 +22,7 @@ from tumble.io import BadFile, files
 from tumble.preprocess import footage, video_to_capture
 from tumble.preprocess.footage import FootageFrame
 from tumble.preprocess.options import FootageOptions
-from tumble.preprocess.source import kind_of
+from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import lens_of, undistorted
 
 LOOKED_AT = 60
@@ -33,7 +33,7 @@ ANSWER = 256
 Box = tuple[int, int, int, int]
 
 
-def picked(path: Path, options: FootageOptions, made: Path, tell: Callable[[str], Any] = print) -> FootageOptions:
+def pick_box(path: Path, options: FootageOptions, made: Path, tell: Callable[[str], Any] = print) -> FootageOptions:
     """The options with a box that a person draws, and the frame it is on; waits until one is drawn.
 
     Args:
@@ -46,7 +46,7 @@ def picked(path: Path, options: FootageOptions, made: Path, tell: Callable[[str]
     """
     if options.box is not None or options.click is not None or options.masks is not None:
         raise ValueError("--pick asks for what --box, --click or --masks say already: leave it out")
-    if kind_of(path) not in ("film", "pictures"):
+    if input_kind(path) not in ("film", "pictures"):
         raise BadFile(path, "is no film and no folder of pictures", "--pick is for those: leave it out")
     note = made / video_to_capture.PROVENANCE
     if note.is_file():

@@ -13,9 +13,9 @@ import numpy as np
 
 from tumble.io import video
 from tumble.preprocess import colmap_to_capture, keyframes, video_to_capture
-from tumble.preprocess.box_picker import picked
+from tumble.preprocess.box_picker import pick_box
 from tumble.preprocess.options import FootageOptions
-from tumble.preprocess.source import kind_of
+from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey
 
 SHAKEN = (0.004, video_to_capture.SHAKEN)
@@ -72,20 +72,20 @@ def check_footage(path: Path, out: Path, options: FootageOptions | None = None, 
         BadFile: It cannot be read, or nothing that moves is found in it.
     """
     options = options or FootageOptions()
-    options = picked(path, options, out / "capture") if pick else options
-    if kind_of(path) == "posed pictures":
+    options = pick_box(path, options, out / "capture") if pick else options
+    if input_kind(path) == "posed pictures":
         return _check_posed(colmap_to_capture.gather(path, options), out, options)
     found = survey(path, options)
     chosen = keyframes.chosen(found.turned, found.blurs, found.usable, options.frames)
     kept = [int(i) for i in np.nonzero(found.usable)[0]] if found.footage.pictures else chosen
     video_to_capture.preview(found, out / video_to_capture.PREVIEW, kept)
-    judged = [_film(found), _hint(found), _camera(found), _masks(found), _border(found)]
+    findings = [_film(found), _hint(found), _camera(found), _masks(found), _border(found)]
     if not kept:
-        return [*judged, Finding("frames", "stop", "none is usable", "draw a box with --pick, or give --masks")]
-    return [*judged, _size(found), *_turning(found, kept), _sharpness(found, kept, options), *_light(found)]
+        return [*findings, Finding("frames", "stop", "none is usable", "draw a box with --pick, or give --masks")]
+    return [*findings, _size(found), *_turning(found, kept), _sharpness(found, kept, options), *_light(found)]
 
 
-def go(findings: list[Finding]) -> bool:
+def passes(findings: list[Finding]) -> bool:
     """Whether nothing stops a reconstruction."""
     return all(finding.verdict != "stop" for finding in findings)
 

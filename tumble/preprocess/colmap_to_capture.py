@@ -169,7 +169,7 @@ def _seen(
     picture: Path, mask: Path | None, view: PosedPicture, options: FootageOptions
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
     """A picture as it was taken, and its mask."""
-    values = files.read_picture(picture)
+    values = files.read_image(picture)
     if values.shape[:2] != (view.optics.height, view.optics.width):
         found = f"is {values.shape[1]} x {values.shape[0]} pixels"
         fix = "give the pictures that COLMAP saw"

@@ -210,7 +210,7 @@ def _films_frames(footage: Footage) -> Iterator[tuple[float, np.ndarray, None]]:
 
 def _folders_frames(footage: Footage, invert: bool) -> Iterator[tuple[float, np.ndarray, np.ndarray | None]]:
     for number, path in enumerate(footage.pictures):
-        values = _upright(path, files.read_picture(path))
+        values = _upright(path, files.read_image(path))
         mask = None
         if values.shape[2] == 4:
             alpha = np.ascontiguousarray(values[..., 3])
@@ -233,7 +233,7 @@ def read_mask(path: Path, picture: UInt8[np.ndarray, "h w c"], invert: bool) -> 
     Raises:
         BadFile: It cannot be read or is of another size.
     """
-    mask = np.ascontiguousarray(files.read_picture(path)[..., -1])
+    mask = np.ascontiguousarray(files.read_image(path)[..., -1])
     if mask.shape != picture.shape[:2]:
         found = f"is {mask.shape[1]} x {mask.shape[0]} pixels"
         raise BadFile(path, f"{found}, its frame is {picture.shape[1]} x {picture.shape[0]}", "masks are upright, too")

@@ -15,7 +15,7 @@ FOOTAGE = ("posed pictures", "pictures", "film")
 """What has to become a capture first."""
 
 
-def kind_of(path: Path) -> SourceKind:
+def input_kind(path: Path) -> SourceKind:
     """What lies at a path.
 
     capture: a folder of a layout that `datasets` reads. posed pictures: pictures with a sparse COLMAP model.
@@ -38,5 +38,5 @@ def to_capture(path: Path, out: Path, options: FootageOptions) -> Path:
     Raises:
         BadFile: The footage cannot become a capture, or `out` is there already; nothing is written then.
     """
-    make = capture_from_model if kind_of(path) == "posed pictures" else capture_from_video
+    make = capture_from_model if input_kind(path) == "posed pictures" else capture_from_video
     return make(path, out, options)

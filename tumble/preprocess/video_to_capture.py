@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 
 from tumble.datasets import capture_document, training_frame
 from tumble.io import BadFile, files, video
-from tumble.maths import linear_from_srgb, photograph
+from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.preprocess import keyframes, segmentation
 from tumble.preprocess.background import compensate, shake
 from tumble.preprocess.footage import FootageFrame, frames
@@ -212,7 +212,7 @@ def developed(picture: np.ndarray, gain: np.ndarray, size: tuple[int, int]) -> U
     if picture.shape[:2] == size:
         return picture
     linear = linear_from_srgb(torch.from_numpy(picture).float() / 255).numpy()
-    return photograph(torch.from_numpy(cv2.resize(linear, size[::-1], interpolation=cv2.INTER_AREA))).numpy()
+    return to_srgb8(torch.from_numpy(cv2.resize(linear, size[::-1], interpolation=cv2.INTER_AREA))).numpy()
 
 
 def _full_mask(

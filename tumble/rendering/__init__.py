@@ -8,8 +8,25 @@ from tumble.rendering import relight
 from tumble.rendering.gbuffer import antialiased, buffers_of
 from tumble.rendering.prefiltered_light import Prefiltered, prefilter
 from tumble.rendering.rasterizer import Buffers, rasterize
-from tumble.rendering.shading import AveragedBounce, Bounce, Surface, in_own_shade, shade, shade_split, surface
-from tumble.rendering.trace import Tracer, Visibility, build, moved, open_sky, surface_points, transfer, visibility
+from tumble.rendering.shading import (
+    AveragedBounce,
+    Bounce,
+    Surface,
+    self_shadowed_irradiance,
+    shade,
+    shade_split,
+    surface,
+)
+from tumble.rendering.trace import (
+    Tracer,
+    Visibility,
+    build,
+    displacement,
+    surface_points,
+    transfer,
+    unoccluded,
+    visibility,
+)
 
 __all__ = [
     "AveragedBounce",
@@ -22,9 +39,9 @@ __all__ = [
     "antialiased",
     "buffers_of",
     "build",
-    "in_own_shade",
-    "moved",
-    "open_sky",
+    "self_shadowed_irradiance",
+    "displacement",
+    "unoccluded",
     "prefilter",
     "rasterize",
     "relight",

@@ -17,7 +17,7 @@ from tumble.rendering.importance_sampling import GlossyBounce, light_sampler, re
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.shading import Bounce, Surface, shade_split, surface
-from tumble.rendering.trace import Tracer, build, open_sky, surface_points, transfer, visibility
+from tumble.rendering.trace import Tracer, build, surface_points, transfer, unoccluded, visibility
 from tumble.scene import TEMPERATURE, Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
 SEEN_FROM = 64
@@ -90,7 +90,7 @@ def preview(
             points.sample(view.features["roughness"]),
             prefiltered,
             R_env_obj,
-            open_sky(directions, len(points.points)),
+            unoccluded(directions, len(points.points)),
             f0=float(material.f0),
         )
         yield points.paint(shaded, camera.height, camera.width) * view.alpha[..., None]
@@ -101,7 +101,7 @@ def gaussian_colours(asset: Asset, frame: int = 0) -> Float[Tensor, "n 3"]:
     """Linear radiance of every Gaussian under the recovered light of one training frame, unshadowed, seen head-on."""
     material, normals, n = asset.material, asset.gaussians.normals, len(asset.gaussians)
     points = Surface(torch.arange(n, device=normals.device), asset.gaussians.means, normals, normals)
-    sky = open_sky(fibonacci_sphere(SKY_DIRECTIONS).to(normals), n)
+    sky = unoccluded(fibonacci_sphere(SKY_DIRECTIONS).to(normals), n)
     return shade_split(
         points,
         material.albedo.mean(1),

@@ -99,10 +99,10 @@ class Bounce:
         bounces (Jimenez et al. 2016): in grooves one bounce alone is too dark, and an open sky too bright.
         """
         coefficients = 4 * math.pi / len(directions) * (spherical_harmonics.basis(directions, 2).mT @ light)
-        return self.albedo / math.pi * in_own_shade(self.transfer, coefficients, self.albedo)
+        return self.albedo / math.pi * self_shadowed_irradiance(self.transfer, coefficients, self.albedo)
 
 
-def in_own_shade(
+def self_shadowed_irradiance(
     transfer: Float[Tensor, "n 9"], coefficients: Float[Tensor, "9 3"], albedo: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     """Irradiance of surfaces under light in harmonics to degree 2, with all bounces between them: `Bounce.radiance`."""
@@ -140,7 +140,7 @@ def shade(
     Differentiable in everything but directions and visibility. Unbiased if the directions are rotated at random.
 
     Args:
-        visibility: What the points see; `trace.open_sky` for everything.
+        visibility: What the points see; `trace.unoccluded` for everything.
         f0: Reflectance at normal incidence.
         bounce: What stands in the way, where the visibility keeps blockers; black when None.
     """

@@ -48,11 +48,11 @@ class Tracer:
 
     def moved(self, gaussians: Gaussians) -> float:
         """How far Gaussians have moved since the tree was built: `moved`."""
-        return moved(self.gaussians, gaussians)
+        return displacement(self.gaussians, gaussians)
 
 
 @torch.no_grad()
-def moved(before: Gaussians, now: Gaussians) -> float:
+def displacement(before: Gaussians, now: Gaussians) -> float:
     """How far the middle Gaussian has moved [its own largest standard deviation], or turned [radians].
 
     The larger of both medians. Rebuild a tree and what was traced with it beyond about 0.3: a shadow's edge is as wide
@@ -125,7 +125,7 @@ class Visibility:
         return (above & self.unpacked()).sum(-1) / above.sum(-1).clamp(min=1).to(normals)
 
 
-def open_sky(directions: Float[Tensor, "D 3"], n_points: int) -> Visibility:
+def unoccluded(directions: Float[Tensor, "D 3"], n_points: int) -> Visibility:
     """The visibility of points that see everything."""
     words = -(-len(directions) // WORD)
     return Visibility(

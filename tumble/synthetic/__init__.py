@@ -8,10 +8,10 @@ if TYPE_CHECKING:
     from tumble.synthetic.demo_object import environment, other_environment, write_object
     from tumble.synthetic.options import SynthOptions
     from tumble.synthetic.pathtracer import OLDEST_LLVM, find_llvm
-    from tumble.synthetic.synthesize import NOTE, render_capture, render_captures
+    from tumble.synthetic.synthesize import SETTINGS_FILE, render_capture, render_captures
 
 __all__ = [
-    "NOTE",
+    "SETTINGS_FILE",
     "OLDEST_LLVM",
     "SynthOptions",
     "environment",
@@ -28,6 +28,6 @@ __getattr__ = lazily(
         "demo_object": ("environment", "other_environment", "write_object"),
         "options": ("SynthOptions",),
         "pathtracer": ("OLDEST_LLVM", "find_llvm"),
-        "synthesize": ("NOTE", "render_capture", "render_captures"),
+        "synthesize": ("SETTINGS_FILE", "render_capture", "render_captures"),
     },
 )

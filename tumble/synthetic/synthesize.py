@@ -19,7 +19,7 @@ from rich.progress import Progress
 from tumble import __version__
 from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
 from tumble.io import BadFile, files, video
-from tumble.maths import SE3, SO3, photograph
+from tumble.maths import SE3, SO3, to_srgb8
 from tumble.scene import BACKGROUND, OBJECT, Camera, Environment, Light, env_from_obj, opengl_from_opencv
 from tumble.synthetic import pathtracer
 from tumble.synthetic.options import SynthOptions
@@ -38,7 +38,7 @@ LIGHT_ROWS = 512
 """Larger light maps are averaged down to this height: a finer sun than a third of a degree costs memory, not truth."""
 MAP_SAMPLES = 256
 """Samples per pixel of albedo, roughness, normal and depth: they only antialias, no light is involved."""
-NOTE = "synth.json"
+SETTINGS_FILE = "synth.json"
 """Says how a folder was made; a second call with the same options goes on where the first one stopped."""
 
 
@@ -97,7 +97,7 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
     _write_documents(studio, shots, lights)
     if options.video:
         training = [out / "images" / shot.name for shot in shots if shot.region is None]
-        video.write_clip(out / "clip.mp4", (files.read_picture(path) for path in training))
+        video.write_clip(out / "clip.mp4", (files.read_image(path) for path in training))
     return out
 
 
@@ -123,14 +123,16 @@ def _note(model: Path, options: SynthOptions) -> dict[str, Any]:
 
 def _claim(out: Path, note: dict[str, Any]) -> bool:
     """Take `out` for this capture; True when an earlier call has begun the same one."""
-    path = out / NOTE
+    path = out / SETTINGS_FILE
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         files.write_json(path, note)
         return False
     if not path.is_file():
         raise BadFile(out, "is there already and was not made by tumble synth", "choose another folder with -o")
     if {k: v for k, v in files.read_json(path).items() if k in note} != note:
-        raise BadFile(out, "holds a capture made with other options", f"remove it or choose another -o; see {NOTE}")
+        raise BadFile(
+            out, "holds a capture made with other options", f"remove it or choose another -o; see {SETTINGS_FILE}"
+        )
     return True
 
 
@@ -246,7 +248,7 @@ def _maps(options: SynthOptions) -> tuple[str, ...]:
 
 
 def _write_photograph(path: Path, radiance: np.ndarray) -> None:
-    files.write_png(path, photograph(torch.from_numpy(radiance)).numpy())
+    files.write_png(path, to_srgb8(torch.from_numpy(radiance)).numpy())
 
 
 # Documents ------------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ def test_true_poses_are_judged_good() -> None:
     scene = tumbling(24, points=200)
     rng = torch.Generator().manual_seed(0)
     some = [scene.match(t - k, t, rng, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
-    found = sfm.judged(sfm.gather(scene.capture, some, "mixed"), truth(scene))
+    found = sfm.assess(sfm.gather(scene.capture, some, "mixed"), truth(scene))
     assert found.quality.verdict == "good"
     assert math.degrees(found.quality.uncertainty) < 1
     between = found.trajectory.T_cam_obj.rotation.inverse() @ truth(scene).T_cam_obj.rotation
@@ -30,8 +30,8 @@ def test_true_poses_are_judged_good() -> None:
 
 def test_it_finds_what_track_finds() -> None:
     """Five frames of a painted ball: too few steps to be right, the same ones as those of the stage alone."""
-    judged = partial(sfm.judged, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
-    inputs = progressive.gather(INPUTS.capture, INPUTS.matches, judged)
+    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
+    inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
     cfg = progressive.Config(**vars(SMOKE))
     assert isinstance(sys.modules["tumble.poses.progressive.stage"], Stage)
     assert progressive.length(cfg, inputs) == tracker.length(SMOKE, inputs.track)

@@ -1,7 +1,7 @@
 """Stage 1 by the paper's progressive route: a neural shape that grows while the object is followed frame by frame.
 
 The tracker finds poses in the virtual camera; they are lifted to the true camera in closed form. How far they can be
-trusted is judged by whatever judges the other route, which is handed in.
+trusted is assessed by whatever judges the other route, which is handed in.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,18 +29,18 @@ class Inputs:
     """A capture without poses, as `gather` makes it."""
 
     track: tracker.Inputs
-    judged: Callable[[Trajectory], PoseResult]
+    assess: Callable[[Trajectory], PoseResult]
     """Adds points, quality and lost frames to poses in the camera frame."""
 
 
-def gather(capture: Capture, matches: Sequence[Match], judged: Callable[[Trajectory], PoseResult]) -> Inputs:
+def gather(capture: Capture, matches: Sequence[Match], assess: Callable[[Trajectory], PoseResult]) -> Inputs:
     """Aim the virtual camera at the silhouettes.
 
     Raises:
         ValueError: No frame shows the object.
     """
     aim = virtual_camera.aim_at(capture.masks, capture.camera, size=AIM)
-    return Inputs(tracker.Inputs(capture, tuple(matches), aim), judged)
+    return Inputs(tracker.Inputs(capture, tuple(matches), aim), assess)
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
@@ -56,6 +56,6 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, torch.Tensor | 
 
 
 def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
-    """Poses in the true camera, judged."""
+    """Poses in the true camera, assessed."""
     found = tracker.finish(cfg, inputs.track, state)
-    return inputs.judged(virtual_camera.lift(found.aim, found.T_aim_obj, inputs.track.capture.light))
+    return inputs.assess(virtual_camera.lift(found.aim, found.T_aim_obj, inputs.track.capture.light))

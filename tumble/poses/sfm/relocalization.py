@@ -23,7 +23,7 @@ TURNS = (-0.35, -0.17, 0.17, 0.35)
 KEPT = 6
 """Hypotheses that are refined."""
 FEW = 10
-"""Planes below which a pose cannot be judged."""
+"""Planes below which a pose cannot be assessed."""
 HOLD = 10.0
 """Weight of the origin's place against one pixel: it moves by a tenth of its distance at most."""
 STEP = 1e-4
@@ -65,7 +65,7 @@ class Judge:
 
 
 def cost(gaps: Float[Tensor, "h n"], scale: float) -> Float[Tensor, " h"]:
-    """Mean of Cauchy's loss; infinite where too little can be judged."""
+    """Mean of Cauchy's loss; infinite where too little can be assessed."""
     known = ~gaps.isnan()
     loss = torch.log1p((torch.where(known, gaps, 0.0) / scale).square()).sum(1)
     return torch.where(known.sum(1) < FEW, torch.inf, loss / known.sum(1).clamp_min(1))

@@ -392,7 +392,7 @@ def _relocate(inputs: Inputs, state: State, scale: float) -> Outcome:
     return replace(state.params, R=R, t=t), {"relocated": float(changed)}
 
 
-def judged(inputs: Inputs, trajectory: Trajectory) -> PoseResult:
+def assess(inputs: Inputs, trajectory: Trajectory) -> PoseResult:
     """Poses of another route as if this one had found them."""
     T_cam_obj = trajectory.T_cam_obj
     t = T_cam_obj.xyz.double()
