@@ -1,9 +1,10 @@
-"""Whether the report's confidence tells where the albedo is wrong: rank correlation with its true error.
+"""Rank correlation between the report's confidence and the true albedo error.
 
-`python -m benchmarks.confidence RUN CAPTURE ...` (pairs; runs with the capture's own poses) prints and writes
-`benchmarks/confidence.json`. Per pixel of the evaluation views that prediction and truth both cover: the error of the
-albedo (mean over the channels of the absolute difference in sRGB, after the one scale per channel of the evaluation),
-and the three counts of `tumble.confidence`, rendered from the Gaussians. Spearman's rho; negative is what is hoped for.
+`python -m benchmarks.confidence RUN CAPTURE ...` takes pairs of a run, with the capture's own poses, and its capture;
+it prints the rows and writes `benchmarks/confidence.json`. For each pixel of the evaluation views that both prediction
+and ground truth cover, it compares the albedo error (mean over the channels of the absolute sRGB difference, after the
+evaluation's scale per channel) with the three counts of `tumble.export.confidence`, rendered from the Gaussians. A
+useful confidence has a negative Spearman's rho.
 """
 
 import argparse
@@ -16,18 +17,18 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from tumble.actions import finished
-from tumble.datasets import which
+from tumble.datasets import reader_for
 from tumble.engine import run as runs
 from tumble.evaluation import metrics
 from tumble.export import confidence_of
 from tumble.io import files
 from tumble.maths import srgb_from_linear
-from tumble.rendering import buffers_of, rasterize
+from tumble.rendering import rasterize, render_gbuffer
 from tumble.report import small_camera
 from tumble.scene import OBJECT, Asset, Truth
 
-COUNTS = ("views", "lights", "halves")
-"""Fields of `Confidence`."""
+COUNTS = {"views": "views", "lights": "lights", "halves": "half_vectors"}
+"""Fields of `Confidence` that are compared with the error, by their key in a row."""
 
 
 def main() -> None:
@@ -37,10 +38,10 @@ def main() -> None:
     arguments = parser.parse_args()
     rows, pixels = [], []
     for run, capture in zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True):
-        truth = which(capture).load_truth(capture)
-        assert truth is not None, f"{capture} has no truth"
-        assert runs.source(run).name == capture.name, "another capture's run"
-        pixels.append(counted(finished(run), truth))
+        truth = reader_for(capture).load_truth(capture)
+        assert truth is not None, f"{capture} has no ground truth"
+        assert runs.capture_source(run).name == capture.name, f"{run} is a run of another capture than {capture}"
+        pixels.append(errors_and_counts(finished(run), truth))
         rows.append({"capture": capture.name, **correlations(pixels[-1])})
         print(rows[-1], flush=True)
     if len(pixels) > 1:
@@ -50,28 +51,28 @@ def main() -> None:
 
 
 @torch.no_grad()
-def counted(asset: Asset, truth: Truth) -> Float[Tensor, "m 4"]:
-    """Per pixel that both cover: the error of the albedo, and the counts."""
-    assert truth.albedo is not None, "a capture with true albedo"
-    assert truth.trajectory is not None, "a capture with evaluation views"
-    seen, n = confidence_of(asset, small_camera(asset.camera)), len(asset.gaussians)
-    counts = torch.stack([getattr(seen, name) for name in COUNTS], -1)[:, None].expand(n, 4, len(COUNTS))
-    albedo, rendered, solid = [], [], []
+def errors_and_counts(asset: Asset, truth: Truth) -> Float[Tensor, "m 4"]:
+    """Albedo error and counts of each pixel that both prediction and ground truth cover."""
+    assert truth.albedo is not None, "the capture needs true albedo"
+    assert truth.trajectory is not None, "the capture needs evaluation views"
+    confidence, n = confidence_of(asset, small_camera(asset.camera)), len(asset.gaussians)
+    counts = torch.stack([getattr(confidence, name) for name in COUNTS.values()], -1)[:, None].expand(n, 4, len(COUNTS))
+    albedo, rendered, opaque = [], [], []
     for i in range(len(truth)):
         T_cam_obj = truth.trajectory.T_cam_obj[i]
-        view = buffers_of(asset, T_cam_obj, asset.camera)
+        view = render_gbuffer(asset, T_cam_obj, asset.camera)
         albedo.append(view.features["albedo"])
-        solid.append(view.alpha > 0.99)
+        opaque.append(view.alpha > 0.99)
         rendered.append(rasterize(asset.gaussians, asset.gamma, T_cam_obj, asset.camera, {"counts": counts}))
-    found, both = torch.stack(albedo), torch.stack(solid) & (truth.masks == OBJECT)
-    scaled = (found * metrics.albedo_scale(found, truth.albedo, both)).clamp(0, 1)
+    estimate, covered = torch.stack(albedo), torch.stack(opaque) & (truth.masks == OBJECT)
+    scaled = (estimate * metrics.albedo_scale(estimate, truth.albedo, covered)).clamp(0, 1)
     error = (srgb_from_linear(scaled) - srgb_from_linear(truth.albedo)).abs().mean(-1, keepdim=True)
     values = torch.stack([buffers.features["counts"] for buffers in rendered])
-    return torch.cat([error, values], -1)[both]
+    return torch.cat([error, values], -1)[covered]
 
 
 def correlations(pixels: Float[Tensor, "m 4"]) -> dict[str, object]:
-    """One row: Spearman's rho per count, and the mean errors of its lowest and of its highest quarter."""
+    """A row: for each count Spearman's rho, and the mean errors in its lowest and highest quartiles."""
     error = pixels[:, 0]
     row: dict[str, object] = {"pixels": len(pixels), "error_srgb": round(float(error.mean()), 4)}
     for name, values in zip(COUNTS, pixels[:, 1:].T, strict=True):

@@ -1,7 +1,7 @@
-"""How fast the kernels of the CPU are, on a closed shell of Gaussians seen whole: medians, and the reference beside.
+"""Speed of the CPU kernels on a closed shell of Gaussians that fits the image, compared with the reference backend.
 
-`python -m benchmarks.kernels` prints a table and writes `benchmarks/kernels.json`. One thread is timed by its own
-processor time, so that other work on the machine hardly counts; several threads by the wall clock.
+`python -m benchmarks.kernels` prints a table of medians and writes `benchmarks/kernels.json`. A single thread is timed
+by its processor time, which other work on the machine hardly affects; several threads by the wall clock.
 """
 
 import argparse
@@ -26,10 +26,13 @@ from tumble.backends import Backend
 from tumble.inverse_rendering import losses
 
 RUNS = 9
+"""Timed calls per figure, of which the median is taken."""
 FEATURES = 16
+"""Feature channels of the larger of the two rasterization cases."""
 DIRECTIONS = 256
+"""Directions of the visibility and shading cases."""
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (50_000, 128), (50_000, 256), (50_000, 512)]
-"""Gaussians and pixels across."""
+"""Rasterization cases: number of Gaussians, and image width [pixels]."""
 
 
 def main() -> None:
@@ -42,13 +45,13 @@ def main() -> None:
     for threads in arguments.threads:
         torch.set_num_threads(threads)
         rows += measure(backends.load("cpu"), "cpu", threads, SIZES)
-        rows += comparing(threads)
-    facts = machine()  # Before the reference, which needs gigabytes.
+        rows += image_loss_rows(threads)
+    machine_info = machine()  # Peak memory is read before the reference runs, which needs gigabytes.
     if not arguments.no_reference:
         torch.set_num_threads(1)
-        # The reference holds every pair of a pixel and a Gaussian nearby, so one size will do.
-        rows += rasterizing(backends.load("reference"), "reference", 1, [(10_000, 256)], runs=3)
-    document = {"command": "python -m benchmarks.kernels", "machine": facts, "rows": rows}
+        # The reference stores every pair of a pixel and a nearby Gaussian: only one size fits into memory and time.
+        rows += rasterize_rows(backends.load("reference"), "reference", 1, [(10_000, 256)], runs=3)
+    document = {"command": "python -m benchmarks.kernels", "machine": machine_info, "rows": rows}
     arguments.out.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
@@ -58,15 +61,15 @@ CPU = torch.device("cpu")
 def measure(
     backend: Backend, name: str, threads: int, sizes: list[tuple[int, int]], *, device: torch.device = CPU
 ) -> list[dict[str, Any]]:
-    """All rows of one backend at one number of threads."""
+    """All rows of a backend at a number of threads."""
     return [
-        *rasterizing(backend, name, threads, sizes, device=device),
-        *tracing(backend, name, threads, device=device),
-        *shading(backend, name, threads, device=device),
+        *rasterize_rows(backend, name, threads, sizes, device=device),
+        *trace_rows(backend, name, threads, device=device),
+        *shade_rows(backend, name, threads, device=device),
     ]
 
 
-def rasterizing(
+def rasterize_rows(
     backend: Backend,
     name: str,
     threads: int,
@@ -75,71 +78,71 @@ def rasterizing(
     *,
     device: torch.device = CPU,
 ) -> list[dict[str, Any]]:
-    """Milliseconds, projection and binning included, with no feature and with FEATURES of them."""
+    """Milliseconds of rasterization, projection and binning included, with 0 and with FEATURES feature channels."""
     rows = []
     for n, size in sizes:
         for c in (0, FEATURES):
-            drawn = [*shell(n), torch.rand(n, 1, 3) + 0.5, torch.rand(n, 4, c), *camera(size)]
-            inputs: Any = [x.to(device).requires_grad_() for x in drawn]
+            tensors = [*shell(n), torch.rand(n, 1, 3) + 0.5, torch.rand(n, 4, c), *camera(size)]
+            inputs: Any = [x.to(device).requires_grad_() for x in tensors]
             arguments: Any = [*inputs, size, size, torch.ones(1, 1, device=device)]
             with torch.no_grad():
-                forward = median(partial(backend.rasterize, *arguments), threads, runs, device)
+                forward = median_seconds(partial(backend.rasterize, *arguments), threads, runs, device)
             view = backend.rasterize(*arguments)[:6]
-            seeds = [torch.randn_like(x) for x in view]
-            adjoint = partial(torch.autograd.grad, view, inputs, seeds, retain_graph=True)
-            backward = median(adjoint, threads, runs, device)
+            gradients = [torch.randn_like(x) for x in view]
+            adjoint = partial(torch.autograd.grad, view, inputs, gradients, retain_graph=True)
+            backward = median_seconds(adjoint, threads, runs, device)
             what = f"rasterize {n // 1000}k, {size} px, {c} features"
             rows.append(row(what, name, threads, "ms", forward * 1e3, backward * 1e3))
     return rows
 
 
-def tracing(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
-    """Million rays per second: from outside at random, and from points of the surface to the hemisphere above."""
+def trace_rows(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
+    """Million rays per second: random rays from outside, and visibility rays from surface points to the hemisphere."""
     rows = []
     for n in (10_000, 50_000):
         means, quats, scales, opacity = (x.to(device) for x in shell(n))
         k = f"{n // 1000}k"
-        build = median(partial(backend.build, means, quats, scales, opacity), threads, RUNS, device)
+        build = median_seconds(partial(backend.build, means, quats, scales, opacity), threads, RUNS, device)
         rows.append(row(f"build {k}", name, threads, "ms", build * 1e3))
         bvh = backend.build(means, quats, scales, opacity)
         rng = torch.Generator().manual_seed(0)
         origins = 2.5 * normalize(torch.randn(100_000, 3, generator=rng), dim=-1)
-        aims = normalize(torch.randn(100_000, 3, generator=rng), dim=-1) * torch.rand(100_000, 1, generator=rng)
-        rays = [x.to(device) for x in (origins, normalize(aims - origins, dim=-1), torch.rand(n, 3))]
-        rate = 0.1 / median(partial(backend.trace, bvh, *rays), threads, RUNS, device)
+        targets = normalize(torch.randn(100_000, 3, generator=rng), dim=-1) * torch.rand(100_000, 1, generator=rng)
+        rays = [x.to(device) for x in (origins, normalize(targets - origins, dim=-1), torch.rand(n, 3))]
+        rate = 0.1 / median_seconds(partial(backend.trace, bvh, *rays), threads, RUNS, device)
         rows.append(row(f"trace {k}, ordered, all blocked", name, threads, "M rays/s", rate))
         normals = normalize(means[:: n // 1000], dim=-1)
         directions = fibonacci(DIRECTIONS).to(device)
-        above = (normals @ directions.T > 0).sum().item() / 1e6
+        million_rays = (normals @ directions.T > 0).sum().item() / 1e6
         outside = 1.03 * normals, normals, directions
-        rate = above / median(partial(backend.visible, bvh, *outside), threads, RUNS, device)
+        rate = million_rays / median_seconds(partial(backend.visible, bvh, *outside), threads, RUNS, device)
         rows.append(row(f"visible {k}, open sky", name, threads, "M rays/s", rate))
-        # A shell that faces inwards, seen from within: every ray is blocked.
-        over = quats[:, [1, 0, 3, 2]] * quats.new_tensor([1.0, -1, 1, -1])
-        inwards = backend.build(means, over, scales, opacity)
+        # From inside a shell whose normals point inwards, every ray is blocked.
+        flipped = quats[:, [1, 0, 3, 2]] * quats.new_tensor([1.0, -1, 1, -1])
+        inward_bvh = backend.build(means, flipped, scales, opacity)
         inside = 0.5 * normals, normals, directions
-        rate = above / median(partial(backend.visible, inwards, *inside), threads, RUNS, device)
+        rate = million_rays / median_seconds(partial(backend.visible, inward_bvh, *inside), threads, RUNS, device)
         rows.append(row(f"visible {k}, all blocked", name, threads, "M rays/s", rate))
     return rows
 
 
-def shading(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
-    """Million evaluations of light and BRDF per second: 2000 points under DIRECTIONS directions."""
+def shade_rows(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
+    """Million evaluations of light and BRDF per second, for 2000 points and DIRECTIONS directions."""
     p = 2000
     rng = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 0.3 * torch.randn(p, 3, generator=rng), dim=-1)
-    drawn = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
-    surface = [x.to(device).requires_grad_() for x in drawn]
+    tensors = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
+    surface = [x.to(device).requires_grad_() for x in tensors]
     light, directions = torch.rand(DIRECTIONS, 3).to(device).requires_grad_(), fibonacci(DIRECTIONS).to(device)
-    seen = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
-    rest = seen, seen.new_full((1, 1), -1), light.new_zeros(0, 3), 0.04
-    arguments: Any = [*surface, directions, light, *rest]
+    visibility = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
+    no_blockers = visibility.new_full((1, 1), -1), light.new_zeros(0, 3)
+    arguments: Any = [*surface, directions, light, visibility, *no_blockers, 0.04]
     with torch.no_grad():
-        forward = median(lambda: backend.shade(*arguments), threads, RUNS, device)
+        forward = median_seconds(lambda: backend.shade(*arguments), threads, RUNS, device)
     shaded = backend.shade(*arguments)
     adjoint = partial(torch.autograd.grad, shaded, [*surface, light], torch.randn_like(shaded), retain_graph=True)
-    backward = median(adjoint, threads, RUNS, device)
+    backward = median_seconds(adjoint, threads, RUNS, device)
     million = p * DIRECTIONS / 1e6
     return [
         row("shade, forward", name, threads, "M evaluations/s", million / forward),
@@ -147,38 +150,38 @@ def shading(backend: Backend, name: str, threads: int, *, device: torch.device =
     ]
 
 
-def comparing(threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
-    """Milliseconds of L1 + SSIM with its gradient, in plain torch: what a step pays beside the kernels."""
+def image_loss_rows(threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
+    """Milliseconds of the L1 + SSIM loss and its gradient in plain torch, the other large cost of a training step."""
     rows = []
     for size in (128, 256):
-        rendered, photograph = torch.rand(2, size, size, 3, device=device)
+        rendered, image = torch.rand(2, size, size, 3, device=device)
         rendered.requires_grad_()
         valid = torch.ones(size, size, 1, device=device)
-        loss = partial(losses.photometric, rendered, photograph, valid, ssim_weight=0.2)
-        forward = median(loss, threads, RUNS, device)
+        loss = partial(losses.photometric, rendered, image, valid, ssim_weight=0.2)
+        forward = median_seconds(loss, threads, RUNS, device)
         adjoint = partial(torch.autograd.grad, loss(), [rendered], retain_graph=True)
-        backward = median(adjoint, threads, RUNS, device)
+        backward = median_seconds(adjoint, threads, RUNS, device)
         rows.append(row(f"L1 + SSIM, {size} px", "torch", threads, "ms", forward * 1e3, backward * 1e3))
     return rows
 
 
 def row(what: str, name: str, threads: int, unit: str, value: float, backward: float | None = None) -> dict[str, Any]:
-    """One line, printed and kept."""
+    """A row of the table, which is also printed."""
     text = f"{value:9.2f}" + (f" + {backward:7.2f}" if backward is not None else "")
     print(f"{what:42s} {name:10s} {threads} thread{'s' * (threads > 1):1s} {text} {unit}", flush=True)
-    kept = {"what": what, "backend": name, "threads": threads, "unit": unit, "value": round(value, 3)}
-    return kept if backward is None else {**kept, "backward": round(backward, 3)}
+    entry = {"what": what, "backend": name, "threads": threads, "unit": unit, "value": round(value, 3)}
+    return entry if backward is None else {**entry, "backward": round(backward, 3)}
 
 
-def median(run: Callable[[], Any], threads: int, runs: int = RUNS, device: torch.device = CPU) -> float:
-    """Median seconds of a call, after two for warmth; a device is waited for."""
-    waits = device.type == "cuda"
-    clock = time.thread_time if threads == 1 and not waits else time.perf_counter
+def median_seconds(run: Callable[[], Any], threads: int, runs: int = RUNS, device: torch.device = CPU) -> float:
+    """Median duration of a call [s], after two warm-up calls; on a GPU, calls are synchronised."""
+    on_gpu = device.type == "cuda"
+    clock = time.thread_time if threads == 1 and not on_gpu else time.perf_counter
     seconds = []
     for i in range(runs + min(2, runs - 1)):
         start = clock()
         run()
-        if waits:
+        if on_gpu:
             torch.cuda.synchronize(device)
         if i >= min(2, runs - 1):
             seconds.append(clock() - start)
@@ -186,7 +189,7 @@ def median(run: Callable[[], Any], threads: int, runs: int = RUNS, device: torch
 
 
 def machine() -> dict[str, Any]:
-    """What a number depends on."""
+    """Facts about machine and process that timings depend on."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
     return {
         "class": f"{os.cpu_count()}-core {platform.machine()} CPU, {backends.vector_bits()}-bit vectors",
@@ -197,15 +200,15 @@ def machine() -> dict[str, Any]:
 
 
 def fibonacci(n: int) -> Tensor:
-    """n directions of equal area."""
+    """n directions of equal solid angle on a Fibonacci spiral."""
     i = torch.arange(n, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * i / n, i * math.pi * (3 - math.sqrt(5))
+    z, azimuth = 1 - 2 * i / n, i * math.pi * (3 - math.sqrt(5))
     r = (1 - z * z).sqrt()
-    return torch.stack([r * turn.cos(), r * turn.sin(), z], -1).float()
+    return torch.stack([r * azimuth.cos(), r * azimuth.sin(), z], -1).float()
 
 
 def shell(n: int) -> list[Tensor]:
-    """Means, quaternions, scales and opacity of a closed sphere of flat Gaussians, a little rough."""
+    """Means, quaternions, scales and opacity of flat Gaussians on a slightly rough unit sphere."""
     rng = torch.Generator().manual_seed(0)
     normals = fibonacci(n)
     w, x, y = 1 + normals[:, 2], -normals[:, 1], normals[:, 0]
@@ -216,7 +219,7 @@ def shell(n: int) -> list[Tensor]:
 
 
 def camera(size: int) -> list[Tensor]:
-    """Rotation, translation and intrinsics of a square picture that the unit sphere fills to two thirds."""
+    """Rotation, translation and intrinsics of a square image, of whose width the unit sphere covers nine tenths."""
     return [torch.eye(3), torch.tensor([0, 0, 3.0]), torch.tensor([1.3 * size, 1.3 * size, size / 2, size / 2])]
 
 

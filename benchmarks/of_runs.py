@@ -1,4 +1,4 @@
-"""A row of figures per capture, of the run that `benchmarks.decomposition` left of it in a folder."""
+"""Command line of the benchmarks that evaluate runs of `benchmarks.decomposition`, one row of figures per capture."""
 
 import argparse
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from tumble.io import files
 
 
 def main(file: str, about: str, row: Callable[[Path, Path], dict[str, Any]]) -> None:
-    """The command line of a benchmark: prints `row(capture, run)` and keeps the rows beside the benchmark's `file`."""
+    """Print `row(capture, run)` of each capture and write the rows to a JSON file beside the benchmark's `file`."""
     script = Path(file)
     parser = argparse.ArgumentParser(description=about.split("\n")[0])
     parser.add_argument("captures", type=Path, nargs="+")

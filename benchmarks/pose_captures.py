@@ -1,7 +1,8 @@
-"""The captures that stage 1 is measured on: five objects under two lights in two tumbles each, two large, eight odd.
+"""Synthetic captures of the benchmarks of stage 1: five objects, each under two lights with two hand-held
+trajectories; two captures at a higher resolution; and eight difficult ones.
 
-All are made here from the files in `../shared/data` and kept as capture folders; what is odd about a capture's frames
-is done to them after loading.
+All are rendered from the files in `../shared/data` into capture folders. A difficulty that concerns images or masks is
+introduced after loading (`ODDITIES`).
 """
 
 import math
@@ -19,16 +20,22 @@ from tumble.scene import BACKGROUND, OBJECT, Capture, Trajectory
 from tumble.synthetic import SynthOptions, render_capture
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+"""Folder of meshes and light maps."""
 TEXTURED = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "ycb_005_tomato_soup_can")
+"""Objects with rich texture."""
 OTHERS = ("chess_Knight", "rubber_duck_toy")
+"""Objects with little texture."""
 LIGHTS = ("immenstadter_horn", "st_fagans_interior")
+"""Light maps: sunny, and indoors."""
 SEEDS = (0, 1)
+"""Seeds of the hand-held trajectories."""
 FRAMES = 72
+"""Frames per capture."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One capture and what is done to it."""
+    """A capture, and how it is modified after loading."""
 
     model: str
     light: str = LIGHTS[0]
@@ -36,41 +43,43 @@ class Case:
     resolution: int = 128
     setting: str = "handheld"
     oddity: str = ""
+    """Key of `ODDITIES`, "spliced", or empty: no modification."""
 
     @property
     def folder(self) -> str:
-        """Where the capture is kept, whatever is done to it afterwards."""
-        if self.model in BARE:
+        """Name of the capture's folder, which does not depend on the modification."""
+        if self.model in TEXTURELESS:
             return self.model
-        more = [str(self.resolution)] if self.resolution != 128 else []
-        more += [self.setting] if self.setting != "handheld" else []
-        return "-".join([self.model, self.light, str(self.seed), *more])
+        suffixes = [str(self.resolution)] if self.resolution != 128 else []
+        suffixes += [self.setting] if self.setting != "handheld" else []
+        return "-".join([self.model, self.light, str(self.seed), *suffixes])
 
     @property
     def name(self) -> str:
+        """Name of the case in the tables."""
         return f"{self.folder}+{self.oddity}" if self.oddity else self.folder
 
 
 def load(case: Case, root: Path) -> tuple[Capture, Trajectory | None]:
-    """The capture, without poses, and its true poses where it makes sense to compare with them."""
-    path = made(case, root)
+    """The modified capture without poses, and its true poses; None if it shows two objects or one without texture."""
+    path = rendered(case, root)
     truth = folder.load_truth(path)
-    assert truth is not None, f"{path} has no truth"
+    assert truth is not None, f"{path} has no ground truth"
     capture = replace(folder.load(path), trajectory=None)
     if case.oddity == "spliced":
-        other = folder.load(made(Case(OTHERS[0]), root))
+        other = folder.load(rendered(Case(OTHERS[0]), root))
         return spliced(capture, other), None
     capture = ODDITIES[case.oddity](capture) if case.oddity else capture
-    return capture, None if case.model in BARE else truth.poses
+    return capture, None if case.model in TEXTURELESS else truth.poses
 
 
-def made(case: Case, root: Path) -> Path:
-    """The capture's folder; rendered where it is not there yet."""
+def rendered(case: Case, root: Path) -> Path:
+    """The capture's folder, rendered if it does not exist."""
     model = DATA / "meshes" / f"{case.model}.glb"
-    if case.model in BARE:
+    if case.model in TEXTURELESS:
         model = root / f"{case.model}.glb"
         if not model.exists():
-            files.write_whole(model, lambda partial: partial.write_bytes(bare(case.model)))
+            files.write_atomically(model, lambda partial: partial.write_bytes(textureless_glb(case.model)))
     options = SynthOptions(
         env=str(DATA / "hdri" / f"{case.light}_1k.hdr"),
         setting=case.setting,  # type: ignore[arg-type]
@@ -87,11 +96,11 @@ def made(case: Case, root: Path) -> Path:
     return render_capture(model, root / case.folder, options)
 
 
-# What is odd ----------------------------------------------------------------------------------------------------------
+# Difficulties ---------------------------------------------------------------------------------------------------------
 
 
-def bare(name: str) -> bytes:
-    """A GLB of a grey sphere, or of a grey can that lies along the z axis."""
+def textureless_glb(name: str) -> bytes:
+    """A GLB of a grey sphere, or of a grey can with its axis along z."""
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -110,41 +119,47 @@ def bare(name: str) -> bytes:
 
 
 def wrong_masks(capture: Capture) -> Capture:
-    """Every tenth mask fails: by turns half of the object is missing, or a patch as large as a quarter is added."""
+    """Every tenth mask is wrong, alternately without half of the object and with background as foreground."""
     masks = capture.masks.clone()
     for number, frame in enumerate(range(5, len(capture), 10)):
         rows, columns = torch.nonzero(masks[frame] == OBJECT).T
-        middle = int(columns.float().mean())
+        centre = int(columns.float().mean())
         if number % 2 == 0:
-            masks[frame, :, middle:] = BACKGROUND
+            masks[frame, :, centre:] = BACKGROUND
         else:
             height, width = int(rows.max() - rows.min()), int(columns.max() - columns.min())
-            masks[frame, int(rows.min()) : int(rows.min()) + height // 2, middle : middle + 3 * width // 4] = OBJECT
+            masks[frame, int(rows.min()) : int(rows.min()) + height // 2, centre : centre + 3 * width // 4] = OBJECT
     return replace(capture, masks=masks)
 
 
-def drifting(capture: Capture) -> Capture:
-    """The exposure rises by 1.3 over the film."""
+def drifting_exposure(capture: Capture) -> Capture:
+    """The exposure rises by a factor of 1.3 over the video."""
     gain = torch.linspace(1.0, 1.3, len(capture))[:, None, None, None]
     linear = (gain * linear_from_srgb(capture.images.float() / 255)).clamp(0, 1)
     return replace(capture, images=(255 * srgb_from_linear(linear)).round().to(torch.uint8))
 
 
 def spliced(capture: Capture, other: Capture) -> Capture:
-    """The second half is of another object."""
+    """The second half of the frames shows another object."""
     half = len(capture) // 2
     images, masks = (torch.cat([getattr(capture, n)[:half], getattr(other, n)[half:]]) for n in ("images", "masks"))
     return replace(capture, images=images, masks=masks)
 
 
-BARE = ("grey_sphere", "bare_can")
-ODDITIES: dict[str, Callable[[Capture], Capture]] = {"wrong masks": wrong_masks, "exposure": drifting}
+TEXTURELESS = ("grey_sphere", "bare_can")
+"""Objects without texture, generated here."""
+ODDITIES: dict[str, Callable[[Capture], Capture]] = {"wrong masks": wrong_masks, "exposure": drifting_exposure}
+"""Modifications of a capture by name."""
 PLAIN = [Case(model, light, seed) for seed in SEEDS for light in LIGHTS for model in (*TEXTURED, *OTHERS)]
+"""All objects, lights and trajectories at the default resolution."""
 COMPARED = [Case(TEXTURED[0]), Case(OTHERS[0]), Case(TEXTURED[1])]
+"""Captures on which the two routes of stage 1 are compared."""
 LARGE = [Case(TEXTURED[0], resolution=256), Case(OTHERS[0], LIGHTS[1], resolution=256)]
-ODD = [
+"""Captures at twice the resolution."""
+DIFFICULT = [
     Case(TEXTURED[0], setting="turntable"),
     *(Case(model, oddity=oddity) for model in (TEXTURED[0], OTHERS[0]) for oddity in ODDITIES),
-    *(Case(model) for model in BARE),
+    *(Case(model) for model in TEXTURELESS),
     Case(TEXTURED[0], oddity="spliced"),
 ]
+"""Captures with modifications, rotation about a single axis, or no texture."""

@@ -1,9 +1,9 @@
-"""How far the live view of a report is from `tumble relight`, for the same light, view and tone mapping.
+"""PSNR between the live view of a report and `tumble relight`, for the same light, view and tone mapping.
 
-`python -m benchmarks.relight_panel RUN` opens `RUN/report.html` in headless Chromium, shows each light of the page and
-one bright spot (dropped as a file) at the start view, and renders the same with rays and with the split sum. The
-number is PSNR [dB] of sRGB values over the pixels that both cover; `--pictures DIR` keeps them side by side.
-The spot stands at the right, above, before the object: a flipped or turned map would light another side.
+`python -m benchmarks.relight_panel RUN` opens `RUN/report.html` in headless Chromium and captures the start view under
+each light of the page and under a bright spot (dropped as a file). It renders the same with rays and with the split
+sum. PSNR [dB] of sRGB values is taken over the pixels that both cover; `--pictures DIR` writes the images side by side.
+The spot is to the right, above and in front of the object: a flipped or rotated map would light another side.
 """
 
 import argparse
@@ -26,17 +26,19 @@ from tumble.engine import run as runs
 from tumble.evaluation import metrics
 from tumble.io import files
 from tumble.maths import SE3, SO3, srgb_from_linear, texel_directions
-from tumble.rendering import buffers_of, relight
+from tumble.rendering import relight, render_gbuffer
 from tumble.scene import Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
 SPOT = (0.8, 0.5, 0.4)
-"""Camera axes: x right, y up, z to the viewer."""
+"""Direction of the spot, not normalised; camera axes: x right, y up, z to the viewer."""
 SETTLED = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
+"""JavaScript that waits until the page has drawn a frame."""
 DROP = """(() => {
   const files = new DataTransfer();
   files.items.add(new File([Uint8Array.from(atob("DATA"), (c) => c.charCodeAt(0))], "spot.hdr"));
   dispatchEvent(new DragEvent("drop", { dataTransfer: files, cancelable: true }));
 })()"""
+"""JavaScript that drops a light map on the page; DATA stands for its bytes in base64."""
 
 
 def main() -> None:
@@ -46,91 +48,95 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     arguments = parser.parse_args()
     page = (arguments.run / "report.html").read_text("utf-8")
-    lights = {name: read_light(part(page, name)) for name in ("recovered", "studio", "overcast", "sunset")}
+    lights = {name: read_light(embedded_file(page, name)) for name in ("recovered", "studio", "overcast", "sunset")}
     lights["spot"] = spot()
-    shown = panel(arguments.run / "report.html", lights["spot"])
+    page_images = capture_panel(arguments.run / "report.html", lights["spot"])
     asset = finished(arguments.run)
     cfg = relight.Config(**runs.recipe(arguments.run)["relight"])
-    reference, rows = strength(lights["recovered"]), {}
-    for name, picture in shown.items():
-        trajectory, camera = start_view(page, *picture.shape[:2])
-        cover = buffers_of(asset, trajectory.T_cam_obj[0], camera).alpha
-        both = (cover > 0.99) & torch.from_numpy(picture[..., 3] == 255)
-        theirs = torch.from_numpy(picture[..., :3]).float() / 255
-        rows[name], pictures = {}, [theirs]
-        for kind, draw in (("rays", relight.relight), ("split_sum", relight.preview)):
-            linear = next(draw(cfg, asset, lights[name], trajectory, camera)) * (reference / strength(lights[name]))
-            ours = srgb_from_linear(neutral(linear)).clamp(0, 1)
-            rows[name][f"psnr_{kind}"] = round(float(metrics.psnr(ours, theirs, both)), 2)
-            ratio = (theirs[both].mean() / ours[both].mean()).item()
+    reference, rows = mean_luminance(lights["recovered"]), {}
+    for name, page_image in page_images.items():
+        trajectory, camera = start_view(page, *page_image.shape[:2])
+        alpha = render_gbuffer(asset, trajectory.T_cam_obj[0], camera).alpha
+        covered = (alpha > 0.99) & torch.from_numpy(page_image[..., 3] == 255)
+        panel = torch.from_numpy(page_image[..., :3]).float() / 255
+        rows[name], images = {}, [panel]
+        for kind, render in (("rays", relight.relight), ("split_sum", relight.preview)):
+            gain = reference / mean_luminance(lights[name])
+            linear = next(render(cfg, asset, lights[name], trajectory, camera)) * gain
+            image = srgb_from_linear(neutral_tone_mapping(linear)).clamp(0, 1)
+            rows[name][f"psnr_{kind}"] = round(float(metrics.psnr(image, panel, covered)), 2)
+            ratio = (panel[covered].mean() / image[covered].mean()).item()
             rows[name][f"brightness_over_{kind}"] = round(ratio, 3)
-            pictures.append(ours)
+            images.append(image)
         print(name, rows[name], flush=True)
         if arguments.pictures:
-            side_by_side = (torch.cat(pictures, 1) * 255).round().to(torch.uint8).numpy()
+            side_by_side = (torch.cat(images, 1) * 255).round().to(torch.uint8).numpy()
             files.write_png(arguments.pictures / f"{name}.png", side_by_side)
     command = "python -m benchmarks.relight_panel RUN"
-    files.write_json(arguments.out, {"command": command, "run": about(arguments.run, asset), "lights": rows})
+    files.write_json(arguments.out, {"command": command, "run": run_facts(arguments.run, asset), "lights": rows})
 
 
-def about(run: Path, asset: Asset) -> dict[str, object]:
-    return {"capture": runs.source(run).name, "gaussians": len(asset.gaussians)}
+def run_facts(run: Path, asset: Asset) -> dict[str, object]:
+    """Facts about the run for the JSON file."""
+    return {"capture": runs.capture_source(run).name, "gaussians": len(asset.gaussians)}
 
 
-def part(page: str, name: str) -> bytes:
-    found = re.search(rf'<script type="text/plain" id="{name}">([^<]*)</script>', page)
-    assert found is not None, f"the page has no {name}"
-    return base64.b64decode(found[1])
+def embedded_file(page: str, name: str) -> bytes:
+    """Content of a file that the page embeds as base64."""
+    match = re.search(rf'<script type="text/plain" id="{name}">([^<]*)</script>', page)
+    assert match is not None, f"the page has no {name}"
+    return base64.b64decode(match[1])
 
 
 def read_light(data: bytes) -> Environment:
+    """The environment map in the bytes of an .hdr file."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "x.hdr").write_bytes(data)
         return Environment.read(Path(folder) / "x.hdr")
 
 
 def spot() -> Environment:
-    """Dark but for one spot of about ten degrees."""
+    """A dark environment map with one bright spot of about ten degrees."""
     d = texel_directions(64, 128)
-    near = d @ torch.nn.functional.normalize(torch.tensor(SPOT), dim=-1)
+    cosine = d @ torch.nn.functional.normalize(torch.tensor(SPOT), dim=-1)
     return Environment.from_radiance(
-        (0.02 + 200 * torch.sigmoid((near - math.cos(0.09)) / 0.002))[..., None].expand(-1, -1, 3)
+        (0.02 + 200 * torch.sigmoid((cosine - math.cos(0.09)) / 0.002))[..., None].expand(-1, -1, 3)
     )
 
 
-def strength(light: Environment) -> float:
-    """Mean radiance over the sphere, as the page takes it."""
+def mean_luminance(light: Environment) -> float:
+    """Mean luminance over the sphere, by which the page normalises all lights."""
     return float(light.integral() @ torch.tensor([0.2126, 0.7152, 0.0722])) / (4 * math.pi)
 
 
-def panel(report: Path, dropped: Environment) -> dict[str, np.ndarray]:
-    """What the page draws, straight code values with coverage, by light."""
+def capture_panel(report: Path, dropped: Environment) -> dict[str, np.ndarray]:
+    """Images of the page's live view [h w 4] by light: 8-bit sRGB with unassociated alpha."""
     assert devtools.browser() is not None, f"needs one of {devtools.BROWSERS}"
     with tempfile.TemporaryDirectory() as folder:
         dropped.write(Path(folder) / "spot.hdr")
         data = base64.b64encode((Path(folder) / "spot.hdr").read_bytes()).decode()
         with devtools.opened(report.resolve().as_uri(), Path(folder), 1400, 900) as tab:
             tab.until("document.documentElement.dataset.panel")
-            shown = {}
+            images = {}
             for name in ("recovered", "studio", "overcast", "sunset", "spot"):
-                press = f"document.querySelector('[data-light={name}]').click()"
-                tab.value(DROP.replace("DATA", data) if name == "spot" else press)
+                click = f"document.querySelector('[data-light={name}]').click()"
+                tab.value(DROP.replace("DATA", data) if name == "spot" else click)
                 tab.until(f'document.documentElement.dataset.light.startsWith("{name}")')
                 tab.value(SETTLED)
                 url = tab.value('document.getElementById("view").toDataURL("image/png")')
                 values = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
-                picture = np.asarray(cv2.imdecode(values, cv2.IMREAD_UNCHANGED))
-                shown[name] = np.ascontiguousarray(picture[..., [2, 1, 0, 3]])
-            return shown
+                bgra = np.asarray(cv2.imdecode(values, cv2.IMREAD_UNCHANGED))
+                images[name] = np.ascontiguousarray(bgra[..., [2, 1, 0, 3]])
+            return images
 
 
 def start_view(page: str, height: int, width: int) -> tuple[Trajectory, Camera]:
-    """The page's camera before anybody turns the object: `panel.js`, functions `home` and `come`."""
-    found = re.search(r'id="about">(.*?)</script>', page)
-    assert found is not None, "a page with a live view"
-    start = json.loads(found[1])
+    """Pose and camera of the page's start view, as computed by `home` and `come` of `panel.js`."""
+    match = re.search(r'id="about">(.*?)</script>', page)
+    assert match is not None, "the page has no live view"
+    start = json.loads(match[1])
     x, y, z, w = start["object_to_camera"]
-    low, high = bounds(part(page, "glb"))
+    low, high = bounding_box(embedded_file(page, "glb"))
     centre, radius = (low + high) / 2, float((high - low).norm()) / 2
     half = math.radians(min(start["fov"], 90)) / 2
     distance = 1.9 * 0.55 * radius / math.sin(half)
@@ -143,22 +149,22 @@ def start_view(page: str, height: int, width: int) -> tuple[Trajectory, Camera]:
     return Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), "camera"), camera
 
 
-def bounds(glb: bytes) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Corners of the box around the positions, as the file states them."""
+def bounding_box(glb: bytes) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Minimum and maximum corner of the mesh, from the header of the GLB."""
     document = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
-    place = document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
-    return torch.tensor(document["accessors"][place]["min"]), torch.tensor(document["accessors"][place]["max"])
+    accessor = document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    return torch.tensor(document["accessors"][accessor]["min"]), torch.tensor(document["accessors"][accessor]["max"])
 
 
-def neutral(linear: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def neutral_tone_mapping(linear: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """The Khronos PBR neutral tone mapper, as published."""
     start, desaturation = 0.8 - 0.04, 0.15
-    least = linear.amin(-1, keepdim=True)
-    colour = linear - torch.where(least < 0.08, least - 6.25 * least**2, 0.04)
+    minimum = linear.amin(-1, keepdim=True)
+    colour = linear - torch.where(minimum < 0.08, minimum - 6.25 * minimum**2, 0.04)
     peak = colour.amax(-1, keepdim=True)
-    pressed = 1 - (1 - start) ** 2 / (peak + 1 - 2 * start)
-    share = 1 - 1 / (desaturation * (peak - pressed) + 1)
-    mapped = torch.lerp(colour * pressed / peak.clamp(min=1e-9), pressed.expand_as(colour), share)
+    compressed = 1 - (1 - start) ** 2 / (peak + 1 - 2 * start)
+    weight = 1 - 1 / (desaturation * (peak - compressed) + 1)
+    mapped = torch.lerp(colour * compressed / peak.clamp(min=1e-9), compressed.expand_as(colour), weight)
     return torch.where(peak < start, colour, mapped)
 
 

@@ -1,11 +1,11 @@
-"""Where the time of stages 2 and 3 goes, and what each second buys.
+"""Time of the parts of stages 2 and 3, and scores over time.
 
-`python -m benchmarks.speed CAPTURE... [--threads N]` reconstructs captures with truth and known poses by DRAFT, and
-every few seconds scores the views of region shared; the clock stands still meanwhile. Writes `benchmarks/speed.json`
-and `.md`.
+`python -m benchmarks.speed CAPTURE... [--threads N]` reconstructs captures with ground truth and known poses with the
+DRAFT recipe, and scores the views of region "shared" every few seconds with the clock stopped. It writes
+`benchmarks/speed.json` and `benchmarks/speed.md`.
 
-Image: PSNR of the stage's own rendering of evaluation views over the foreground [dB, sRGB]; stage 3 draws none. Albedo:
-foreground PSNR after the scale per channel, as everywhere [dB, sRGB].
+Image: PSNR of the stage's own rendering of the evaluation views over the foreground [dB, sRGB]; only in stage 2.
+Albedo: foreground PSNR after the scale per channel [dB, sRGB].
 """
 
 import argparse
@@ -32,27 +32,28 @@ from tumble.recipes import DRAFT, known_poses
 from tumble.rendering import rasterize
 from tumble.scene import Capture, Truth
 
-EVERY = 10.0
-"""Seconds of work between two looks."""
+INTERVAL = 10.0
+"""Time between two measurements of the scores [s]."""
 PARTS = {
     "refine": {
         "rendering": (refine, "render"),
         "losses": (refine, "_terms"),
         "densifying": (refine, "_densify"),
-        "visibility": (refine, "_look_around"),
+        "visibility": (refine, "_trace_visibility"),
         "backward pass and Adam": (optim, "descend"),
     },
     "decompose": {
-        "visibility": (decompose, "_look_around"),
-        "rendering": (decompose, "buffers_of"),
-        "shading": (decompose, "_shaded"),
+        "visibility": (decompose, "_trace_visibility"),
+        "rendering": (decompose, "render_gbuffer"),
+        "shading": (decompose, "_shade"),
         "backward pass and Adam": (optim, "descend"),
     },
 }
 
 
 class Clock:
-    """Counts work, not scoring, and what parts of it take; a part within a part counts for the outer one alone."""
+    """Stopwatch that is paused while scores are measured, and times parts of the work; a part that runs inside another
+    one counts as the outer one."""
 
     def __init__(self) -> None:
         self.begun, self.paused, self.inside, self.parts = (
@@ -63,24 +64,28 @@ class Clock:
         )
 
     def now(self) -> float:
+        """Time since the start without pauses [s]."""
         return time.perf_counter() - self.begun - self.paused
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        begun = time.perf_counter()
+        """Pause the clock."""
+        started = time.perf_counter()
         yield
-        self.paused += time.perf_counter() - begun
+        self.paused += time.perf_counter() - started
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, with its time added to the part `name`."""
+
         def call(*args: Any, **keywords: Any) -> Any:
             if self.inside:
                 return function(*args, **keywords)
-            self.inside, begun = True, time.perf_counter()
+            self.inside, started = True, time.perf_counter()
             try:
                 return function(*args, **keywords)
             finally:
                 self.inside = False
-                self.parts[name] += time.perf_counter() - begun
+                self.parts[name] += time.perf_counter() - started
 
         return call
 
@@ -97,51 +102,51 @@ def main() -> None:
         rows.append({"capture": path.name, "threads": arguments.threads, **measure(path)})
         command = "python -m benchmarks.speed CAPTURE... [--threads N]"
         files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
-        text = page(command, rows)
-        files.write_whole(arguments.out.with_suffix(".md"), lambda partial, text=text: partial.write_text(text))
-        print(page(command, rows[-1:]), flush=True)
+        text = report(command, rows)
+        files.write_atomically(arguments.out.with_suffix(".md"), lambda partial, text=text: partial.write_text(text))
+        print(report(command, rows[-1:]), flush=True)
 
 
 def measure(path: Path) -> dict[str, Any]:
-    """Both stages of one capture: seconds by part, and scores by second."""
+    """Both stages of a capture: seconds by part, and scores over time."""
     capture, truth = folder.load(path), folder.load_truth(path)
-    assert truth is not None, "a capture with truth"
-    assert capture.trajectory is not None, "a capture with known poses"
+    assert truth is not None, "the capture needs ground truth"
+    assert capture.trajectory is not None, "the capture needs known poses"
     inputs, clock, curve = refine.Inputs(capture, capture.trajectory), Clock(), []
     cfg = known_poses(DRAFT).refine
-    refined, seconds = _staged(refine, cfg, inputs, clock, curve, lambda s: _of_refine(s, capture, truth))
-    parts = {"refine": _shares(clock, seconds)}
+    refined, seconds = _run_stage(refine, cfg, inputs, clock, curve, lambda s: _refine_scores(s, capture, truth))
+    parts = {"refine": _part_seconds(clock, seconds)}
     inputs = decompose.Inputs(capture, refined)
-    _, last = _staged(
+    _, total = _run_stage(
         decompose,
         DRAFT.decompose,
         inputs,
         clock,
         curve,
-        lambda s: _of_decompose(decompose.shared_out(s.params), capture, truth),
+        lambda s: _decompose_scores(decompose.absorb_specular_scale(s.params), capture, truth),
     )
-    parts["decompose"] = _shares(clock, last - seconds)
+    parts["decompose"] = _part_seconds(clock, total - seconds)
     return {
-        "seconds": {"refine": round(seconds, 1), "decompose": round(last - seconds, 1)},
+        "seconds": {"refine": round(seconds, 1), "decompose": round(total - seconds, 1)},
         "parts": parts,
         "curve": curve,
     }
 
 
-def _staged(
+def _run_stage(
     stage: Any,
     cfg: Any,
     inputs: Any,
     clock: Clock,
     curve: list[dict[str, Any]],
-    scored: Callable[[Any], dict[str, float]],
+    scores: Callable[[Any], dict[str, float]],
 ) -> tuple[Any, float]:
-    """A stage's outcome, and when it was there."""
+    """Run a stage and append its scores to `curve`; its output, and the time at its end [s]."""
     name = stage.__name__.rsplit(".", 1)[-1]
 
-    def look(state: Any) -> None:
+    def measure_scores(state: Any) -> None:
         with clock.stopped(), torch.no_grad():
-            curve.append({"stage": name, "seconds": round(clock.now(), 1), "step": state.step, **scored(state)})
+            curve.append({"stage": name, "seconds": round(clock.now(), 1), "step": state.step, **scores(state)})
 
     clock.parts.clear()
     with ExitStack() as patches:
@@ -151,49 +156,50 @@ def _staged(
         due = clock.now()
         while state.step < cfg.steps:
             if clock.now() >= due:
-                look(state)
-                due = clock.now() + EVERY
+                measure_scores(state)
+                due = clock.now() + INTERVAL
             stage.step(cfg, inputs, state)
             state.step += 1
-        outcome = stage.finish(cfg, inputs, state)
-    look(state)
-    return outcome, clock.now()
+        output = stage.finish(cfg, inputs, state)
+    measure_scores(state)
+    return output, clock.now()
 
 
-def _shares(clock: Clock, seconds: float) -> dict[str, float]:
+def _part_seconds(clock: Clock, seconds: float) -> dict[str, float]:
+    """Seconds of each part, and of the rest."""
     parts = {name: round(value, 1) for name, value in clock.parts.items()}
     return {**parts, "the rest": round(seconds - sum(clock.parts.values()), 1)}
 
 
-def _of_refine(state: State, capture: Capture, truth: Truth) -> dict[str, float]:
+def _refine_scores(state: State, capture: Capture, truth: Truth) -> dict[str, float]:
     assert truth.trajectory is not None
-    params, sky, image, full = state.params, refine.sky(state), [], []
+    params, visibility, image, full = state.params, refine.cached_visibility(state), [], []
     albedo = torch.sigmoid(params.points.albedo_logits)
     for number in truth.views("shared"):
         arguments = (truth.trajectory.T_cam_obj[number], truth.trajectory, capture.camera)
-        view = refine.render(params.points, params.gamma, params.light, *arguments, sky=sky)
-        rendered, photograph = srgb_from_linear(view.rgb).clamp(0, 1), truth.images[number] / 255
-        image.append(metrics.psnr(rendered, photograph, truth.foreground[number]))
-        full.append(metrics.psnr(rendered, photograph, torch.ones_like(truth.foreground[number])))
+        view = refine.render(params.points, params.gamma, params.light, *arguments, visibility=visibility)
+        rendered, true_image = srgb_from_linear(view.rgb).clamp(0, 1), truth.images[number] / 255
+        image.append(metrics.psnr(rendered, true_image, truth.foreground[number]))
+        full.append(metrics.psnr(rendered, true_image, torch.ones_like(truth.foreground[number])))
     gaussians = params.points.gaussians
     scores = {name: round(sum(x) / len(x), 2) for name, x in (("image", image), ("image_full", full))}
-    return scores | _albedo(gaussians, params.gamma, albedo, capture, truth)
+    return scores | _albedo_scores(gaussians, params.gamma, albedo, capture, truth)
 
 
-def _of_decompose(params: decompose.Params, capture: Capture, truth: Truth) -> dict[str, float]:
-    return _albedo(params.gaussians, params.gamma, params.material.albedo, capture, truth)
+def _decompose_scores(params: decompose.Params, capture: Capture, truth: Truth) -> dict[str, float]:
+    return _albedo_scores(params.gaussians, params.gamma, params.material.albedo, capture, truth)
 
 
-def _albedo(gaussians: Any, gamma: Tensor, albedo: Tensor, capture: Capture, truth: Truth) -> dict[str, float]:
+def _albedo_scores(gaussians: Any, gamma: Tensor, albedo: Tensor, capture: Capture, truth: Truth) -> dict[str, float]:
     assert truth.trajectory is not None
     corners = albedo if albedo.ndim == 3 else albedo[:, None].expand(-1, 4, -1)
-    places = (truth.trajectory.T_cam_obj[number] for number in truth.views("shared"))
-    views = [rasterize(gaussians, gamma, T_cam_obj, capture.camera, {"albedo": corners}) for T_cam_obj in places]
+    poses = (truth.trajectory.T_cam_obj[number] for number in truth.views("shared"))
+    views = [rasterize(gaussians, gamma, T_cam_obj, capture.camera, {"albedo": corners}) for T_cam_obj in poses]
     return {"albedo": round(albedo_psnr(views, truth)[0], 2)}
 
 
-def page(command: str, rows: list[dict[str, Any]]) -> str:
-    """The figures as Markdown."""
+def report(command: str, rows: list[dict[str, Any]]) -> str:
+    """The figures in Markdown."""
     lines = [f"# Time of stages 2 and 3\n\n`{command}`: DRAFT, known poses, 128 x 128, 64 frames; 2-core x86_64 CPU.\n"]
     for row in rows:
         seconds = row["seconds"]
@@ -202,9 +208,9 @@ def page(command: str, rows: list[dict[str, Any]]) -> str:
             listed = ", ".join(f"{name} {value:.1f}" for name, value in parts.items())
             lines += [f"- {stage} {seconds[stage]:.1f} s: {listed}"]
         lines += ["", "| s | stage | step | image fg / full [dB] | albedo fg [dB] |", "|---|---|---|---|---|"]
-        for look in row["curve"]:
-            image = f"{look['image']} / {look['image_full']}" if "image" in look else ""
-            lines += [f"| {look['seconds']:.0f} | {look['stage']} | {look['step']} | {image} | {look['albedo']} |"]
+        for point in row["curve"]:
+            image = f"{point['image']} / {point['image_full']}" if "image" in point else ""
+            lines += [f"| {point['seconds']:.0f} | {point['stage']} | {point['step']} | {image} | {point['albedo']} |"]
         lines += [""]
     return "\n".join(lines)
 

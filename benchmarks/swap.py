@@ -1,16 +1,17 @@
-"""What limits the albedo: the truth swapped in for one unknown at a time, on captures with truth and known poses.
+"""Error of the albedo if other unknowns are replaced by their true values, for captures with known poses.
 
-`python -m benchmarks.swap CAPTURE...` reconstructs each with DRAFT and prints a row per unknown that is given:
+`python -m benchmarks.swap CAPTURE...` reconstructs each capture with DRAFT, and prints a row per replacement. Replaced
+quantities stay fixed:
 
-    nothing      the method as it is
-    roughness    the true mean roughness, kept
-    light        the true light map at 32 rows, kept
-    both         both
-    geometry     Gaussians on the true surface with its normals, kept (their size and opacity are still fitted)
-    all          all of it: what is left is the albedo alone
+    nothing      the method without replacement
+    roughness    the true mean roughness
+    light        the true environment map at 32 rows
+    both         roughness and light
+    geometry     Gaussians on the true surface with its normals (their size and opacity are still optimised)
+    all          roughness, light and geometry: only the albedo is unknown
 
-Foreground PSNR of the sRGB albedo over the shared evaluation views after the scale per channel, and that scale (1 where
-albedo and light share their product as the truth does); mean error of normals [deg].
+A row has the foreground PSNR of the sRGB albedo over the shared evaluation views after the scale per channel, this
+scale (1 if the product of albedo and light is split as in the ground truth), and the mean error of the normals [deg].
 """
 
 import argparse
@@ -33,12 +34,13 @@ from tumble.inverse_rendering import decompose, refine
 from tumble.io import files
 from tumble.maths import srgb_from_linear
 from tumble.recipes import DRAFT, known_poses
-from tumble.rendering import Buffers, antialiased
+from tumble.rendering import Buffers, antialiased_gbuffer
 from tumble.scene import TEMPERATURE, Asset, Capture, Environment, visual_hull
 
 GIVEN = ("nothing", "roughness", "light", "both", "geometry", "all")
+"""Replacements by true values, one per row."""
 ROWS = 32
-"""Of the light map, as DRAFT ends."""
+"""Rows of the environment map, as at the end of DRAFT."""
 
 
 def main() -> None:
@@ -50,24 +52,24 @@ def main() -> None:
     rows = []
     for path in arguments.captures:
         capture, truth = folder.load(path), folder.load_truth(path)
-        refined = loop.drive(refine, known_poses(DRAFT).refine, refine.Inputs(capture, _known(capture)), seed=0)
-        true_surface = on_the_surface(path, capture) if {"geometry", "all"} & set(arguments.given) else refined
+        refined = loop.drive(refine, known_poses(DRAFT).refine, refine.Inputs(capture, _poses(capture)), seed=0)
+        true_surface = refine_on_true_surface(path, capture) if {"geometry", "all"} & set(arguments.given) else refined
         for given in arguments.given:
             surface = true_surface if given in ("geometry", "all") else refined
-            found = score(material(capture, truth, surface, given), truth, capture)
-            rows.append({"capture": path.name, "given": given, **found})
+            scores = score(decompose_given(capture, truth, surface, given), truth, capture)
+            rows.append({"capture": path.name, "given": given, **scores})
             print(rows[-1], flush=True)
             command = "python -m benchmarks.swap CAPTURE..."
             files.write_json(arguments.out, {"command": command, "machine": machine(), "rows": rows})
 
 
-def _known(capture: Capture) -> Any:
-    assert capture.trajectory is not None, "captures with known poses"
+def _poses(capture: Capture) -> Any:
+    assert capture.trajectory is not None, "the capture needs known poses"
     return capture.trajectory
 
 
-def material(capture: Capture, truth: Any, refined: refine.Refined, given: str) -> Asset:
-    """Stage 3 with what is given held at its true value."""
+def decompose_given(capture: Capture, truth: Any, refined: refine.Refined, given: str) -> Asset:
+    """Result of stage 3 with roughness and light fixed at their true values if `given` names them."""
     cfg = DRAFT.decompose
     assert isinstance(cfg, decompose.Config), "DRAFT is the method, not a baseline"
     rates = cfg.rates
@@ -85,46 +87,48 @@ def material(capture: Capture, truth: Any, refined: refine.Refined, given: str) 
         if given in ("light", "both", "all"):
             with torch.no_grad():
                 environment, albedo_logits = state.params.environment, state.params.material.albedo_logits
-                # Albedo and light share one product per channel.
+                # The product of albedo and light stays the same in each channel.
                 albedo = state.params.material.albedo * environment.integral() / light.integral()
-                albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*decompose.ALBEDO)))
+                albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*decompose.ALBEDO_RANGE)))
                 environment.log_radiance.copy_(light.log_radiance)
-            decompose.fit_highlight(cfg, inputs, state)
+            decompose.fit_specular(cfg, inputs, state)
         return state
 
     stage: Any = SimpleNamespace(**vars(decompose) | {"init": init})
     return loop.drive(stage, replace(cfg, rates=rates), decompose.Inputs(capture, refined), seed=0)
 
 
-def on_the_surface(path: Path, capture: Capture) -> refine.Refined:
-    """Stage 2 with Gaussians that stay on the true mesh."""
+def refine_on_true_surface(path: Path, capture: Capture) -> refine.Refined:
+    """Result of stage 2 with the centres and normals of the Gaussians fixed on the true mesh."""
     import trimesh
 
     mesh: Any = trimesh.load(path / "truth" / "mesh.glb", force="mesh")
 
-    def surface(inside: Tensor, n: int, rng: torch.Generator) -> visual_hull.OrientedPoints:
-        drawn: Any = trimesh.sample.sample_surface(mesh, n, seed=0)
-        positions, faces = drawn[:2]
-        share = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], positions)
-        normals = (mesh.vertex_normals[mesh.faces[faces]] * share[..., None]).sum(1)
+    def sample_mesh(inside: Tensor, n: int, rng: torch.Generator) -> visual_hull.OrientedPoints:
+        samples: Any = trimesh.sample.sample_surface(mesh, n, seed=0)
+        positions, faces = samples[:2]
+        barycentric = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], positions)
+        normals = (mesh.vertex_normals[mesh.faces[faces]] * barycentric[..., None]).sum(1)
         points = torch.tensor(positions, dtype=torch.float32)
         return visual_hull.OrientedPoints(
-            points, normalize(torch.tensor(normals).float(), dim=-1), visual_hull.spacing(points)
+            points, normalize(torch.tensor(normals).float(), dim=-1), visual_hull.neighbour_spacing(points)
         )
 
     cfg = known_poses(DRAFT).refine
     rates = replace(cfg.rates, means=0.0, quats=0.0, sdf=0.0)
-    growth = cfg.densification
-    cfg = replace(cfg, points=growth.max_gaussians, densification=replace(growth, refine_every=cfg.steps), rates=rates)
-    with patch.object(visual_hull, "surface", surface):
-        return loop.drive(refine, cfg, refine.Inputs(capture, _known(capture)), seed=0)
+    densify = cfg.densification
+    cfg = replace(
+        cfg, points=densify.max_gaussians, densification=replace(densify, refine_every=cfg.steps), rates=rates
+    )
+    with patch.object(visual_hull, "sample_surface", sample_mesh):
+        return loop.drive(refine, cfg, refine.Inputs(capture, _poses(capture)), seed=0)
 
 
 @torch.no_grad()
 def score(asset: Asset, truth: Any, capture: Capture) -> dict[str, Any]:
-    """Of the shared evaluation views."""
+    """Scores of the shared evaluation views."""
     numbers = truth.views("shared")
-    views = [antialiased(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
+    views = [antialiased_gbuffer(asset, truth.trajectory.T_cam_obj[i], capture.camera) for i in numbers]
     normals = torch.stack([normalize(view.normal, dim=-1) for view in views])
     psnr, scale = albedo_psnr(views, truth)
     angles = metrics.normal_angles(normals, truth.normals[numbers])[truth.foreground[numbers]]
@@ -136,13 +140,13 @@ def score(asset: Asset, truth: Any, capture: Capture) -> dict[str, Any]:
 
 
 def albedo_psnr(views: Sequence[Buffers], truth: Any) -> tuple[float, Tensor]:
-    """Foreground PSNR of the albedo of the shared evaluation views, sRGB, and the scale per channel before it."""
-    numbers, least = truth.views("shared"), DRAFT.relight.alpha_min
-    shown = torch.stack([view.features["albedo"] * (view.alpha >= least)[..., None] for view in views])
+    """Foreground PSNR [dB] of the sRGB albedo over the shared evaluation views, and the scale per channel before it."""
+    numbers, alpha_min = truth.views("shared"), DRAFT.relight.alpha_min
+    estimate = torch.stack([view.features["albedo"] * (view.alpha >= alpha_min)[..., None] for view in views])
     foreground, albedo = truth.foreground[numbers], truth.albedo[numbers]
-    scale = metrics.albedo_scale(shown, albedo, foreground)
-    pictures = zip(srgb_from_linear((shown * scale).clamp(0, 1)), srgb_from_linear(albedo), foreground, strict=True)
-    psnr = [metrics.psnr(a, b, mask) for a, b, mask in pictures]
+    scale = metrics.albedo_scale(estimate, albedo, foreground)
+    images = zip(srgb_from_linear((estimate * scale).clamp(0, 1)), srgb_from_linear(albedo), foreground, strict=True)
+    psnr = [metrics.psnr(a, b, mask) for a, b, mask in images]
     return sum(psnr) / len(psnr), scale
 
 

@@ -1,8 +1,8 @@
-"""How well the frames tell the width of the highlight: what each width that stage 3 tries leaves over.
+"""How well the images determine the roughness: the error of each roughness that stage 3 tries at its start.
 
 `python -m benchmarks.widths CAPTURE... --runs FOLDER` takes stage 2 from runs of `benchmarks.decomposition`. A row per
-capture: the least mean absolute error [thousandths of sRGB] at each roughness, over all strengths, and that of the
-highlight as stage 2 left it (`highlight.fit`).
+capture has the minimum mean absolute error [thousandths of sRGB] at each roughness, over all specular scales, and the
+error with the specular lobe of stage 2 (`specular_fit.fit`).
 """
 
 from pathlib import Path
@@ -17,19 +17,22 @@ from tumble.io import tree
 from tumble.recipes import DRAFT
 
 
-class Found(Exception):
-    """Ends stage 3 once its samples are there."""
+class Result(Exception):
+    """Carries the row and ends stage 3 as soon as its samples are known."""
 
 
 def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
-    """What is left over at each width, and as stage 2 left it."""
+    """The row of one capture and its run."""
 
-    def compare(samples: specular_fit.Samples, n: int, which: int, strength: float) -> None:
-        def left(width: int, strength: float) -> float:
-            return round(1000 * float(specular_fit.left_over(samples, samples.specular[width], strength, n, 0.0)[0]), 3)
+    def compare(samples: specular_fit.Samples, n: int, roughness_index: int, specular_scale: float) -> None:
+        def error(index: int, scale: float) -> float:
+            return round(1000 * float(specular_fit.fit_error(samples, samples.specular[index], scale, n, 0.0)[0]), 3)
 
-        widths = {str(r): min(left(i, s) for s in specular_fit.STRENGTHS) for i, r in enumerate(specular_fit.ROUGHNESS)}
-        raise Found({"as_stage_2": left(which, strength), "by_roughness": widths})
+        by_roughness = {
+            str(r): min(error(i, s) for s in specular_fit.SPECULAR_SCALES)
+            for i, r in enumerate(specular_fit.ROUGHNESSES)
+        }
+        raise Result({"as_stage_2": error(roughness_index, specular_scale), "by_roughness": by_roughness})
 
     refined = tree.load(refine.Refined, run / "2-refine" / "out.safetensors")
     inputs = decompose.Inputs(folder.load(capture), refined)
@@ -37,8 +40,8 @@ def errors(capture: Path, run: Path) -> dict[str, float | dict[str, float]]:
     with patch.object(specular_fit, "fit", compare):
         try:
             decompose.init(DRAFT.decompose, inputs, torch.Generator().manual_seed(0))
-        except Found as found:
-            return found.args[0]
+        except Result as result:
+            return result.args[0]
     return {}
 
 

@@ -1,4 +1,4 @@
-"""Poses from elsewhere, such as a tracker or a robot's arm: stage 1 is left out, the poses stay as they are.
+"""Reconstruction with known poses, for example from a tracker or a robot arm; stage 1 is skipped.
 
 $ python -m examples.bring_your_own_poses OUT           (minutes on two CPU cores)
 """
@@ -16,9 +16,9 @@ def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> tumble.Report:
     clip = tumble.demo_clip(out / "clip")
     capture = tumble.read_capture(clip)
 
-    # Camera to object, 4 x 4, OpenGL camera axes; the object lies in the unit ball about the origin.
-    known = json.loads((clip / "truth" / "poses.json").read_text())
-    matrices = torch.tensor([known[name] for name in capture.names])
+    # Camera to object, 4 x 4, OpenGL camera axes; the object lies in the unit sphere around the origin.
+    poses_by_name = json.loads((clip / "truth" / "poses.json").read_text())
+    matrices = torch.tensor([poses_by_name[name] for name in capture.names])
     poses = tumble.Trajectory.from_camera_to_object(matrices, light="camera")
 
     asset = tumble.reconstruct(capture, out / "run", recipe, poses=poses)

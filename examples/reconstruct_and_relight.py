@@ -1,4 +1,4 @@
-"""From a clip to pictures under another light, in Python: what `tumble run` and `tumble relight` do.
+"""From a video to images under another light in Python, as `tumble run` and `tumble relight` do.
 
 $ python -m examples.reconstruct_and_relight OUT        (minutes on two CPU cores)
 """
@@ -15,14 +15,14 @@ def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> tumble.Asset:
     clip = tumble.demo_clip(out / "clip")  # or tumble.video_to_capture("clip.mp4", out / "clip")
     capture = tumble.read_capture(clip)
 
-    def tell(progress: tumble.Progress) -> None:
+    def print_progress(progress: tumble.Progress) -> None:
         print(f"{progress.name}: step {progress.step} of {progress.of}, {progress.eta:.0f} s to go")
 
-    found = tumble.estimate_poses(capture, recipe, progress=tell)
-    print(found.quality.sentence)
-    asset = tumble.reconstruct(capture, recipe=recipe, poses=found, progress=tell)
+    poses = tumble.estimate_poses(capture, recipe, progress=print_progress)
+    print(poses.quality.sentence)
+    asset = tumble.reconstruct(capture, recipe=recipe, poses=poses, progress=print_progress)
 
-    maps = tumble.render(asset, 0)  # from where the camera saw the first frame
+    maps = tumble.render(asset, 0)  # in the pose of the first frame
     files.write_png(out / "albedo.png", to_srgb8(maps.features["albedo"] * maps.alpha[..., None]).numpy())
     light = tumble.Environment.read(clip / "truth" / "lights" / "sunset.hdr")
     first = tumble.Trajectory(asset.trajectory.T_cam_obj[:1], light="object")

@@ -1,6 +1,7 @@
-"""What does stage 3 bring? Another one in its place, which takes albedo and light as stage 2 left them.
+"""Effect of stage 3: a stage in its place that keeps albedo and light of stage 2 is compared with it.
 
-A stage is a module with VERSION, Config, length, init, step and finish; this file is one. It is chosen by its Config.
+A stage is a module with VERSION, Config, length, init, step and finish. This file is such a module; a recipe selects it
+by its Config.
 
 $ python -m examples.swap_a_stage OUT                   (minutes on two CPU cores)
 """
@@ -24,9 +25,9 @@ VERSION = 1
 @dataclass(frozen=True)
 class Config:
     roughness: float = 0.4
-    """Of the whole object."""
+    """Roughness of the whole object."""
     rows: int = 16
-    """Of the light map."""
+    """Rows of the environment map."""
 
 
 def length(cfg: Config, inputs: decompose.Inputs) -> int:
@@ -43,12 +44,12 @@ def step(cfg: Config, inputs: decompose.Inputs, state: State) -> dict[str, Tenso
 
 def finish(cfg: Config, inputs: decompose.Inputs, state: State) -> tumble.Asset:
     refined = inputs.refined
-    plain = Material.constant(len(refined.albedo), torch.full((3,), 0.5), cfg.roughness)
+    material = Material.constant(len(refined.albedo), torch.full((3,), 0.5), cfg.roughness)
     logits = TEMPERATURE * torch.logit(refined.albedo.clamp(0.003, 0.98))
     return tumble.Asset(
         gaussians=refined.gaussians,
         gamma=refined.gamma,
-        material=replace(plain, albedo_logits=logits[:, None].repeat(1, 4, 1)),
+        material=replace(material, albedo_logits=logits[:, None].repeat(1, 4, 1)),
         environment=sh_lighting.environment(refined.light, cfg.rows),
         trajectory=refined.trajectory,
         camera=inputs.capture.camera,
@@ -58,13 +59,13 @@ def finish(cfg: Config, inputs: decompose.Inputs, state: State) -> tumble.Asset:
 def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> dict[str, float]:
     clip = tumble.demo_clip(out / "clip")
     capture = tumble.read_capture(clip)
-    found = tumble.estimate_poses(capture, recipe)
-    # By its full name: run as a script, this module would be called __main__, and a stored run could not find it.
+    poses = tumble.estimate_poses(capture, recipe)
+    # Imported by its full name: run as a script, this module is called __main__, which a stored run could not import.
     this: Any = __import__("examples.swap_a_stage", fromlist=["Config"])
     stages = {"ours": recipe.decompose, "stage 2 alone": this.Config()}
     psnr = {}
     for name, stage in stages.items():
-        asset = tumble.reconstruct(capture, recipe=replace(recipe, decompose=stage), poses=found)
+        asset = tumble.reconstruct(capture, recipe=replace(recipe, decompose=stage), poses=poses)
         scores = tumble.evaluate(asset, clip, poses_given=False, cfg=recipe.relight)
         psnr[name] = scores["regions"]["shared"]["albedo.psnr_fg_srgb"]
         print(f"{name:14} albedo {psnr[name]:.1f} dB on the object")

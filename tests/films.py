@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tumble.demo import bundled
+from tumble.demo import bundled_folder
 from tumble.io import files, video
 
 HEIGHT, WIDTH, SIDE = 130, 160, 96
@@ -79,8 +79,8 @@ def _cloud(rng: np.random.Generator, sigma: float) -> np.ndarray:
 @cache
 def _demo(n: int) -> tuple[np.ndarray, np.ndarray]:
     """The first frames of the bundled clip and their coverage in [0, 1], made smaller."""
-    clip = [frame for frame, _ in zip(video.read_clip(bundled() / "clip.mp4"), range(n), strict=False)]
-    masks = [files.read_image(bundled() / "masks" / f"{i:04d}.png")[..., 0] / 255.0 for i in range(n)]
+    clip = [frame for frame, _ in zip(video.read_clip(bundled_folder() / "clip.mp4"), range(n), strict=False)]
+    masks = [files.read_image(bundled_folder() / "masks" / f"{i:04d}.png")[..., 0] / 255.0 for i in range(n)]
     small = [cv2.resize(f.astype(np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA) for f in clip]
     shares = [cv2.resize(m, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for m in masks]
     # The clip is over black: its border pixels are darkened by their coverage already.

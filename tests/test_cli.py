@@ -47,8 +47,8 @@ def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(
         (["synth", "nowhere.glb", "--env", "white", "-o", "OUT"], "nowhere.glb: is missing"),
         (["synth", "nowhere.glb", "--env", "white", "-o", "OUT", "--fov", "500"], "fov is out of range: 500"),
         (["evaluate", "nowhere", "nowhere-either"], "nowhere-either: is missing"),
-        (["evaluate", "nowhere"], "nowhere is no finished run: name the capture"),
-        (["run", "film.mp4", "-o", "OUT", "--matcher", "mixd"], "no 'mixd' in tumble/matching; there are: aliked"),
+        (["evaluate", "nowhere"], "nowhere is not a finished run: give the capture"),
+        (["run", "film.mp4", "-o", "OUT", "--matcher", "mixd"], "no 'mixd' in tumble/matching; available: aliked"),
     ],
 )
 def test_an_error_is_one_line_that_names_the_file_and_ends_with_code_1(

@@ -1,4 +1,4 @@
-"""The examples do what they say, by the recipe that takes seconds."""
+"""The examples run with the SMOKE recipe, in seconds, and write what they document."""
 
 import math
 from pathlib import Path
@@ -16,7 +16,7 @@ RECIPE = recipes.replace(recipes.SMOKE, track=QUICK)
 
 @pytest.fixture(autouse=True)
 def short_clip(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first frames of the bundled clip."""
+    """Unpack only the first 12 frames of the bundled clip."""
     unpack = demo.unpack
 
     def shortened(out: Path) -> Path:
@@ -29,21 +29,21 @@ def short_clip(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "unpack", shortened)
 
 
-def test_a_clip_becomes_pictures_under_another_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_clip_is_reconstructed_and_relit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asset = reconstruct_and_relight.main(tmp_path, RECIPE)
     assert torch.isfinite(asset.environment.radiance).all()
     assert all(files.read_image(tmp_path / name).max() > 30 for name in ("albedo.png", "sunset.png"))
     assert "refine: step 30 of 30" in capsys.readouterr().out
 
 
-def test_own_poses_stay_as_they_are(tmp_path: Path) -> None:
+def test_given_poses_are_not_changed(tmp_path: Path) -> None:
     scores = bring_your_own_poses.main(tmp_path, RECIPE)
     assert scores["poses"]["poses.rotation_mean_degrees"] < 0.01
     assert (tmp_path / "export" / "asset.ply").is_file()
     assert (tmp_path / "scores" / "sheet.png").is_file()
 
 
-def test_a_stage_is_swapped(tmp_path: Path) -> None:
+def test_a_custom_stage_replaces_stage_3(tmp_path: Path) -> None:
     psnr = swap_a_stage.main(tmp_path, RECIPE)
     assert psnr["ours"] != psnr["stage 2 alone"]
     assert all(math.isfinite(value) for value in psnr.values())

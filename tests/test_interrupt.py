@@ -155,7 +155,7 @@ def test_a_run_of_a_film_killed_at_ten_random_moments_goes_on_to_the_same_bits(t
     film = written(scene().pictures, tmp_path / "x.mp4")
 
     def everything(out: Path) -> None:
-        pipeline.reconstruct(pipeline.ingested(film, out, FILM_OPTIONS), out, RECIPE)
+        pipeline.reconstruct(pipeline.capture_of(film, out, FILM_OPTIONS), out, RECIPE)
 
     # The first one also compiles and loads what the others find ready.
     everything(tmp_path / "warm")
@@ -183,27 +183,28 @@ def test_two_processes_never_work_in_one_folder_and_a_killed_one_lets_go(capture
         warnings.simplefilter("ignore", DeprecationWarning)
         process = os.fork()
     if process == 0:
-        with run.alone(out):
+        with run.exclusive_access(out):
             os.write(told, b"x")
             time.sleep(60)
         os._exit(0)
     assert os.read(inside, 1) == b"x"
-    with pytest.raises(BadFile, match=rf"run: is being worked in by another process, {process} \(wait until"):
+    with pytest.raises(BadFile, match=rf"run: is in use by another process, {process} \(wait until"):
         pipeline.reconstruct(capture, out, RECIPE)
     os.kill(process, signal.SIGKILL)
     os.waitpid(process, 0)
     assert (out / run.LOCK).exists()
-    with run.alone(out), pytest.raises(BadFile, match=f"another process, {os.getpid()}"), run.alone(out):
+    is_locked = pytest.raises(BadFile, match=f"another process, {os.getpid()}")
+    with run.exclusive_access(out), is_locked, run.exclusive_access(out):
         pass
     assert not out.exists() or list(out.iterdir()) == []
 
 
 def test_a_lock_leaves_nothing_where_nothing_was_made(tmp_path: Path) -> None:
-    with pytest.raises(BadFile, match="nothing readable"), run.alone(tmp_path / "run"):
+    with pytest.raises(BadFile, match="nothing readable"), run.exclusive_access(tmp_path / "run"):
         raise BadFile(tmp_path, "nothing readable")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")
-    with pytest.raises(BadFile, match="is a file"), run.alone(tmp_path / "file"):
+    with pytest.raises(BadFile, match="is a file"), run.exclusive_access(tmp_path / "file"):
         pass
 
 
@@ -213,12 +214,12 @@ def test_only_what_dead_processes_left_half_written_is_swept(tmp_path: Path) -> 
         os._exit(0)
     os.waitpid(dead, 0)
     for owner in (dead, os.getpid(), os.getppid()):
-        (tmp_path / "a" / f"{files.PARTIAL}{owner}-xyz").mkdir(parents=True)
-        (tmp_path / f"{files.PARTIAL}{owner}-xyz.png").write_text("half of i")
+        (tmp_path / "a" / f"{files.PARTIAL_PREFIX}{owner}-xyz").mkdir(parents=True)
+        (tmp_path / f"{files.PARTIAL_PREFIX}{owner}-xyz.png").write_text("half of i")
     (tmp_path / "a" / "kept.png").write_text("")
-    files.sweep(tmp_path)
+    files.remove_partial_files(tmp_path)
     left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*"))
-    living = f"{files.PARTIAL}{os.getppid()}-xyz"
+    living = f"{files.PARTIAL_PREFIX}{os.getppid()}-xyz"
     assert left == [f"{living}.png", "a", f"a/{living}", "a/kept.png"]
 
 
@@ -234,7 +235,7 @@ def test_a_damaged_output_is_named_with_the_fix_and_the_fix_works(
     with (out / name).open("r+b") as file:
         file.truncate((out / name).stat().st_size // 2)
     read = (lambda: actions.finished(out)) if name == run.ASSET else None
-    with pytest.raises(BadFile, match=rf"{name}: is damaged: .*\(remove it, and give the command that made it again\)"):
+    with pytest.raises(BadFile, match=rf"{name}: is damaged: .*\(remove it and run the command that made it again\)"):
         read() if read else pipeline.reconstruct(capture, out, RECIPE)
     (out / name).unlink()
     pipeline.reconstruct(capture, out, RECIPE)
@@ -243,12 +244,12 @@ def test_a_damaged_output_is_named_with_the_fix_and_the_fix_works(
 
 def test_half_a_line_of_the_log_spoils_no_other(tmp_path: Path) -> None:
     opened = run.open(tmp_path / "run", Path("clip"), RECIPE)
-    assert run.records(opened.path) == []
+    assert run.log_records(opened.path) == []
     run.log(opened, {"n": 1})
     with (opened.path / run.LOG).open("a") as file:
         file.write('{"time": "2026-')
     run.log(opened, {"n": 2})
-    assert [record["n"] for record in run.records(opened.path)] == [1, 2]
+    assert [record["n"] for record in run.log_records(opened.path)] == [1, 2]
 
 
 def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
@@ -272,7 +273,7 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(OSError, match=r"Read-only file system \(choose a folder that can be written"), run.alone(whole):
+    with pytest.raises(OSError, match=r"system \(choose a folder that can be written"), run.exclusive_access(whole):
         pass
 
 
@@ -281,15 +282,15 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
 
 def test_a_run_takes_up_the_capture_of_its_own_film_and_options_alone(tmp_path: Path) -> None:
     film, out = written(scene().pictures, tmp_path / "x.mp4"), tmp_path / "run"
-    made = pipeline.ingested(film, out, FILM_OPTIONS)
+    made = pipeline.capture_of(film, out, FILM_OPTIONS)
     before = finished_run(out)
-    assert pipeline.ingested(film, out, FILM_OPTIONS) == made
+    assert pipeline.capture_of(film, out, FILM_OPTIONS) == made
     film.rename(tmp_path / "moved.mp4")
-    assert pipeline.ingested(tmp_path / "moved.mp4", out, FILM_OPTIONS) == made
-    with pytest.raises(BadFile, match=r"in another way: options\.frames is 16 there and 12 here \(choose another"):
-        pipeline.ingested(tmp_path / "moved.mp4", out, dataclasses.replace(FILM_OPTIONS, frames=12))
-    with pytest.raises(BadFile, match=r"of another film, .*: footage is"):
-        pipeline.ingested(written(scene(18).pictures, film), out, FILM_OPTIONS)
+    assert pipeline.capture_of(tmp_path / "moved.mp4", out, FILM_OPTIONS) == made
+    with pytest.raises(BadFile, match=r"other options: options\.frames is 16 in the folder, 12 was requested"):
+        pipeline.capture_of(tmp_path / "moved.mp4", out, dataclasses.replace(FILM_OPTIONS, frames=12))
+    with pytest.raises(BadFile, match=r"of other footage or made .*: footage is"):
+        pipeline.capture_of(written(scene(18).pictures, film), out, FILM_OPTIONS)
     assert finished_run(out) == before
 
 
@@ -297,9 +298,9 @@ def test_a_folder_of_pictures_is_footage_unless_it_is_a_capture(capture: Path, t
     for i in range(6):
         alpha = np.where(scene().object[i], 255, 0).astype(np.uint8)
         files.write_png(tmp_path / "in" / f"{i}.png", np.dstack([scene().pictures[i], alpha]))
-    made = pipeline.ingested(tmp_path / "in", tmp_path / "run", FootageOptions(fov=40.0))
+    made = pipeline.capture_of(tmp_path / "in", tmp_path / "run", FootageOptions(fov=40.0))
     assert len(folder.load(made)) == 6
-    assert pipeline.ingested(capture, tmp_path / "other", FootageOptions()) == capture
+    assert pipeline.capture_of(capture, tmp_path / "other", FootageOptions()) == capture
     assert not (tmp_path / "other").exists()
 
 

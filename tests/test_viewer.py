@@ -1,4 +1,4 @@
-"""A run in the browser: what the page is told to show is what the run holds, before its end and after."""
+"""The viewer: the page shows the contents of the run directory, during a run and after it."""
 
 import socket
 import sys
@@ -27,28 +27,28 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def test_a_finished_run_shows_the_maps_of_its_asset(whole: Path, capture: Path) -> None:  # noqa: F811
+def test_the_snapshot_of_a_finished_run_has_the_maps_of_its_asset(whole: Path, capture: Path) -> None:  # noqa: F811
     asset = tree.load(Asset, whole / "asset.safetensors")
-    seen = viewer.look(whole, folder.load(capture))
-    assert seen.stage == "finished"
-    assert list(seen.colours) == ["as photographed", "albedo", "roughness", "normals"]
+    snapshot = viewer.read_snapshot(whole, folder.load(capture))
+    assert snapshot.stage == "finished"
+    assert list(snapshot.colours) == ["as captured", "albedo", "roughness", "normals"]
     assert asset.material is not None
-    torch.testing.assert_close(linear_from_srgb(seen.colours["albedo"]), asset.material.albedo.mean(1))
-    torch.testing.assert_close(2 * seen.colours["normals"] - 1, asset.gaussians.normals)
-    assert seen.trajectory is not None
-    assert len(seen.trajectory) == 8
+    torch.testing.assert_close(linear_from_srgb(snapshot.colours["albedo"]), asset.material.albedo.mean(1))
+    torch.testing.assert_close(2 * snapshot.colours["normals"] - 1, asset.gaussians.normals)
+    assert snapshot.trajectory is not None
+    assert len(snapshot.trajectory) == 8
 
 
 @pytest.mark.parametrize(
-    ("stage", "stop", "found"), [(refine, 25, "stage 2, step 26"), (decompose, 6, "stage 3, step 7")]
+    ("stage", "stop", "label"), [(refine, 25, "stage 2, step 26"), (decompose, 6, "stage 3, step 7")]
 )
-def test_a_run_that_is_still_going_on_shows_its_last_checkpoint(
+def test_the_snapshot_of_an_unfinished_run_is_its_last_checkpoint(
     capture: Path,  # noqa: F811
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     stage,
     stop: int,
-    found: str,
+    label: str,
 ) -> None:
     step, last = stage.step, []
 
@@ -59,7 +59,7 @@ def test_a_run_that_is_still_going_on_shows_its_last_checkpoint(
 
             if stage is decompose:
                 with torch.no_grad():
-                    state.params.log_tint.add_(torch.tensor([0.4, 0.1, -0.2]))
+                    state.params.log_specular_scale.add_(torch.tensor([0.4, 0.1, -0.2]))
             last[:] = cfg, inputs, state
             signal.raise_signal(signal.SIGINT)
         return result
@@ -67,31 +67,31 @@ def test_a_run_that_is_still_going_on_shows_its_last_checkpoint(
     monkeypatch.setattr(stage, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         pipeline.reconstruct(capture, tmp_path / "run", RECIPE)
-    seen = viewer.look(tmp_path / "run", folder.load(capture))
-    assert seen.stage == found
-    assert seen.gaussians is not None
-    assert all(values.shape == (len(seen.gaussians), 3) for values in seen.colours.values())
-    assert ("roughness" in seen.colours) == (stage is decompose)
-    assert (seen.environment is not None) == (stage is decompose)
+    snapshot = viewer.read_snapshot(tmp_path / "run", folder.load(capture))
+    assert snapshot.stage == label
+    assert snapshot.gaussians is not None
+    assert all(values.shape == (len(snapshot.gaussians), 3) for values in snapshot.colours.values())
+    assert ("roughness" in snapshot.colours) == (stage is decompose)
+    assert (snapshot.environment is not None) == (stage is decompose)
     if stage is decompose:
-        # What the stage would put out if it ended now: the tint of the highlight is shared out.
+        # The snapshot equals the stage's output at this step, in which albedo and light absorb the specular scale.
         ended = decompose.finish(*last)
         assert ended.material is not None
-        torch.testing.assert_close(linear_from_srgb(seen.colours["albedo"]), ended.material.albedo.mean(1))
+        torch.testing.assert_close(linear_from_srgb(snapshot.colours["albedo"]), ended.material.albedo.mean(1))
 
 
-def test_the_log_becomes_a_line(tmp_path: Path) -> None:
+def test_progress_is_the_last_record_of_the_log(tmp_path: Path) -> None:
     opened = run.open(tmp_path / "run", Path("clip"), RECIPE)
-    assert viewer.progress(opened.path) == "no stage has begun"
+    assert viewer.progress(opened.path) == "no stage has started"
     run.log(opened, {"name": "refine", "event": "start"})
-    assert viewer.progress(opened.path) == "refine begins"
+    assert viewer.progress(opened.path) == "refine started"
     run.log(opened, {"name": "refine", "step": 5, "of": 30, "eta": 12.0, "metrics": {"loss": 0.25}})
     assert viewer.progress(opened.path) == "refine: step 5 of 30, 12 s to go; loss 0.25"
     run.log(opened, {"name": "refine", "event": "done", "seconds": 31.2})
     assert viewer.progress(opened.path) == "refine finished after 31 s"
 
 
-def test_without_viser_the_way_to_get_it_is_said(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_the_error_without_viser_has_the_install_command(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ModuleNotFoundError, match=r"needs viser: pip install 'tumble\[view\]'"):
         viewer.serve(whole, "127.0.0.1", 0)
@@ -118,31 +118,31 @@ def test_the_page_is_served_and_its_scene_holds_the_run(window: viewer.ViewerWin
         assert node(name) is not None, name
     camera = asset.trajectory.T_cam_obj[3].inverse()
     np.testing.assert_allclose(node("/cameras/3.png").position, camera.xyz.numpy(), atol=1e-6)
-    assert "finished" in window.state.content
-    assert window.map.options == ("as photographed", "albedo", "roughness", "normals")
+    assert "finished" in window.status.content
+    assert window.map.options == ("as captured", "albedo", "roughness", "normals")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_choices_change_what_is_shown(window: viewer.ViewerWindow, whole: Path) -> None:  # noqa: F811
+def test_controls_change_the_scene(window: viewer.ViewerWindow, whole: Path) -> None:  # noqa: F811
     node = window.server.scene.get_handle_by_name
     window.map.value = "normals"
-    window._object()
+    window._show_object()
     normals = tree.load(Asset, whole / "asset.safetensors").gaussians.normals.numpy()
     np.testing.assert_allclose(node("/object").rgbs / 255, 0.5 + 0.5 * normals, atol=1 / 255)
-    turns = []
+    orientations = []
     for frame in (0, 5):
         window.frame.value = frame
-        window._choose()
-        turns.append(np.array(node("/light").wxyz))
-    assert window.look.trajectory is not None
-    # A light that stands still with the camera turns about the object.
-    assert np.abs(turns[0] - turns[1]).max() > 0.05
-    window.sky.value = False
-    window._choose()
+        window._show_frame()
+        orientations.append(np.array(node("/light").wxyz))
+    assert window.snapshot.trajectory is not None
+    # A light that is fixed to the camera rotates in the object frame.
+    assert np.abs(orientations[0] - orientations[1]).max() > 0.05
+    window.light_visible.value = False
+    window._show_frame()
     assert not node("/light").visible
 
 
-def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_a_run_raises(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="needs the extra `view`")
-    with pytest.raises(BadFile, match="is no run"):
+    with pytest.raises(BadFile, match="is not a run directory"):
         viewer.ViewerWindow(tmp_path, "127.0.0.1", free_port())

@@ -1,38 +1,38 @@
-"""tumble: object motion, shape, material and light from one video of an object turned in the hand.
+"""tumble: motion, shape, material and light of an object from one video of it being turned in the hand.
 
     import tumble
 
     asset = tumble.reconstruct("captures/mug", "runs/mug")
-    pictures = list(tumble.relight(asset, "studio.hdr"))
+    images = list(tumble.relight(asset, "studio.hdr"))
     tumble.export_asset(asset, "runs/mug/export")
 
-Each folder is a room, with what it offers in its `__init__`. In the order of the data:
+Each folder is a room: one part of the method, whose `__init__` lists what other rooms use. In the order of the data:
 
-    datasets            readers of captures: ours, BOP, HO3D; drop a file here for another layout
-    preprocess          from a film, or pictures with a COLMAP model, to a capture: frames, masks, lens
-    matching            pixel correspondences between frames; drop a file here for another matcher
-    poses               stage 1: how the object moved; `sfm` from matches and silhouettes, `progressive` as in the paper
-    inverse_rendering   stages 2 and 3: Gaussians and poses, then albedo, roughness and light; losses, densification
-    rendering           rasterizer, ray tracer, BRDF, shading, relighting
-    export              asset to GLB, PLY, light and pose files; mesh and texture baking
-    report              the page of a run, with its health card
-    evaluation          metrics, and predictions against truth
-    synthetic           captures with truth, path traced by Mitsuba
+    datasets            readers of capture folders: ours, BOP, HO3D; a new layout is a new file here
+    preprocess          converts a video, or images with a COLMAP model, to a capture: frames, masks, lens
+    matching            pixel correspondences between frames; a new matcher is a new file here
+    poses               stage 1, object poses: `sfm` from matches and silhouettes, `progressive` as in the paper
+    inverse_rendering   stage 2, Gaussians and poses; stage 3, albedo, roughness and light; losses, densification
+    rendering           rasterization, ray tracing, BRDF, shading, relighting
+    export              asset to textured GLB, PLY, environment map and pose files
+    report              the report.html of a run, with its health card
+    evaluation          metrics, and scores of predictions against ground truth
+    synthetic           captures with ground truth, path traced by Mitsuba
 
-Beneath them:
+Used by all of these:
 
-    scene               what all speak of: camera, trajectory, Gaussians, material, environment, capture, asset
-    engine              the training loop, optimizer and run directories; knows no scene
-    backends            kernels on tensors: reference, CPU, CUDA; drop a file here for another renderer
-    maths, io           rotations, directions, harmonics, images; files, films, trees of tensors, weights
+    scene               camera, trajectory, Gaussians, material, environment, capture, match, asset
+    engine              training loop, optimizer, run directories; independent of the scene
+    backends            rendering kernels on tensors: reference, CPU, CUDA; a new renderer is a new file here
+    maths, io           rotations, directions, spherical harmonics, images; files, video, safetensors, weights
 
-Beside them: `pipeline` (the stages in order), `recipes` (their settings), `actions` (what is done with an asset),
-`cli`, `demo`, `doctor`, `viewer`. Which room may import which stands in `tests/test_guards.py`.
+Files beside the rooms: `pipeline` (the stages in order), `recipes` (their settings), `actions` (relight, export,
+evaluate), `cli`, `demo`, `doctor`, `viewer`. `tests/test_guards.py` lists which room may import which.
 """
 
 from typing import TYPE_CHECKING
 
-from tumble._lazy import lazily
+from tumble._lazy import lazy_getattr
 
 if TYPE_CHECKING:
     from tumble.actions import evaluate, export_asset, relight, render
@@ -74,7 +74,7 @@ __all__ = [
     "render",
 ]
 
-__getattr__ = lazily(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "actions": ("evaluate", "export_asset", "relight", "render"),

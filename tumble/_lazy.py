@@ -1,23 +1,23 @@
-"""Faces that load nothing before it is asked for: the package's own, and those of rooms that the command line names."""
+"""Lazy imports for the `__init__` of packages whose import must stay fast (PEP 562)."""
 
 import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def lazily(package: str, offered: Mapping[str, tuple[str, ...]]) -> Callable[[str], Any]:
-    """A package's `__getattr__` (PEP 562): each name is imported from its module when it is first used.
+def lazy_getattr(package: str, exports: Mapping[str, tuple[str, ...]]) -> Callable[[str], Any]:
+    """The `__getattr__` of a package (PEP 562) that imports each exported name from its module at first use.
 
     Args:
         package: Name of the package.
-        offered: Names by the module that defines them, below the package. None may be that of a module, which would
-            hide it once imported.
+        exports: Exported names by the submodule that defines them. No exported name may equal the name of a submodule,
+            because the imported submodule would hide it.
     """
-    homes = {name: f"{package}.{module}" for module, names in offered.items() for name in names}
+    modules = {name: f"{package}.{module}" for module, names in exports.items() for name in names}
 
     def load(name: str) -> Any:
-        if name not in homes:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(homes[name]), name)
+        return getattr(importlib.import_module(modules[name]), name)
 
     return load

@@ -1,7 +1,7 @@
-"""What is done with a finished asset, and with the run that holds one: render, relight, film, export, score.
+"""Operations on a finished asset or run: render, relight, make a turntable video, export, evaluate.
 
-Functions of an `Asset` are for notebooks; those whose names end in `_run` find all they need in a run directory, and
-write into it.
+Functions that take an `Asset` are for notebooks. Functions that take a run directory are the commands of the command
+line: they read the asset from the run and write their output into it.
 """
 
 import hashlib
@@ -19,35 +19,39 @@ from torch import Tensor
 
 from tumble import pipeline
 from tumble.engine import run
-from tumble.evaluation import Report, Subject, align_views, predict_views, read_subject, score
+from tumble.evaluation import CaptureWithTruth, Report, align_views, predict_views, read_with_truth, score
 from tumble.export import PresetName, write_asset
-from tumble.io import files, named, video
+from tumble.io import files, load_plugin, video
 from tumble.maths import SE3, to_srgb8
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box
 from tumble.recipes import Recipe
-from tumble.rendering import Buffers, antialiased, usable_device
+from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
 from tumble.rendering import relight as relighting
 from tumble.report import write_report
 from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
-LIGHT_NOTE = "light.json"
-"""In a folder of relit pictures: which light they show."""
-FILM_FRAMES, FILM_SIDE, FILM_ELEVATION = 90, 384, math.radians(20)
-"""Of a turntable film: three seconds, its longer side [pixels], and how far the camera looks down [radians]."""
+LIGHT_FILE = "light.json"
+"""File in a folder of relit images that records the environment map."""
+TURNTABLE_FRAMES = 90
+"""Frames of a turntable video: three seconds."""
+TURNTABLE_SIDE = 384
+"""Longer side of a turntable video [pixels]."""
+TURNTABLE_ELEVATION = math.radians(20)
+"""Elevation of the camera of a turntable video [radians]."""
 
 
 # Assets ---------------------------------------------------------------------------------------------------------------
 
 
 def render(asset: Asset, T_cam_obj: SE3 | int = 0, camera: Camera | None = None) -> Buffers:
-    """Draw an asset's maps: albedo and roughness (`features`), normals, depth and coverage.
+    """Render the G-buffer of an asset: albedo and roughness (`features`), normals, depth and opacity.
 
     Args:
-        T_cam_obj: The object's pose, or the number of a training frame whose pose it is.
-        camera: The capture's when None.
+        T_cam_obj: Pose of the object, or the index of a training frame whose pose to use.
+        camera: Default: the camera of the capture.
     """
     pose = asset.trajectory.T_cam_obj[T_cam_obj] if isinstance(T_cam_obj, int) else T_cam_obj
-    return antialiased(asset, pose, camera or asset.camera)
+    return antialiased_gbuffer(asset, pose, camera or asset.camera)
 
 
 def relight(
@@ -59,15 +63,14 @@ def relight(
     cfg: relighting.Config | None = None,
     fast: bool = False,
 ) -> Iterator[Float[Tensor, "h w 3"]]:
-    """Draw an asset under another light, view by view: linear radiance over black.
+    """Render an asset under another light, view by view: linear radiance over black.
 
     Args:
-        light: In the frame in which it stands still, or the path of a lat-long .hdr or .exr.
-        trajectory: Poses, and what the light stands still with; when None those of the training frames, with the light
-            standing still with the object.
-        camera: The capture's when None.
-        cfg: How many rays.
-        fast: Prefiltered light without shadows, instead of rays.
+        light: Environment map in the env frame of `trajectory`, or the path of an equirectangular .hdr or .exr file.
+        trajectory: Poses to render. Default: those of the training frames, with the light fixed to the object.
+        camera: Default: the camera of the capture.
+        cfg: Numbers of rays.
+        fast: Use prefiltered light without shadows instead of ray tracing.
     """
     environment = light if isinstance(light, Environment) else Environment.read(Path(light))
     trajectory = trajectory or Trajectory(asset.trajectory.T_cam_obj, "object")
@@ -83,12 +86,14 @@ def export_asset(
     names: list[str] | None = None,
     scale_mm: float | None = None,
 ) -> Path:
-    """Write an asset for other programs (docs/export.md): textured GLB, Gaussian PLYs, light, poses.
+    """Export an asset for other programs (docs/export.md): textured GLB, Gaussian PLYs, environment map, poses.
 
     Args:
-        preset: web: 20k triangles, 2k textures; game: 8k, 1k; film: 50k, 4k; splat: the Gaussians alone.
-        names: Of the training frames; their numbers when None.
-        scale_mm: The largest distance between two points of the object, as a ruler finds it [mm]: files in metres.
+        folder: Folder for the files; also returned.
+        preset: web: 20k triangles, 2k textures; game: 8k, 1k; film: 50k, 4k; splat: Gaussians only.
+        names: File names of the training frames. Default: their numbers.
+        scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
+            metres.
     """
     names = names or [f"{number:04}.png" for number in range(len(asset.trajectory))]
     write_asset(asset, names, Path(folder), preset, scale_mm)
@@ -104,18 +109,18 @@ def evaluate(
     out: Path | str | None = None,
     cfg: relighting.Config | None = None,
 ) -> Report:
-    """Score an asset against a capture's truth (docs/metrics.md).
+    """Score an asset against the ground truth of a capture (docs/metrics.md).
 
     Args:
-        capture: A capture with truth.
-        names: Training frames of the asset's trajectory, in order; all of the capture's when None.
-        poses_given: Whether the asset's poses are those of the capture; else both are aligned first.
-        out: Folder for the prediction, `report.json` and `sheet.png`. None keeps nothing.
-        cfg: How many rays relit pictures take.
+        capture: Path of a capture with ground truth.
+        names: File names of the asset's training frames, in order. Default: all of the capture's.
+        poses_given: Whether the asset's poses are those of the capture; otherwise the two are aligned first.
+        out: Folder for the prediction, `report.json` and `sheet.png`. None saves nothing.
+        cfg: Numbers of rays of relit images.
     """
-    known = read_subject(Path(capture))
+    known = read_with_truth(Path(capture))
     names = names or known.capture.names
-    aligned = align_views(asset.trajectory, names, known.capture, known.truth, given=poses_given)
+    aligned = align_views(asset.trajectory, names, known.capture, known.truth, known_poses=poses_given)
     with tempfile.TemporaryDirectory() as scratch:
         where = Path(out or scratch)
         return _scored(asset, known, aligned, names, where, where, cfg or relighting.Config())
@@ -123,14 +128,14 @@ def evaluate(
 
 def _scored(
     asset: Asset,
-    known: Subject,
+    known: CaptureWithTruth,
     aligned: tuple[Any, str],
     names: tuple[str, ...],
     folder: Path,
     where: Path,
     cfg: relighting.Config,
 ) -> Report:
-    """Render a prediction into `folder/prediction`, and score it into `where`."""
+    """Render a prediction into `folder/prediction`, score it, and write the scores into `where`."""
     alignment, words = aligned
     answer = predict_views(cfg, asset, known.capture, known.truth, alignment, names=names)
     answer.write(folder / run.PREDICTION)
@@ -159,77 +164,77 @@ def run_capture(
     pick: bool = False,
     device: str = "cpu",
 ) -> Path:
-    """Reconstruct a capture, or footage that becomes one, in a run directory, and write its report; returns the page.
+    """Reconstruct a capture or footage in a run directory and write the report; returns the path of the report.
 
     Args:
-        path: A film, pictures, or a capture.
-        options: How footage becomes a capture.
-        pick: Ask a person in the browser where the object is.
+        path: A video, a folder of images, or a capture.
+        options: How footage is converted to a capture.
+        pick: Let the user draw a box around the object in the browser.
 
     Raises:
         ValueError: There is no such matcher or device.
-        BadFile: As `pipeline.ingested` and `pipeline.reconstruct`.
+        BadFile: See `pipeline.capture_of` and `pipeline.reconstruct`.
     """
     place = usable_device(device)
-    named("matching", recipe.matcher)  # before a film is cut up for it
+    load_plugin("matching", recipe.matcher)  # fail before the video is converted
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
-    capture = pipeline.ingested(path, out, options)
+    capture = pipeline.capture_of(path, out, options)
     pipeline.reconstruct(capture, out, recipe, poses=poses, device=place)
     return write_report(out, capture=capture)
 
 
 def evaluate_folder(prediction: Path, capture: Path | None = None, out: Path | None = None) -> Report:
-    """Score a prediction folder, or a run, which is rendered first.
+    """Score a prediction folder, or a run, whose prediction is rendered first.
 
     Raises:
-        ValueError: A prediction folder does not say which capture it answers.
+        ValueError: A prediction folder is given without its capture.
     """
     if (prediction / run.ASSET).is_file():
         return evaluate_run(prediction, capture, out)
     if capture is None:
-        raise ValueError(f"{prediction} is no finished run: name the capture that it answers, after it")
+        raise ValueError(f"{prediction} is not a finished run: give the capture of the prediction as second argument")
     return score(prediction, capture, out or prediction)
 
 
 def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = None) -> Report:
-    """Render a finished run's answer for a capture and score it.
+    """Render a finished run's prediction for a capture and score it.
 
-    A run that found its poses, or had them from COLMAP, has an object frame of its own: it is aligned first.
+    A run with estimated poses, or with poses of COLMAP, has its own object frame and is aligned first.
 
     Args:
-        capture: With truth; where the run found its own when None.
-        where: Folder for `report.json` and `sheet.png`; the run directory when None.
+        capture: Capture with ground truth. Default: the capture of the run.
+        where: Folder for `report.json` and `sheet.png`. Default: the run directory.
 
     Raises:
-        BadFile: There is no finished run in `out`, or the capture has no truth.
+        BadFile: There is no finished run in `out`, or the capture has no ground truth.
     """
     asset = finished(out)
-    known = read_subject(capture or run.source(out))
+    known = read_with_truth(capture or run.capture_source(out))
     names = source_names(out, known.capture)
     own_frame = (out / run.TRACK).is_dir() or (out / run.CAPTURE / PROVENANCE).is_file()
     given = known.capture.trajectory is not None and not own_frame
-    lens = _lens(out, asset, known.capture)
+    lens = _focal_ratio(out, asset, known.capture)
     training = asset.trajectory, names, known.capture, known.truth
-    aligned = align_views(*training, given=given, lens=lens)
+    aligned = align_views(*training, known_poses=given, focal_ratio=lens)
     return _scored(asset, known, aligned, names, out, where or out, _relighting(out))
 
 
-def _lens(out: Path, asset: Asset, capture: Capture) -> float:
-    """The capture's focal length over the run's, in the same pixels; 1 of a film whose focal length is no guess."""
+def _focal_ratio(out: Path, asset: Asset, capture: Capture) -> float:
+    """Ratio of the capture's focal length to the run's, in the same pixels; 1 if the run's was given by the user."""
     focal, _, cx, _ = asset.camera.fx_fy_cx_cy.tolist()
     whole, note = asset.camera.width, out / run.CAPTURE / PROVENANCE
     if note.is_file():
         said = files.read_json(note)
         if said.get("focal_source") != "guess":
             return 1.0
-        # The lens of a film looks through its middle, of which the run's pictures are a window.
+        # The principal point is the centre of the video; the run's images are a window of it.
         _, left, _, width = said["window_top_left_height_width"]
         whole = 2 * (cx + left * asset.camera.width / width)
     return float(capture.camera.fx_fy_cx_cy[0]) / (focal * capture.camera.width / whole)
 
 
 def source_names(out: Path, capture: Capture) -> tuple[str, ...]:
-    """Names in a capture of the frames of a run, in order: those of a film are found by their numbers."""
+    """Names in a capture of the frames of a run, in order; frames of a video are identified by their numbers."""
     names, note = tuple(files.read_json(out / run.POSES)), out / run.CAPTURE / PROVENANCE
     if not note.is_file():
         return names
@@ -237,65 +242,67 @@ def source_names(out: Path, capture: Capture) -> tuple[str, ...]:
     return tuple(capture.names[i] if (i := numbers.get(name, len(capture))) < len(capture) else name for name in names)
 
 
-def relight_run(out: Path, env: Path, pictures: Path | None = None, *, fast: bool, exposure: float = 0.0) -> Path:
-    """Write a run's object under another light as `0000.png`, ..., one per training frame; returns their folder.
+def relight_run(out: Path, env: Path, images: Path | None = None, *, fast: bool, exposure: float = 0.0) -> Path:
+    """Render a run's object under another light, one image per training frame; returns the folder of the images.
 
-    The light's frame is the object's.
+    The light is fixed to the object.
 
     Args:
-        pictures: None: `RUN/relit/<name of the light>`, or with a number where another light has that name.
-        exposure: How much brighter the pictures are than the light makes them [stops].
+        images: Folder for `0000.png`, ... Default: `RUN/relit/<name of the map>`, numbered if another map has
+            that name.
+        exposure: Exposure of the images relative to the environment map [stops].
 
     Raises:
         BadFile: There is no finished run in `out`, or the light cannot be read.
     """
     asset = finished(out)
     views = relight(asset, env, cfg=_relighting(out), fast=fast)
-    pictures = pictures or _relit_folder(out, env)
+    images = images or _relit_folder(out, env)
     n = len(asset.trajectory)
     for number, linear in enumerate(track(views, f"relighting under {env.stem}", n, transient=True)):
-        files.write_png(pictures / f"{number:04}.png", to_srgb8(2**exposure * linear).numpy())
-    return pictures
+        files.write_png(images / f"{number:04}.png", to_srgb8(2**exposure * linear).numpy())
+    return images
 
 
 def _relit_folder(out: Path, env: Path) -> Path:
     content = hashlib.sha256(env.read_bytes()).hexdigest()
     for number in itertools.count(1):
         folder = out / run.RELIT / (env.stem if number == 1 else f"{env.stem}-{number}")
-        note = folder / LIGHT_NOTE
+        note = folder / LIGHT_FILE
         if not note.is_file() or files.read_json(note).get("sha256") == content:
             files.write_json(note, {"light": str(env.resolve()), "sha256": content})
             return folder
-    raise AssertionError("numbers do not end")
+    raise AssertionError("unreachable")
 
 
-def relight_turntable(out: Path, env: Path, film: Path, *, fast: bool, exposure: float = 0.0) -> Path:
-    """Write a film of a run's object that turns once about its +y axis under another light; returns its path.
+def relight_turntable(out: Path, env: Path, clip: Path, *, fast: bool, exposure: float = 0.0) -> Path:
+    """Render a turntable video of a run's object under another light; returns its path.
 
-    Light and camera stand still; at the first frame the light's frame is the object's.
+    The object makes one revolution about its +y axis; light and camera are fixed. In the first frame the light's frame
+    is the object's.
 
     Args:
-        exposure: How much brighter the frames are than the light makes them [stops].
+        exposure: Exposure of the frames relative to the environment map [stops].
 
     Raises:
         BadFile: There is no finished run in `out`, or the light cannot be read.
     """
     asset, light, cfg = finished(out), Environment.read(env), _relighting(out)
-    # A film hides the noise of a quarter of the rays.
+    # A quarter of the rays is enough: in a video the noise averages out over frames.
     cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
-    R_gl_obj, turning = relighting.turntable(asset.trajectory, FILM_FRAMES, FILM_ELEVATION)
-    # A run's pictures are a window of its film's; here the object turns in their middle. H.264 wants even sides.
+    R_gl_obj, turning = relighting.turntable(asset.trajectory, TURNTABLE_FRAMES, TURNTABLE_ELEVATION)
+    # The run's images are a window of the video; here the object is in the centre. H.264 needs even sides.
     camera = asset.camera.centred()
-    scale = FILM_SIDE / max(camera.height, camera.width)
+    scale = TURNTABLE_SIDE / max(camera.height, camera.width)
     camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     views = relight(asset, light.rotated(R_gl_obj), turning, camera, cfg=cfg, fast=fast)
-    frames = track(views, f"turning under {env.stem}", FILM_FRAMES, transient=True)
-    video.write_clip(film, (to_srgb8(2**exposure * linear).cpu().numpy() for linear in frames))
-    return film
+    frames = track(views, f"turning under {env.stem}", TURNTABLE_FRAMES, transient=True)
+    video.write_clip(clip, (to_srgb8(2**exposure * linear).cpu().numpy() for linear in frames))
+    return clip
 
 
 def export_run(out: Path, folder: Path | None, preset: PresetName, scale_mm: float | None) -> Path:
-    """Write a run's object for other programs; returns the folder, `RUN/export/PRESET` when None.
+    """Export a run's object for other programs; returns the folder, by default `RUN/export/PRESET`.
 
     Raises:
         BadFile: There is no finished run in `out`.
@@ -307,5 +314,5 @@ def export_run(out: Path, folder: Path | None, preset: PresetName, scale_mm: flo
 
 
 def _relighting(out: Path) -> relighting.Config:
-    """The run's own way to relight."""
+    """The relighting settings of the run's recipe."""
     return relighting.Config(**run.recipe(out)["relight"])

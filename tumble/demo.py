@@ -1,7 +1,8 @@
-"""The bundled clip: a pot of our own making, turned in front of a still camera, with its truth; and its reconstruction.
+"""The bundled demo clip and its reconstruction.
 
-`tumble/data/demo/` is a pose-free capture folder whose training photographs are the frames of `clip.mp4`; everything in
-it was made by `build`, from code alone.
+The clip is a rendered video of a coffee pot that rotates in front of a still camera. `tumble/data/demo/` is a capture
+folder without poses, with ground truth; its training images are stored as the frames of `clip.mp4`. `build` generates
+all of it from code.
 """
 
 import shutil
@@ -16,61 +17,65 @@ from tumble.evaluation import Report
 from tumble.io import files, video
 from tumble.recipes import DRAFT, Recipe
 from tumble.report import write_report
-from tumble.synthetic import environment, other_environment, write_object
+from tumble.synthetic import room_environment, sunset_environment, write_pot
 
 CLIP = "clip.mp4"
+"""Name of the video in the bundled folder."""
 
 
-def bundled() -> Path:
-    """The folder of the bundled clip."""
+def bundled_folder() -> Path:
+    """Path of the bundled clip's folder inside the installed package."""
     return Path(str(resources.files("tumble"))) / "data" / "demo"
 
 
 def demo_clip(out: Path | str) -> Path:
-    """Write the bundled clip as a capture folder without poses, with its truth; returns `out`."""
+    """Write the bundled clip to `out` as a capture folder without poses, with ground truth; returns the folder."""
     return unpack(Path(out))
 
 
 def unpack(out: Path) -> Path:
-    """The bundled clip as a capture folder: its films' frames become pictures. Returns the folder."""
+    """Copy the bundled clip to `out` as a capture folder, with the video's frames as its images; returns the folder.
+
+    A folder that holds a capture already is returned unchanged.
+    """
     if (out / "transforms.json").exists():
         return out
-    shutil.copytree(bundled(), out, dirs_exist_ok=True, ignore=shutil.ignore_patterns("transforms.json"))
-    document = files.read_json(bundled() / "transforms.json")
+    shutil.copytree(bundled_folder(), out, dirs_exist_ok=True, ignore=shutil.ignore_patterns("transforms.json"))
+    document = files.read_json(bundled_folder() / "transforms.json")
     names = [frame["file_path"] for frame in document["frames"] if frame["split"] == "train"]
     for name, values in zip(names, video.read_clip(out / CLIP), strict=True):
-        files.write_png(files.inside(out, name), values)
+        files.write_png(files.path_inside(out, name), values)
     files.write_json(out / "transforms.json", document)
     return out
 
 
 def reconstruct_clip(out: Path, recipe: Recipe = DRAFT) -> tuple[Report, Path]:
-    """Reconstruct the bundled clip from its frames and masks alone, score it, and write its report.
+    """Reconstruct the bundled clip from its frames and masks, evaluate the result, and write the report page.
 
     Returns:
-        The scores (docs/metrics.md), and the page.
+        The scores (docs/metrics.md), and the path of the page.
 
     Raises:
         BadFile: `out` holds something else.
     """
-    with run.alone(out):
+    with run.exclusive_access(out):
         folder = unpack(out / run.CAPTURE)
     pipeline.reconstruct(folder, out, recipe)
     return actions.evaluate_run(out, folder), write_report(out)
 
 
 def build(out: Path = Path("tumble/data/demo")) -> None:
-    """Make the bundled clip anew: object, light, film, masks and truth (extra `synth`; minutes).
+    """Generate the bundled clip again: object, light, video, masks and ground truth (extra `synth`; takes minutes).
 
     $ python -c "from tumble.demo import build; build()"
     """
     from tumble.synthetic import SETTINGS_FILE, SynthOptions, render_capture
 
-    with tempfile.TemporaryDirectory() as folder_name:
-        work = Path(folder_name)
-        write_object(work / "pot.glb")
-        environment().write(work / "room.hdr")
-        other_environment().write(work / "sunset.hdr")
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        write_pot(work / "pot.glb")
+        room_environment().write(work / "room.hdr")
+        sunset_environment().write(work / "sunset.hdr")
         options = SynthOptions(
             env=str(work / "room.hdr"),
             relight=(str(work / "sunset.hdr"),),
@@ -81,9 +86,9 @@ def build(out: Path = Path("tumble/data/demo")) -> None:
             pose_free=True,
             video=True,
         )
-        made = render_capture(work / "pot.glb", work / "capture", options)
-        (made / SETTINGS_FILE).unlink()
-        for frame in capture_folder.load(made).names:
-            (made / "images" / frame).unlink()
+        capture = render_capture(work / "pot.glb", work / "capture", options)
+        (capture / SETTINGS_FILE).unlink()
+        for frame in capture_folder.load(capture).names:
+            (capture / "images" / frame).unlink()
         shutil.rmtree(out, ignore_errors=True)
-        shutil.copytree(made, out)
+        shutil.copytree(capture, out)

@@ -1,4 +1,4 @@
-"""What this machine offers, and the exact fix for what it lacks."""
+"""Environment check of `tumble doctor`: hardware, libraries and extras, and how to install what is missing."""
 
 import importlib.metadata
 import importlib.util
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from tumble import __version__
-from tumble.synthetic import OLDEST_LLVM, find_llvm
+from tumble.synthetic import MIN_LLVM, find_llvm
 
 
 @dataclass(frozen=True)
@@ -19,13 +19,15 @@ class DoctorFinding:
     """One line of the report."""
 
     subject: str
+    """What was checked."""
     state: str
+    """What was found."""
     fix: str = ""
-    """What to do; empty when all is well."""
+    """How to fix it; empty if nothing is wrong."""
 
 
 def findings() -> list[DoctorFinding]:
-    """Everything `tumble doctor` prints, in order."""
+    """All lines of the report, in the order in which `tumble doctor` prints them."""
     return [*_machine(), _renderer(), _compiler(), _codec(), _atlas(), *_extras()]
 
 
@@ -46,7 +48,7 @@ def _machine() -> Iterator[DoctorFinding]:
         yield DoctorFinding(
             "memory",
             f"{memory:.0f} GiB",
-            "" if memory >= 4 else "runs need about 4 GiB: close other programs",
+            "" if memory >= 4 else "a run needs about 4 GiB: close other programs",
         )
 
 
@@ -56,35 +58,37 @@ def _renderer() -> DoctorFinding:
     llvm = find_llvm()
     if llvm is not None:
         return DoctorFinding("tumble synth", f"Mitsuba on LLVM {llvm[1]} ({llvm[0]})")
-    how = {"Darwin": "brew install llvm", "Windows": "install LLVM 17 or newer from llvm.org"}
-    fix = how.get(platform.system(), f"apt install libllvm19 (any libLLVM >= {OLDEST_LLVM} will do)")
+    fixes = {"Darwin": "brew install llvm", "Windows": "install LLVM 17 or newer from llvm.org"}
+    fix = fixes.get(platform.system(), f"apt install libllvm19 (or any other libLLVM >= {MIN_LLVM})")
     return DoctorFinding(
-        "tumble synth", "Mitsuba in its scalar variant: right, but several times slower than with LLVM", fix
+        "tumble synth", "Mitsuba in its scalar variant: correct, but several times slower than with LLVM", fix
     )
 
 
 def _compiler() -> DoctorFinding:
-    found = next((path for name in ("c++", "g++", "clang++") if (path := shutil.which(name))), None)
-    if found:
-        return DoctorFinding("compiler", found)
+    compiler = next((path for name in ("c++", "g++", "clang++") if (path := shutil.which(name))), None)
+    if compiler:
+        return DoctorFinding("compiler", compiler)
     return DoctorFinding("compiler", "none", "optional: apt install g++ (the CPU kernels are compiled on first use)")
 
 
 def _codec() -> DoctorFinding:
     import av
 
-    known = "libx264" in av.codecs_available
+    encodes = "libx264" in av.codecs_available
     return DoctorFinding(
-        "film",
-        f"PyAV {av.__version__}, H.264 {'in and out' if known else 'in only'}",
-        "" if known else "pip install -U av",
+        "video",
+        f"PyAV {av.__version__}, H.264 {'in and out' if encodes else 'in only'}",
+        "" if encodes else "pip install -U av",
     )
 
 
 def _atlas() -> DoctorFinding:
     if importlib.util.find_spec("xatlas") is None:
         return DoctorFinding(
-            "export", "no meshes: xatlas is not installed", "pip install xatlas (without a wheel: needs g++)"
+            "export",
+            "no mesh export: xatlas is not installed",
+            "pip install xatlas (needs g++ if there is no wheel for this platform)",
         )
     return DoctorFinding("export", f"meshes by xatlas {importlib.metadata.version('xatlas')}")
 

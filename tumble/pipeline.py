@@ -1,4 +1,4 @@
-"""From a film or a capture to an asset: the stages in order, kept in a run directory or only handed back."""
+"""From a video or a capture to an asset: all stages in order, saved in a run directory or only returned."""
 
 import math
 import sys
@@ -12,61 +12,69 @@ from typing import Any, Literal
 import torch
 
 from tumble import matching, recipes
-from tumble.datasets import which
+from tumble.datasets import reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import BadFile, files, tree
 from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
-from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, input_kind, origin, to_capture
+from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, footage_fingerprint, input_kind, to_capture
 from tumble.recipes import DRAFT, Recipe
 from tumble.scene import Asset, Capture, Trajectory, content_key
 
-LEAST_TRACKED = 8
-"""Frames with a pose under which a capture shows too little of the object."""
+MIN_FRAMES = 8
+"""Minimum number of frames with a pose; fewer show too little of the object."""
 IN_MEMORY = Path("capture")
-"""What messages call a capture that was not read from disk."""
+"""Name, in error messages, of a capture that was not read from disk."""
 
 
 def read_capture(path: Path | str) -> Capture:
-    """Read the training frames of a capture: a folder of docs/format.md, or another layout that `datasets` knows.
+    """Read the training frames of a capture folder, in any layout of `datasets` (docs/format.md).
 
     Raises:
-        BadFile: There is no capture, or it breaks a rule. A film has to become one first: `video_to_capture`.
+        BadFile: There is no capture, or it breaks a rule of its layout, or it is a video: see `video_to_capture`.
     """
     path = Path(path)
     if input_kind(path) in FOOTAGE:
-        raise BadFile(path, "is footage and no capture yet", "tumble.video_to_capture makes one of it")
-    return which(path).load(path)
+        raise BadFile(path, "is footage, not a capture", "convert it with tumble.video_to_capture")
+    return reader_for(path).load(path)
 
 
 def video_to_capture(path: Path | str, out: Path | str, options: FootageOptions | None = None) -> Path:
-    """Make a capture folder of a film, a folder of pictures, or one with a COLMAP model; returns `out`.
+    """Convert footage to a capture folder; returns `out`.
+
+    Args:
+        path: A video, a folder of images with masks, or such a folder with a COLMAP model.
+        out: The capture folder to create.
 
     Raises:
-        BadFile: The footage cannot become a capture, or `out` is there already; nothing is written then.
+        BadFile: The footage cannot be converted, or `out` exists; nothing is written then.
     """
     return to_capture(Path(path), Path(out), options or FootageOptions())
 
 
-def ingested(path: Path, out: Path, options: FootageOptions) -> Path:
-    """The capture that a run reconstructs: `path` itself, or what footage became, in the run directory `out`.
+def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
+    """Path of the capture to reconstruct: `path` itself, or the capture in `out` to which footage is converted.
+
+    Args:
+        path: A capture or footage.
+        out: The run directory; a capture converted earlier from the same footage is reused.
 
     Raises:
-        BadFile: The footage cannot become a capture, or `out` holds that of other footage or of other options.
+        BadFile: The footage cannot be converted, or `out` holds a capture of other footage or other options.
     """
     if input_kind(path) not in FOOTAGE:
         return path
     made = out / run.CAPTURE
-    with run.alone(out):
+    with run.exclusive_access(out):
         if not made.exists():
             return to_capture(path, made, options)
     note = made / PROVENANCE
-    found, wanted = files.read_json(note) if note.exists() else {}, origin(path, options)
+    found, wanted = files.read_json(note) if note.exists() else {}, footage_fingerprint(path, options)
     different = [line for name in wanted for line in run.differences(found.get(name), wanted[name], name)]
     if different:
-        rule = f"holds the capture of another film, or one made in another way: {'; '.join(different)}"
+        rule = f"holds a capture of other footage or made with other options: {'; '.join(different)}"
         raise BadFile(out, rule, "choose another folder with -o, or remove this one")
     return made
 
@@ -74,14 +82,14 @@ def ingested(path: Path, out: Path, options: FootageOptions) -> Path:
 def estimate_poses(
     capture: Capture, recipe: Recipe = DRAFT, *, progress: Callable[[Progress], None] | None = None
 ) -> PoseResult:
-    """Find how the object moved, from the frames and masks alone (stage 1); poses that the capture has are not read.
+    """Estimate the object's pose in every frame from images and masks (stage 1); the capture's own poses are ignored.
 
     Args:
-        recipe: Its `matcher`, `track` and `seed` count.
+        recipe: Only `matcher`, `track` and `seed` are used.
         progress: Called every few seconds.
 
     Raises:
-        BadFile: The capture has too few frames, or cannot be tracked.
+        BadFile: The capture has too few frames, or too few of them could be tracked.
     """
     capture = replace(capture, trajectory=None)
     return _track(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
@@ -96,19 +104,19 @@ def reconstruct(
     device: torch.device | str = "cpu",
     progress: Callable[[Progress], None] | None = None,
 ) -> Asset:
-    """Reconstruct an object: its motion, geometry, albedo and roughness, and the light. Truth is never read.
+    """Reconstruct an object's motion, geometry, albedo and roughness, and the light. Ground truth is never read.
 
-    Frames whose pose is lost are left out of all that follows stage 1.
+    Frames whose pose could not be estimated are dropped after stage 1.
 
     Args:
-        capture: Read before, or where it is; footage has to become one first (`video_to_capture`).
-        out: A run directory, where every finished stage is kept, a stopped one goes on from its checkpoint, and
-            `asset.safetensors`, `light.exr` and `poses.json` are written. None keeps nothing.
-        recipe: All settings. Another stage is a module with a `Config` of its own in the place of ours.
-        poses: given: those of the capture, which stay as they are, or estimated where it has none. estimate: found from
-            the frames all the same. A trajectory, one pose per frame: taken as given. What `estimate_poses` found:
-            taken, and realigned in stage 2.
-        device: Of stages 2 and 3.
+        capture: A capture or the path of one; convert footage with `video_to_capture` first.
+        out: Run directory: finished stages are saved in it, an interrupted stage resumes from its checkpoint, and
+            `asset.safetensors`, `light.exr` and `poses.json` are written. None saves nothing.
+        recipe: Settings of all stages. A custom stage is a module whose `Config` replaces the default one.
+        poses: "given": the capture's poses, unchanged; estimated if it has none. "estimate": always estimated. A
+            trajectory with one pose per frame: used unchanged. A `PoseResult`: the starting poses of stage 2, which
+            refines them.
+        device: Where stages 2 and 3 run.
         progress: Called every few seconds.
 
     Returns:
@@ -116,7 +124,7 @@ def reconstruct(
 
     Raises:
         BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
-        NotFinite: Training met a NaN; names the tensor, the step and the state that is kept.
+        NotFinite: A NaN occurred in training; the message names the tensor, the step and the saved state.
     """
     where = IN_MEMORY if isinstance(capture, Capture) else Path(capture)
     capture = capture if isinstance(capture, Capture) else read_capture(capture)
@@ -128,7 +136,7 @@ def reconstruct(
     if out is None:
         return _reconstruct(run.Run(None, recipe, progress), capture, where, found, device)[0]
     out = Path(out)
-    with run.alone(out):
+    with run.exclusive_access(out):
         opened = run.open(out, where, recipe, content=content_key(capture), report=progress)
         asset, names = _reconstruct(opened, capture, where, found, device)
         _keep(asset, names, out)
@@ -138,7 +146,7 @@ def reconstruct(
 def _reconstruct(
     opened: run.Run, capture: Capture, where: Path, found: PoseResult | None, device: torch.device | str
 ) -> tuple[Asset, tuple[str, ...]]:
-    """The asset, on the CPU, and the names of its frames."""
+    """The asset on the CPU, and the names of its frames."""
     recipe, trajectory, key = opened.recipe, capture.trajectory, content_key(capture)
     if trajectory is None:
         tracked, key = (found, "") if found else _track(opened, capture, where, key)
@@ -158,18 +166,18 @@ def _reconstruct(
 
 
 def stage_of(cfg: Any) -> Any:
-    """The stage that a configuration belongs to: the module that defines its class."""
+    """The stage module in which the class of a configuration is defined."""
     stage = sys.modules[type(cfg).__module__]
     if not isinstance(stage, Stage):
-        raise TypeError(f"{stage.__name__} is no stage: it needs VERSION, Config, length, init, step and finish")
+        raise TypeError(f"{stage.__name__} is not a stage: it needs VERSION, Config, length, init, step and finish")
     return stage
 
 
 def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tuple[PoseResult, str]:
-    """Stage 1: match, then find all poses; also the key of the result."""
-    if len(capture) < LEAST_TRACKED:
-        rule = f"has {len(capture)} frames: too few to find how the object moved"
-        raise BadFile(where, rule, f"film more of it: at least {LEAST_TRACKED} frames, better 40 to 100")
+    """Stage 1: match frames, then estimate all poses; also returns the key of the result."""
+    if len(capture) < MIN_FRAMES:
+        rule = f"has {len(capture)} frames, too few to estimate the motion"
+        raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
@@ -180,26 +188,30 @@ def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tupl
         if route is progressive:
             inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:
-        raise BadFile(where, str(error), "give masks that show the object") from None
+        raise BadFile(where, str(error), "provide masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]
     tracked, key = run.stage(opened, run.TRACK, route, recipe.track, inputs, keys)
-    _told(opened, capture, where, tracked)
+    _check_quality(opened, capture, where, tracked)
     return tracked, key
 
 
-def _told(opened: run.Run, capture: Capture, where: Path, tracked: PoseResult) -> None:
-    """Log how good the poses are, warn where they are bad, and refuse to go on with too few."""
+def _check_quality(opened: run.Run, capture: Capture, where: Path, tracked: PoseResult) -> None:
+    """Log the quality of the poses, warn if it is bad.
+
+    Raises:
+        BadFile: Too few frames have a pose.
+    """
     quality, lost = tracked.quality, int(tracked.quality.lost.sum())
-    about = {"lost": lost, "verdict": quality.verdict, "axis": quality.observability.sentence}
+    about = {"lost": lost, "verdict": quality.rating, "axis": quality.observability.sentence}
     run.log(opened, {"name": "track", "event": "quality", **about, "degrees": math.degrees(quality.uncertainty)})
-    focal, guess = (float(camera.fx_fy_cx_cy[0]) for camera in (tracked.camera, capture.camera))
-    if focal != guess:
-        said = f"focal length {focal:.0f} pixels (estimated; the guess was {guess:.0f})"
-        run.log(opened, {"name": "track", "event": "focal", "pixels": focal, "guess": guess, "said": said})
-    if len(capture) - lost < LEAST_TRACKED:
-        rule = f"could not be tracked: {lost} of {len(capture)} frames contradict the others"
-        raise BadFile(where, rule, "film an object with more texture or shape, in smaller turns")
-    if quality.verdict == "bad":
+    focal, assumed = (float(camera.fx_fy_cx_cy[0]) for camera in (tracked.camera, capture.camera))
+    if focal != assumed:
+        said = f"focal length {focal:.0f} pixels (estimated; {assumed:.0f} was assumed)"
+        run.log(opened, {"name": "track", "event": "focal", "pixels": focal, "guess": assumed, "said": said})
+    if len(capture) - lost < MIN_FRAMES:
+        rule = f"could not be tracked: {lost} of {len(capture)} frames are inconsistent with the others"
+        raise BadFile(where, rule, "record an object with more texture or shape, and turn it more slowly")
+    if quality.rating == "bad":
         warnings.warn(quality.sentence, stacklevel=2)
 
 

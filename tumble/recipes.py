@@ -1,7 +1,7 @@
-"""Recipes: every number of a run in one place. PAPER holds the published values; the others say what they change.
+"""Recipes: the settings of all stages. PAPER has the defaults of the stages; the others change some of them.
 
-DRAFT: two CPU cores, minutes. STANDARD: one GPU, minutes. SMOKE: seconds, for tests. The ablations and baselines of the
-paper are recipes too.
+DRAFT: minutes on two CPU cores. STANDARD: meant for one GPU. SMOKE: seconds, for tests. The ablations and baselines of
+the paper are functions from a recipe to a recipe. What experiments said about the values stands in docs/method.md.
 """
 
 from dataclasses import dataclass, field, replace
@@ -14,44 +14,43 @@ from tumble.poses import progressive, sfm
 
 @dataclass(frozen=True)
 class Recipe:
-    """The configurations of all stages; that of another stage puts it in the place of ours."""
+    """The configurations of all stages. The module that defines a configuration's class is the stage that runs."""
 
     matcher: str = "mixed"
-    """Of pixels between frames, for captures without poses: a file of `matching`."""
+    """Matcher of stage 1: the name of a file of `matching`."""
     track: Any = field(default_factory=sfm.Config)
-    """Stage 1, for captures without poses: by the graph route, or by the paper's (`progressive`)."""
+    """Stage 1, for captures without poses: `poses.sfm` or, as in the paper, `poses.progressive`."""
     refine: Any = field(default_factory=inverse_rendering.refine.Config)
-    """Its pose rate and realignments count where poses are estimated; known ones stay as they are."""
+    """Stage 2. Its pose learning rate and realignments are ignored if poses are given."""
     decompose: Any = field(default_factory=inverse_rendering.decompose.Config)
-    """Of the method, or of the baseline that takes its place."""
+    """Stage 3: `inverse_rendering.decompose` or a baseline in its place."""
     relight: rendering.relight.Config = field(default_factory=rendering.relight.Config)
+    """Numbers of rays for relighting and for evaluation."""
     seed: int = 0
-    """Of every random draw."""
+    """Seed of all random numbers."""
 
 
 CREASE = 25.0
-"""Normals that are 16 degrees apart count half."""
+"""Stage 2's `crease`: two normals 16 degrees apart have weight 1/2 in the smoothness term."""
 
 PROJ = 0.1
-"""The paper's weight of the projection term (1) draws Gaussians to the depth of their neighbourhood, and fills grooves:
-albedo and normals at 1, 0.1 and 0 (sunny): chess knight 26.6, 27.1, 27.1 dB and 7.4, 6.8, 6.7 degrees; mustard bottle
-31.9, 32.4, 32.5 dB and 3.9, 3.5, 3.4 degrees; cracker box 25.9 and 25.9 dB at 1 and 0."""
+"""Stage 2's weight of the projection term; the paper's weight of 1 fills grooves."""
 
 MASK = 3.0
-"""Of stage 3. With geometry joining at once, the chess knight's silhouette has an IoU of 0.989, 0.992, 0.993 and 0.994
-at 0, 1, 3 and 10."""
+"""Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
 PAPER = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
-"""The paper moves estimated poses by a network; ours are realigned (docs/method.md)."""
+"""The default configuration of every stage, except that estimated poses are realigned instead of moved by the paper's
+pose network (docs/method.md)."""
 
 STANDARD = replace(
     PAPER,
     refine=replace(
         PAPER.refine,
         steps=20_000,
-        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, highlight=0.002),
+        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
         crease=CREASE,
-        rates=replace(PAPER.refine.rates, highlight=0.005),
+        rates=replace(PAPER.refine.rates, specular_scale=0.005),
         points=20_000,
         densification=densify.Config(max_gaussians=60_000),
     ),
@@ -59,26 +58,24 @@ STANDARD = replace(
         steps=10_000,
         warmup=1_000,
         doublings=3,
-        fitted=True,
+        fit_specular=True,
         weights=inverse_rendering.decompose.Weights(light=0.02, material=0.02, mask=MASK),
-        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.03, light=0.03, tint=0.03),
+        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.03, light=0.03, specular_scale=0.03),
     ),
 )
 
 DRAFT = replace(
     PAPER,
-    # The paper's weight of the normal term (0.05) leaves normals 3 degrees rougher on the mustard bottle at 128 pixels,
-    # and any weight that smooths fills the grooves of the chess knight unless creases are left alone: under the indoor
-    # map 10.5 degrees and 27.4 dB of albedo at a weight of 0.5 without, 8.5 and 28.0 at 2 with (0.5: 9.4, 1: 8.9).
+    # A normal weight above the paper's 0.05 gives smoother normals; `crease` keeps it from filling grooves.
     refine=replace(
         PAPER.refine,
         steps=3_000,
         points=9_000,
         densification=densify.Config(refine_every=300, max_gaussians=16_000),
         hull=96,
-        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, highlight=0.002),
+        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
         crease=CREASE,
-        rates=replace(PAPER.refine.rates, highlight=0.02),
+        rates=replace(PAPER.refine.rates, specular_scale=0.02),
         ramp=0.5,
     ),
     decompose=inverse_rendering.decompose.Config(
@@ -86,9 +83,9 @@ DRAFT = replace(
         warmup=100,
         directions=256,
         doublings=1,
-        fitted=True,
+        fit_specular=True,
         weights=inverse_rendering.decompose.Weights(light=0.002, material=0.01, mask=MASK),
-        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.05, light=0.05, tint=0.1),
+        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.05, light=0.05, specular_scale=0.1),
     ),
     relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
 )
@@ -126,14 +123,15 @@ QUICK_TRACK = progressive.Config(
     weights=progressive.Weights(match=0.5),
     rates=progressive.Rates(poses=3e-3, poses_decay=0.3, fields=2e-3, sharpness=2e-3, ramp=1),
 )
-"""The progressive route for two CPU cores: its network, rays and steps are a hundredth of the paper's work. So few want
-a heavier match term: the cracker box is 8 degrees off after 99 degrees of turn, at the paper's weight 13."""
+"""The progressive stage for two CPU cores: network, rays and steps take a hundredth of the paper's computation. So few
+rays need a larger weight of the match term than the paper's."""
 
 QUALITIES = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
+"""Recipes by the value of `--quality`."""
 
 
 def known_poses(recipe: Recipe) -> Recipe:
-    """For captures whose poses are given: they stay as they are."""
+    """The recipe for captures with given poses: no stage changes them."""
     second, third = recipe.refine, recipe.decompose
     if isinstance(second, inverse_rendering.refine.Config):
         second = replace(second, rates=replace(second.rates, poses=0.0), realignments=0)
@@ -143,62 +141,66 @@ def known_poses(recipe: Recipe) -> Recipe:
 
 
 def static_colour(recipe: Recipe) -> Recipe:
-    """Ablation: the paper's radiance per Gaussian that does not know that the light stands still."""
+    """Ablation: stage 2's radiance is one set of spherical harmonics per Gaussian, as in the paper."""
     return replace(recipe, refine=replace(recipe.refine, colour="sh"))
 
 
 def no_visibility(recipe: Recipe) -> Recipe:
-    """Ablation: nothing shadows anything, in either stage."""
-    recipe = replace(recipe, refine=replace(recipe.refine, shaded=1.0))
-    return _decomposing(recipe, visibility=False)
+    """Ablation: no self-shadowing in stages 2 and 3."""
+    recipe = replace(recipe, refine=replace(recipe.refine, shadow_start=1.0))
+    return _replace_decompose(recipe, visibility=False)
 
 
 def no_indirect(recipe: Recipe) -> Recipe:
-    """Ablation: shadows are black."""
-    return _decomposing(recipe, bounce="none")
+    """Ablation: no indirect light."""
+    return _replace_decompose(recipe, bounce="none")
 
 
 def averaged_indirect(recipe: Recipe) -> Recipe:
-    """The paper's indirect light: the mean radiance over all frames, whatever the light of the frame."""
-    return _decomposing(recipe, bounce="average")
+    """Ablation: the paper's indirect light, whose radiance is the mean over all frames."""
+    return _replace_decompose(recipe, bounce="average")
 
 
 def no_corners(recipe: Recipe) -> Recipe:
     """Ablation: one material per Gaussian."""
-    return _decomposing(recipe, corners=False)
+    return _replace_decompose(recipe, corners=False)
 
 
 def no_sdf(recipe: Recipe) -> Recipe:
-    """Ablation: opacity is free; nothing ties it to a distance from the surface or sharpens it."""
+    """Ablation: opacity is a free parameter, not derived from a signed distance."""
     stage = recipe.refine
     weights, rates = replace(stage.weights, gamma=0.0, proj=0.0), replace(stage.rates, gamma=0.0)
     return replace(recipe, refine=replace(stage, weights=weights, rates=rates))
 
 
 def full_light(recipe: Recipe) -> Recipe:
-    """Ablation: the light map has its last size from the start."""
+    """Ablation: the environment map has its final resolution from the start."""
     stage = recipe.decompose
     assert isinstance(stage, inverse_rendering.decompose.Config), "an ablation of the method, not of a baseline"
     return replace(recipe, decompose=replace(stage, rows=stage.rows * 2**stage.doublings, doublings=0))
 
 
-def averaging(recipe: Recipe) -> Recipe:
-    """Baseline: albedo is the mean colour over the frames, the light is white; no inverse rendering."""
+def mean_colour(recipe: Recipe) -> Recipe:
+    """Baseline: albedo is the mean colour over the frames under a white light; no inverse rendering."""
     return replace(recipe, decompose=mean_colour_baseline.Config())
 
 
-def descended_highlight(recipe: Recipe) -> Recipe:
-    """Ablation: the highlight starts as it does in the paper, at one width, and is left to the descent."""
-    return _decomposing(recipe, fitted=False)
+def no_specular_fit(recipe: Recipe) -> Recipe:
+    """Ablation: roughness and F0 start at the paper's values and are only optimised, without the grid search of
+    `specular_fit`."""
+    return _replace_decompose(recipe, fit_specular=False)
 
 
 def progressive_poses(recipe: Recipe) -> Recipe:
-    """The paper's route of stage 1: a neural field that grows frame by frame. PAPER's numbers take days on a CPU; other
-    recipes take a network, rays and steps for minutes."""
+    """Stage 1 as in the paper: a neural SDF that grows frame by frame.
+
+    PAPER uses the paper's numbers, which take days on a CPU; other recipes use a small network with few rays and steps,
+    which take minutes.
+    """
     return replace(recipe, track=progressive.Config() if recipe == PAPER else QUICK_TRACK)
 
 
-def _decomposing(recipe: Recipe, **changes: Any) -> Recipe:
+def _replace_decompose(recipe: Recipe, **changes: Any) -> Recipe:
     assert isinstance(recipe.decompose, inverse_rendering.decompose.Config), (
         "an ablation of the method, not of a baseline"
     )
@@ -213,6 +215,6 @@ ABLATIONS = {
     "no-corners": no_corners,
     "no-sdf": no_sdf,
     "full-light": full_light,
-    "averaging": averaging,
-    "descended-highlight": descended_highlight,
+    "mean-colour": mean_colour,
+    "no-specular-fit": no_specular_fit,
 }

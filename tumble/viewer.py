@@ -1,7 +1,8 @@
-"""A run in the browser (extra `view`), while it goes on and after: cameras, Gaussians and their maps, the light.
+"""Browser viewer of a finished or running run (extra `view`): cameras, Gaussians and their maps, environment map.
 
-The world is the object's frame, +y up. Nodes: `/object` (Gaussians, or the points of stage 1), `/cameras/NAME`,
-`/path`, `/light` (a sphere of the light's colours, turned as the light stood in the chosen frame).
+The world frame is the object frame, +y up. Nodes of viser's scene: `/object` (Gaussians, or the points of stage 1),
+`/cameras/NAME`, `/path` (the camera centres), `/light` (the environment map on a large sphere, in its orientation at
+the selected frame).
 """
 
 import contextlib
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from tumble.datasets import which
+from tumble.datasets import reader_for
 from tumble.engine import loop, run
 from tumble.inverse_rendering import Refined, decompose
 from tumble.io import BadFile, tree
@@ -26,12 +27,18 @@ from tumble.rendering import relight
 from tumble.report import panorama
 from tumble.scene import Asset, Capture, Environment, Gaussians, Material, Trajectory, opacity
 
-SECONDS = 2.0
-"""Between two looks at the run."""
-CAMERAS, THUMBNAIL = 48, 96
-"""Cameras drawn at most, and the longer side of their photographs [pixels]."""
-SKY, SKY_ROWS, SKY_TEXEL = 12.0, 48, 0.85
-"""Radius of the sphere of light, beyond the cameras [object radius], its rows of points, and their size."""
+POLL_SECONDS = 2.0
+"""Interval at which the run directory is read again [s]."""
+MAX_CAMERAS = 48
+"""Maximum number of camera frustums drawn."""
+THUMBNAIL = 96
+"""Longer side of the images in the frustums [pixels]."""
+LIGHT_RADIUS = 12.0
+"""Radius of the sphere that shows the environment map, beyond the cameras [object radius]."""
+LIGHT_ROWS = 48
+"""Rows of points on that sphere."""
+LIGHT_POINT_SIZE = 0.85
+"""Size of those points [object radius]."""
 SOURCES = (
     run.ASSET,
     f"{run.DECOMPOSE}/{run.CHECKPOINT}",
@@ -39,29 +46,30 @@ SOURCES = (
     f"{run.REFINE}/{run.CHECKPOINT}",
     f"{run.TRACK}/{run.OUT}",
 )
-"""Where geometry is, the latest first."""
+"""Files of a run directory that contain geometry, the most recent stage first."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """What a run directory shows at one moment; None where it does not know yet."""
+class Snapshot:
+    """State of a run directory at one moment; fields are None if the run has not computed them yet."""
 
     stage: str
-    """Where the geometry is from, in words."""
+    """Stage and step that the geometry is from, for display."""
     gaussians: Gaussians | None = None
     gamma: Float[Tensor, ""] | None = None
+    """Sharpness of the Gaussians' opacity [1 / object radius]."""
     points: Float[Tensor, "n 3"] | None = None
-    """Of stage 1, before there are Gaussians; object frame."""
+    """Surface points of stage 1 in the object frame, while there are no Gaussians."""
     colours: dict[str, Float[Tensor, "n 3"]] = field(default_factory=dict)
-    """sRGB by the name of a map."""
+    """sRGB colours of the Gaussians or points, by the name of the map."""
     trajectory: Trajectory | None = None
     names: tuple[str, ...] = ()
-    """Of the trajectory's frames."""
+    """Image names of the trajectory's frames."""
     environment: Environment | None = None
 
 
-def look(out: Path, capture: Capture | None) -> Look:
-    """What is there: of an unfinished run the last checkpoint.
+def read_snapshot(out: Path, capture: Capture | None) -> Snapshot:
+    """Read the most recent result of a run, or the last checkpoint of a stage that is not finished.
 
     Raises:
         BadFile: A file of the run is damaged.
@@ -71,24 +79,24 @@ def look(out: Path, capture: Capture | None) -> Look:
     trajectory, names = _frames(tracked, capture)
     if source == run.ASSET:
         asset = run.asset(out, Asset)
-        lit = srgb_from_linear(relight.gaussian_colours(asset)).clamp(0, 1)
-        colours = {"as photographed": lit} | _maps(asset.gaussians, asset.material)
-        shown = asset.gaussians, asset.gamma, None, colours, asset.trajectory, names, asset.environment
-        return Look("finished", *shown)
+        shaded = srgb_from_linear(relight.gaussian_colours(asset)).clamp(0, 1)
+        colours = {"as captured": shaded} | _maps(asset.gaussians, asset.material)
+        parts = asset.gaussians, asset.gamma, None, colours, asset.trajectory, names, asset.environment
+        return Snapshot("finished", *parts)
     if source.endswith(run.CHECKPOINT):
-        return replace(_checkpoint(out / source), trajectory=trajectory, names=names)
+        return replace(_read_checkpoint(out / source), trajectory=trajectory, names=names)
     if source.startswith(run.REFINE):
         refined = tree.load(Refined, out / source)
         colours = {"albedo": srgb_from_linear(refined.albedo)} | _normals(refined.gaussians)
-        return Look("stage 2 finished", refined.gaussians, refined.gamma, None, colours, trajectory, names)
+        return Snapshot("stage 2 finished", refined.gaussians, refined.gamma, None, colours, trajectory, names)
     if tracked is not None:
-        colours = {"as photographed": srgb_from_linear(tracked.colours)}
-        return Look("stage 1 finished", None, None, tracked.points, colours, trajectory, names)
-    return Look("nothing yet", trajectory=trajectory, names=names)
+        colours = {"as captured": srgb_from_linear(tracked.colours)}
+        return Snapshot("stage 1 finished", None, None, tracked.points, colours, trajectory, names)
+    return Snapshot("no result yet", trajectory=trajectory, names=names)
 
 
 def _frames(tracked: PoseResult | None, capture: Capture | None) -> tuple[Trajectory | None, tuple[str, ...]]:
-    """Poses and names of the frames that are used; those whose pose is lost are left out."""
+    """Poses and image names of the frames, without those whose pose was not found."""
     names = () if capture is None else capture.names
     if tracked is None:
         return (None if capture is None else capture.trajectory), names
@@ -96,8 +104,8 @@ def _frames(tracked: PoseResult | None, capture: Capture | None) -> tuple[Trajec
     return tracked.trajectory.select(kept), tuple(names[i] for i in kept) if names else ()
 
 
-def _checkpoint(path: Path) -> Look:
-    """A stage in training; of stage 3 what it would put out if it ended now."""
+def _read_checkpoint(path: Path) -> Snapshot:
+    """Snapshot of a stage in training; of stage 3, the output that it would have if it ended at this step."""
     step, params = loop.peek(path)
     parts: dict[str, dict[str, Tensor]] = {}
     for name, value in params.items():
@@ -106,32 +114,34 @@ def _checkpoint(path: Path) -> Look:
     gaussians, gamma = Gaussians(**parts["gaussians"]), params["gamma"]
     if "material" not in parts:
         colours = {"albedo": srgb_from_linear(torch.sigmoid(params["points.albedo_logits"]))} | _normals(gaussians)
-        return Look(f"stage 2, step {step}", gaussians, gamma, None, colours)
+        return Snapshot(f"stage 2, step {step}", gaussians, gamma, None, colours)
     material, environment = Material(**parts["material"]), Environment(**parts["environment"])
-    trained = decompose.Params(gaussians, gamma, material, environment, params["poses"], params["log_tint"])
-    ended = decompose.shared_out(trained)
+    trained = decompose.Params(gaussians, gamma, material, environment, params["poses"], params["log_specular_scale"])
+    ended = decompose.absorb_specular_scale(trained)
     colours = _maps(gaussians, ended.material)
-    return Look(f"stage 3, step {step}", gaussians, gamma, None, colours, environment=ended.environment)
+    return Snapshot(f"stage 3, step {step}", gaussians, gamma, None, colours, environment=ended.environment)
 
 
 def _maps(gaussians: Gaussians, material: Material) -> dict[str, Float[Tensor, "n 3"]]:
+    """Colours that display albedo and roughness, as means over the corners of each Gaussian, and normals."""
     albedo, rough = srgb_from_linear(material.albedo.mean(1)), material.roughness.mean(1, keepdim=True)
     return {"albedo": albedo, "roughness": rough.expand(-1, 3)} | _normals(gaussians)
 
 
 def _normals(gaussians: Gaussians) -> dict[str, Float[Tensor, "n 3"]]:
+    """Colours that display the normals: -1 to 1 as 0 to 1."""
     return {"normals": 0.5 + 0.5 * gaussians.normals}
 
 
 def progress(out: Path) -> str:
-    """What the log says last, as a line."""
-    records = [record for record in run.records(out) if "name" in record]
+    """The last record of the run's log as one line of text."""
+    records = [record for record in run.log_records(out) if "name" in record]
     if not records:
-        return "no stage has begun"
+        return "no stage has started"
     last = records[-1]
     if "step" not in last:
-        words = {"start": "begins", "done": f"finished after {last.get('seconds', 0):.0f} s"}
-        return f"{last['name']} {words.get(last.get('event', ''), 'finished')}"
+        events = {"start": "started", "done": f"finished after {last.get('seconds', 0):.0f} s"}
+        return f"{last['name']} {events.get(last.get('event', ''), 'finished')}"
     metrics = ", ".join(f"{key} {value:.3g}" for key, value in last["metrics"].items() if value is not None)
     return f"{last['name']}: step {last['step']} of {last['of']}, {last['eta']:.0f} s to go; {metrics}"
 
@@ -140,78 +150,81 @@ def progress(out: Path) -> str:
 
 
 class ViewerWindow:
-    """A server whose page follows a run; a class, because it remembers what the page shows."""
+    """Web server whose page follows a run; a class, because it holds the state of the page."""
 
     def __init__(self, out: Path, host: str, port: int) -> None:
         viser = _viser()
         if not out.is_dir() or not ((out / run.RECIPE).is_file() or (out / run.LOCK).exists()):
-            raise BadFile(out, "is no run", "give the folder of a `tumble run`, which may still be going on")
-        self.out, self.stamp, self.look = out, (), Look("nothing yet")
+            raise BadFile(out, "is not a run directory", "give the output folder of a finished or running `tumble run`")
+        self.out, self.timestamps, self.snapshot = out, (), Snapshot("no result yet")
         self.capture: Capture | None = None
         self.server = viser.ViserServer(host=host, port=port, label=f"tumble {out.name}", verbose=False)
         self.server.scene.set_up_direction("+y")
         self.server.scene.configure_fog(1.0, 2.0, enabled=False)
         self.server.initial_camera.position = (0.9, 0.9, 2.4)
         gui = self.server.gui
-        self.state = gui.add_markdown("")
-        self.map = gui.add_dropdown("Colour", ("as photographed",))
+        self.status = gui.add_markdown("")
+        self.map = gui.add_dropdown("Colour", ("as captured",))
         self.frame = gui.add_slider("Frame", 0, 1, 1, 0)
-        self.photograph = gui.add_image(np.zeros((8, 8, 3), np.uint8), label="Photograph")
+        self.image = gui.add_image(np.zeros((8, 8, 3), np.uint8), label="Image")
         self.panorama = gui.add_image(np.zeros((8, 16, 3), np.uint8), label="Light")
-        self.sky = gui.add_checkbox("Light around the object", True)
-        self.map.on_update(lambda _: self._object())
-        self.frame.on_update(lambda _: self._choose())
-        self.sky.on_update(lambda _: self._choose())
+        self.light_visible = gui.add_checkbox("Light around the object", True)
+        self.map.on_update(lambda _: self._show_object())
+        self.frame.on_update(lambda _: self._show_frame())
+        self.light_visible.on_update(lambda _: self._show_frame())
         self.refresh()
 
     @property
     def address(self) -> str:
+        """URL of the page."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def refresh(self) -> None:
-        """Show what is there now."""
-        stamp = tuple((self.out / name).stat().st_mtime_ns for name in SOURCES if (self.out / name).is_file())
+        """Update the page if files of the run have changed."""
+        timestamps = tuple((self.out / name).stat().st_mtime_ns for name in SOURCES if (self.out / name).is_file())
         if self.capture is None and (self.out / run.RECIPE).is_file():
-            self.capture = _capture(self.out)
-        if (stamp, self.capture is None) != self.stamp:
-            self.stamp = stamp, self.capture is None
+            self.capture = _load_capture(self.out)
+        if (timestamps, self.capture is None) != self.timestamps:
+            self.timestamps = timestamps, self.capture is None
             tracked = run.output(self.out, run.TRACK, PoseResult)
             if self.capture is not None and tracked is not None:
                 self.capture = replace(self.capture, camera=tracked.camera)
-            self.look = look(self.out, self.capture)
-            self._cameras()
-            self.map.options = tuple(self.look.colours) or ("as photographed",)
-            self._object()
-            self._light()
-            self._choose()
-        self.state.content = f"**{self.look.stage}**\n\n{progress(self.out)}"
+            self.snapshot = read_snapshot(self.out, self.capture)
+            self._show_cameras()
+            self.map.options = tuple(self.snapshot.colours) or ("as captured",)
+            self._show_object()
+            self._show_light()
+            self._show_frame()
+        self.status.content = f"**{self.snapshot.stage}**\n\n{progress(self.out)}"
 
-    def _object(self) -> None:
-        found = self.look
-        if not found.colours:
+    def _show_object(self) -> None:
+        """Draw the Gaussians or points in the colours of the selected map."""
+        snapshot = self.snapshot
+        if not snapshot.colours:
             return
-        chosen = found.colours.get(self.map.value, next(iter(found.colours.values())))
-        colours = chosen.clamp(0, 1).detach().numpy()
-        if found.gaussians is None:
-            assert found.points is not None, "colours of something"
-            self.server.scene.add_point_cloud("/object", found.points.numpy(), colours, point_size=0.02)
+        selected = snapshot.colours.get(self.map.value, next(iter(snapshot.colours.values())))
+        colours = selected.clamp(0, 1).detach().numpy()
+        if snapshot.gaussians is None:
+            assert snapshot.points is not None, "a snapshot with colours has Gaussians or points"
+            self.server.scene.add_point_cloud("/object", snapshot.points.numpy(), colours, point_size=0.02)
             return
-        gaussians, gamma = found.gaussians, found.gamma
-        assert gamma is not None, "Gaussians come with their sharpness"
+        gaussians, gamma = snapshot.gaussians, snapshot.gamma
+        assert gamma is not None, "a snapshot with Gaussians has gamma"
         axes = gaussians.R_obj_local * gaussians.scales[:, None]
         centres, covariances, alpha = gaussians.means, axes @ axes.mT, opacity(gaussians.sdf, gamma)[:, None]
         parts = (x.detach().numpy() for x in (centres, covariances))
         self.server.scene.add_gaussian_splats("/object", *parts, colours, alpha.detach().numpy())
 
-    def _cameras(self) -> None:
-        trajectory, capture = self.look.trajectory, self.capture
+    def _show_cameras(self) -> None:
+        """Draw the camera path, and frustums with their images at up to `MAX_CAMERAS` frames."""
+        trajectory, capture = self.snapshot.trajectory, self.capture
         if trajectory is None or capture is None:
             return
-        names = self.look.names
+        names = self.snapshot.names
         self.frame.max = len(names) - 1
         T_obj_cam, camera = trajectory.T_cam_obj.inverse(), capture.camera
         fov = 2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1]))
-        for i in np.linspace(0, len(names) - 1, min(CAMERAS, len(names))).round().astype(int):
+        for i in np.linspace(0, len(names) - 1, min(MAX_CAMERAS, len(names))).round().astype(int):
             self.server.scene.add_camera_frustum(
                 f"/cameras/{names[i]}",
                 fov,
@@ -219,45 +232,46 @@ class ViewerWindow:
                 scale=0.2,
                 thickness=0.008,
                 color=(60, 110, 200),
-                image=_small(capture, names[i]),
+                image=_thumbnail(capture, names[i]),
                 wxyz=T_obj_cam.wxyz[i].numpy(),
                 position=T_obj_cam.xyz[i].numpy(),
             )
         self.server.scene.add_spline_catmull_rom("/path", T_obj_cam.xyz.numpy(), thickness=0.01, color=(60, 110, 200))
 
-    def _light(self) -> None:
-        if self.look.environment is None:
+    def _show_light(self) -> None:
+        """Draw the environment map as a panorama and as points on a sphere around the object."""
+        if self.snapshot.environment is None:
             return
-        picture = panorama(self.look.environment, SKY_ROWS)
-        self.panorama.image = panorama(self.look.environment, 96)
-        around = SKY * texel_directions(SKY_ROWS, 2 * SKY_ROWS).reshape(-1, 3).numpy()
-        self.server.scene.add_point_cloud("/light", around, picture.reshape(-1, 3), point_size=SKY_TEXEL)
+        colours = panorama(self.snapshot.environment, LIGHT_ROWS)
+        self.panorama.image = panorama(self.snapshot.environment, 96)
+        positions = LIGHT_RADIUS * texel_directions(LIGHT_ROWS, 2 * LIGHT_ROWS).reshape(-1, 3).numpy()
+        self.server.scene.add_point_cloud("/light", positions, colours.reshape(-1, 3), point_size=LIGHT_POINT_SIZE)
 
-    def _choose(self) -> None:
-        """Show the frame's photograph, and turn the light as it stood about the object then."""
-        names = self.look.names
+    def _show_frame(self) -> None:
+        """Show the selected frame's input image, and rotate the light to its orientation in that frame."""
+        names = self.snapshot.names
         if self.capture is not None and names:
-            self.photograph.image = _small(self.capture, names[min(self.frame.value, len(names) - 1)], 320)
+            self.image.image = _thumbnail(self.capture, names[min(self.frame.value, len(names) - 1)], 320)
         light = self.server.scene.get_handle_by_name("/light")
-        if light is not None and self.look.trajectory is not None:
-            R_env_obj = self.look.trajectory.R_env_obj[min(self.frame.value, len(self.look.trajectory) - 1)]
+        if light is not None and self.snapshot.trajectory is not None:
+            R_env_obj = self.snapshot.trajectory.R_env_obj[min(self.frame.value, len(self.snapshot.trajectory) - 1)]
             light.wxyz = SO3.from_matrix(R_env_obj.T).wxyz.numpy()
-            light.visible = self.sky.value
+            light.visible = self.light_visible.value
 
 
 def serve(out: Path, host: str, port: int) -> None:
-    """Serve a run until Ctrl-C.
+    """Serve the viewer page of a run until Ctrl-C.
 
     Raises:
-        ModuleNotFoundError: viser is not installed; says how to.
-        BadFile: `out` is no run, or a file of it is damaged.
+        ModuleNotFoundError: viser is not installed; the message contains the command that installs it.
+        BadFile: `out` is not a run directory, or one of its files is damaged.
     """
     window = ViewerWindow(out, host, port)
-    print(f"{window.address}   (Ctrl-C ends it; from another machine: ssh -L {port}:localhost:{port} THIS_MACHINE)")
+    print(f"{window.address}   (Ctrl-C stops it; from another machine: ssh -L {port}:localhost:{port} THIS_MACHINE)")
     try:
         with contextlib.suppress(KeyboardInterrupt):
             while True:
-                time.sleep(SECONDS)
+                time.sleep(POLL_SECONDS)
                 window.refresh()
     finally:
         window.server.stop()
@@ -271,14 +285,15 @@ def _viser() -> Any:
     return viser
 
 
-def _capture(out: Path) -> Capture | None:
-    """The run's photographs, if they are still where the run found them."""
-    path = run.source(out)
-    return which(path).load(path) if path.exists() else None
+def _load_capture(out: Path) -> Capture | None:
+    """The capture of a run; None if it is no longer at the path stored in the run."""
+    path = run.capture_source(out)
+    return reader_for(path).load(path) if path.exists() else None
 
 
-def _small(capture: Capture, name: str, side: int = THUMBNAIL) -> UInt8[np.ndarray, "h w 3"]:
-    picture = capture.images[capture.names.index(name)]
-    scale = min(1.0, side / max(picture.shape[:2]))
-    size = (max(1, round(scale * length)) for length in picture.shape[:2])
-    return resize_area(picture.float(), *size).round().to(torch.uint8).numpy()
+def _thumbnail(capture: Capture, name: str, side: int = THUMBNAIL) -> UInt8[np.ndarray, "h w 3"]:
+    """An input image, reduced so that its longer side is at most `side` [pixels]."""
+    image = capture.images[capture.names.index(name)]
+    scale = min(1.0, side / max(image.shape[:2]))
+    size = (max(1, round(scale * length)) for length in image.shape[:2])
+    return resize_area(image.float(), *size).round().to(torch.uint8).numpy()

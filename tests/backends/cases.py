@@ -1,4 +1,4 @@
-"""Scenes for the conformance of backends: an easy one, a hard one, and an empty one."""
+"""Scenes for conformance tests of backends: an easy one, a hard one, and an empty one."""
 
 import math
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from tumble import backends
 from tumble.backends import Backend, Rendering, reference
 
 DIFFERENTIABLE = 6
-"""The first so many results of `rasterize` have a gradient."""
+"""Number of results of `rasterize` that are differentiable; they are the first ones."""
 
 
 class Scene(NamedTuple):
-    """Arguments of `rasterize` that are differentiated, in order, and the picture's size."""
+    """Differentiable arguments of `rasterize`, in order, and the image size."""
 
     inputs: list[Tensor]
     height: int
@@ -23,17 +23,17 @@ class Scene(NamedTuple):
 
 
 def facing(normals: Tensor) -> Tensor:
-    """Quaternions that turn +z to the normals (none may be -z)."""
+    """Quaternions of rotations from +z to the normals (none may be -z)."""
     w, x, y = 1 + normals[:, 2], -normals[:, 1], normals[:, 0]
     return normalize(torch.stack([w, x, y, torch.zeros_like(w)], -1), dim=-1)
 
 
 def fibonacci(n: int) -> Tensor:
-    """n directions of equal area."""
+    """n directions of equal solid angle."""
     i = torch.arange(n, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * i / n, i * math.pi * (3 - math.sqrt(5))
+    z, phi = 1 - 2 * i / n, i * math.pi * (3 - math.sqrt(5))
     r = (1 - z * z).sqrt()
-    return torch.stack([r * turn.cos(), r * turn.sin(), z], -1)
+    return torch.stack([r * phi.cos(), r * phi.sin(), z], -1)
 
 
 def shell(n: int, thickness: float = 0.1) -> list[Tensor]:
@@ -45,14 +45,14 @@ def shell(n: int, thickness: float = 0.1) -> list[Tensor]:
 
 
 def camera(height: int, width: int) -> list[Tensor]:
-    """A general pose before the object, and intrinsics with the principal point off the middle."""
+    """Extrinsics of a general pose, and intrinsics with a principal point that is not centred."""
     q = normalize(torch.tensor([[0.9, 0.2, -0.3, 0.25]], dtype=torch.float64), dim=-1)
     focal = torch.tensor([1.3 * width, 1.25 * width, 0.5 * width + 0.3, 0.5 * height - 0.2], dtype=torch.float64)
     return [reference.rotation(q)[0], torch.tensor([0.05, -0.1, 3.0], dtype=torch.float64), focal]
 
 
 def easy() -> Scene:
-    """Half-transparent Gaussians of moderate shape, all in the picture."""
+    """Semi-transparent Gaussians of moderate shape, all within the image."""
     rng = torch.Generator().manual_seed(1)
     n, height, width = 150, 40, 48
     means, quats, scales, _ = shell(n)
@@ -67,7 +67,7 @@ def easy() -> Scene:
 
 
 def hard() -> Scene:
-    """Opaque, deep, needle-shaped and wafer-thin Gaussians; some off the picture, behind the camera, or black."""
+    """Opaque, overlapping, elongated and very thin Gaussians; some outside the image, behind the camera, or black."""
     rng = torch.Generator().manual_seed(6)
     n, height, width = 400, 37, 51
     means, quats, scales, _ = shell(n)
@@ -87,7 +87,7 @@ def hard() -> Scene:
 
 
 def empty() -> Scene:
-    """No Gaussians at all."""
+    """A scene without Gaussians."""
     scene = easy()
     return scene._replace(inputs=[*(x[:0] for x in scene.inputs[:6]), *scene.inputs[6:]])
 
@@ -96,7 +96,7 @@ SCENES = {"easy": easy, "hard": hard, "empty": empty}
 
 
 def seeds(scene: Scene) -> list[Tensor]:
-    """A random gradient for every differentiable result; the variance is small, so its seed is large."""
+    """Random gradients of all differentiable results; that of the depth variance, which is small, is larger."""
     rng = torch.Generator().manual_seed(5)
     h, w, c = scene.height, scene.width, scene.inputs[5].shape[2]
     shapes = [(h, w, 3), (h, w), (h, w), (h, w), (h, w, 3), (h, w, c)]
@@ -106,7 +106,7 @@ def seeds(scene: Scene) -> list[Tensor]:
 def render(
     backend: Backend, scene: Scene, dtype: torch.dtype, mask: Tensor | None = None
 ) -> tuple[Rendering, list[Tensor]]:
-    """A view by a backend, and the gradient of `seeds` in every input."""
+    """A view rendered by a backend, and the gradients of all inputs from the gradients `seeds`."""
     inputs = [x.to(dtype).requires_grad_() for x in scene.inputs]
     mask = torch.ones(1, 1) if mask is None else mask
     view = backend.rasterize(*inputs, scene.height, scene.width, mask.to(dtype))
@@ -115,12 +115,12 @@ def render(
 
 
 def fast() -> list[str]:
-    """The backends to hold against the reference."""
+    """Names of all backends except the reference."""
     return [name for name in backends.names() if name != "reference"]
 
 
 def difference(value: Tensor, truth: Tensor) -> float:
-    """Relative L2 distance; absolute where the truth is zero."""
+    """Relative L2 distance of a value to the truth; absolute if the truth is zero."""
     value, truth = value.detach().double().cpu(), truth.detach().double()
     norm = truth.norm().item()
     return (value - truth).norm().item() / (norm if norm > 0 else 1.0)
@@ -131,5 +131,5 @@ def _normal(rng: torch.Generator, *shape: int) -> Tensor:
 
 
 def _round(scene: Scene) -> Scene:
-    """Inputs that 32 bits can hold, so that both precisions draw the same scene."""
+    """The scene with inputs rounded to float32, so that both precisions render the same scene."""
     return scene._replace(inputs=[x.float().double() for x in scene.inputs])

@@ -13,7 +13,7 @@ from tumble.backends import _brute, reference
 
 CPU = torch.device("cpu")
 RELATIVE = 1e-4
-"""32 bits against 64: about 1e-7 a step, some thousand steps, and nothing that cancels."""
+"""Tolerance of float32 against float64: about 1e-7 per operation, some thousand operations, without cancellation."""
 
 
 @pytest.fixture(params=cases.fast())
@@ -45,19 +45,19 @@ def test_values_and_gradients_are_those_of_the_reference(backend: backends.Backe
     assert max(worst.values()) < RELATIVE, worst
 
 
-def test_the_hard_scene_is_hard() -> None:
-    """It reaches the alpha clamp and the early stop many times, and holds what is culled for every reason."""
+def test_the_hard_scene_covers_all_thresholds() -> None:
+    """The alpha clamp and the early stop occur many times, and Gaussians are culled for every reason."""
     scene = cases.hard()
     means, quats, scales, opacity, sh, corners, R, t, focal = scene.inputs
     view = reference.project(means, quats, scales, opacity, sh, R, t)
     mask = torch.zeros(scene.height, scene.width, dtype=torch.float64)
 
-    def alpha(rules: reference.Rules) -> torch.Tensor:
-        return reference.composite(view, opacity, corners, t, focal, mask, rules).alpha
+    def alpha(thresholds: reference.Thresholds) -> torch.Tensor:
+        return reference.composite(view, opacity, corners, t, focal, mask, thresholds).alpha
 
-    truth = alpha(reference.SHARP)
-    assert (alpha(reference.SHARP._replace(alpha_max=1.0)) != truth).sum() > 50
-    assert (alpha(reference.SHARP._replace(T_min=0.0)) != truth).sum() > 1000
+    truth = alpha(reference.THRESHOLDS)
+    assert (alpha(reference.THRESHOLDS._replace(alpha_max=1.0)) != truth).sum() > 50
+    assert (alpha(reference.THRESHOLDS._replace(T_min=0.0)) != truth).sum() > 1000
     p_cam = means @ R.T + t
     assert (p_cam[:, 2] < 0).sum() >= 5
     pixel = p_cam[:, :2] / p_cam[:, 2:] * focal[:2] + focal[2:]
@@ -73,7 +73,7 @@ def test_one_gaussian_has_the_closed_form() -> None:
     sigma, o, size = 0.1, 0.8, 9
     inputs = [
         [[0.0, 0.0, 0.0]],
-        [[0.0, 1.0, 0.0, 0.0]],  # Half a turn about x: the normal looks back at the camera.
+        [[0.0, 1.0, 0.0, 0.0]],  # Rotation by pi about x: the normal faces the camera.
         [[sigma, sigma, sigma]],
         [o],
         [[[0.7 / 0.28209479177387814] * 3]],
@@ -120,17 +120,17 @@ def test_gradients_of_the_reference_are_finite_differences() -> None:
     inputs += [x.clone().requires_grad_() for x in scene.inputs[6:8]] + [focal]
     weights = torch.randn(3, 4, 13, generator=rng, dtype=torch.float64)
 
-    def draw(*x: torch.Tensor) -> torch.Tensor:
+    def render(*x: torch.Tensor) -> torch.Tensor:
         view = reference.project(*x[:5], x[6], x[7])
-        picture = reference.composite(view, x[3], x[5], x[7], x[8], torch.ones(3, 4).double(), reference.SMOOTH)
-        flat = [y if y.ndim == 3 else y[..., None] for y in picture[: cases.DIFFERENTIABLE]]
+        image = reference.composite(view, x[3], x[5], x[7], x[8], torch.ones(3, 4).double(), reference.NO_THRESHOLDS)
+        flat = [y if y.ndim == 3 else y[..., None] for y in image[: cases.DIFFERENTIABLE]]
         return (torch.cat(flat, -1) * weights[..., : sum(y.shape[-1] for y in flat)]).sum((0, 1))
 
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("c", [0, 1, 8, 13, 16, 21])
-def test_any_number_of_features_is_drawn(backend: backends.Backend, c: int) -> None:
+def test_any_number_of_features_is_rendered(backend: backends.Backend, c: int) -> None:
     scene = cases.easy()
     rng = torch.Generator().manual_seed(c)
     scene.inputs[5] = torch.randn(150, 4, c, generator=rng).double()
@@ -141,7 +141,7 @@ def test_any_number_of_features_is_drawn(backend: backends.Backend, c: int) -> N
 
 
 @pytest.mark.parametrize("name", ["easy", "hard"])
-def test_features_alone_get_the_gradient_they_get_with_the_rest(backend: backends.Backend, name: str) -> None:
+def test_gradients_of_features_do_not_depend_on_those_of_geometry(backend: backends.Backend, name: str) -> None:
     scene = cases.SCENES[name]()
     inputs = [x.float() for x in scene.inputs]
     corners = inputs[5].requires_grad_()
@@ -152,7 +152,7 @@ def test_features_alone_get_the_gradient_they_get_with_the_rest(backend: backend
     torch.testing.assert_close(alone, gradients[5])
 
 
-def test_kernels_keep_the_threads_that_torch_gives_up() -> None:
+def test_threads_for_kernels_limits_torch_and_not_the_kernels() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -163,7 +163,7 @@ def test_kernels_keep_the_threads_that_torch_gives_up() -> None:
         torch.set_num_threads(before)
 
 
-def test_results_repeat_bit_for_bit_and_hardly_depend_on_threads(backend: backends.Backend) -> None:
+def test_results_are_reproducible_and_depend_on_threads_by_rounding_only(backend: backends.Backend) -> None:
     scene = cases.hard()
     threads = torch.get_num_threads()
     try:
@@ -175,14 +175,14 @@ def test_results_repeat_bit_for_bit_and_hardly_depend_on_threads(backend: backen
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for a, b in zip(runs[1], runs[2], strict=True))
-    # Sums over pixels are the same numbers in another order.
+    # The order of sums over pixels depends on the number of threads.
     assert max(cases.difference(a, b) for a, b in zip(runs[0], runs[1], strict=True)) < 1e-5
 
 
 # ---------------------------------------------------------------------------------------------------- trace
 
 
-def _cloud(name: str) -> list[torch.Tensor]:
+def _gaussians(name: str) -> list[torch.Tensor]:
     return cases.shell(700) if name == "shell" else cases.SCENES[name]().inputs[:4]
 
 
@@ -193,7 +193,7 @@ def _rays(n: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_a_ray_past_one_gaussian_has_the_closed_form() -> None:
-    """At distance b of the centre, alpha = o exp(-b^2 / 2 s^2), cut at three sigma, and only from the front."""
+    """At distance b from the centre alpha = o exp(-b^2 / 2 s^2), up to three sigma, and only from the front."""
     sigma, o = 0.1, 0.7
     gaussian = [torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), sigma), torch.tensor([o])]
     bvh = reference.build(*(x.double() for x in gaussian))
@@ -210,8 +210,8 @@ def test_a_ray_past_one_gaussian_has_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize("name", ["shell", "easy", "hard", "empty"])
-def test_rays_meet_what_brute_force_meets(backend: backends.Backend, name: str) -> None:
-    cloud = _cloud(name)
+def test_hits_are_those_of_brute_force(backend: backends.Backend, name: str) -> None:
+    cloud = _gaussians(name)
     origins, directions = _rays(3000)
     radiance = torch.rand(len(cloud[0]), 3, generator=torch.Generator().manual_seed(0))
     tree = backend.build(*(x.float() for x in cloud))
@@ -220,14 +220,14 @@ def test_rays_meet_what_brute_force_meets(backend: backends.Backend, name: str) 
     truth = reference.trace(bvh, origins.double(), directions.double(), radiance.double())
     assert cases.difference(hits.transmittance, truth.transmittance) < RELATIVE
     assert cases.difference(hits.radiance, truth.radiance) < RELATIVE
-    # Two Gaussians of equal weight may change places.
+    # Two Gaussians of equal weight may be swapped.
     assert (hits.hit != truth.hit).float().mean() < 2e-3
     if name != "empty":
         assert 0.005 < (truth.transmittance == 0).double().mean() < 0.9
 
 
 def test_a_ray_through_hundreds_of_faint_gaussians_is_exact(backend: backends.Backend) -> None:
-    """More hits than any buffer holds, among them exact duplicates: 600 of alpha 0.005 leave T = 0.995^600."""
+    """More hits than the buffers hold, with exact duplicates: 600 of alpha 0.005 give T = 0.995^600."""
     n = 600
     rng = torch.Generator().manual_seed(2)
     z = torch.rand(n, generator=rng).round(decimals=2)
@@ -243,24 +243,24 @@ def test_a_ray_through_hundreds_of_faint_gaussians_is_exact(backend: backends.Ba
 
 @pytest.mark.parametrize("name", ["shell", "hard"])
 def test_visibility_bits_and_blockers_are_those_of_brute_force(backend: backends.Backend, name: str) -> None:
-    cloud = _cloud(name)
+    cloud = _gaussians(name)
     points, normals = _rays(150)
     directions = cases.fibonacci(75).float()
     tree, bvh = backend.build(*(x.float() for x in cloud)), reference.build(*(x.float().double() for x in cloud))
     bits = backend.visible(tree, points, normals, directions)
     truth = reference.visible(bvh, points.double(), normals.double(), directions.double())
-    seen, truly = _brute.unpack(bits, 75), _brute.unpack(truth, 75)
+    visible, truly_visible = _brute.unpack(bits, 75), _brute.unpack(truth, 75)
     # A transmittance may lie within rounding of one half.
-    assert (seen != truly).float().mean() < 1e-3
-    assert not seen[normals @ directions.T <= 0].any()
-    assert 0.1 < truly.double().mean() < 0.49
+    assert (visible != truly_visible).float().mean() < 1e-3
+    assert not visible[normals @ directions.T <= 0].any()
+    assert 0.1 < truly_visible.double().mean() < 0.49
     blockers = backend.blockers(tree, points, normals, directions, truth)
     true_blockers = reference.blockers(bvh, points.double(), normals.double(), directions.double(), truth)
     assert (blockers != true_blockers).float().mean() < 1e-3
-    assert torch.equal(true_blockers >= 0, (normals @ directions.T > 0) & ~truly)
+    assert torch.equal(true_blockers >= 0, (normals @ directions.T > 0) & ~truly_visible)
 
 
-def test_packed_bits_come_back() -> None:
+def test_unpack_inverts_pack() -> None:
     bits = torch.rand(5, 70, generator=torch.Generator().manual_seed(0)) > 0.5
     words = _brute.pack(bits)
     assert words.shape == (5, 3)
@@ -268,8 +268,8 @@ def test_packed_bits_come_back() -> None:
     assert words[0, 0].item() & 0xFFFFFFFF == sum(1 << j for j in range(32) if bits[0, j])
 
 
-def test_a_convex_object_hardly_shades_itself(backend: backends.Backend) -> None:
-    """A sphere of Gaussians, from points of its *rendered* surface: mean visibility above the horizon > 0.985."""
+def test_a_convex_object_hardly_shadows_itself(backend: backends.Backend) -> None:
+    """Mean visibility above the horizon exceeds 0.985 at points of the rendered surface of a sphere of Gaussians."""
     n, size = 4000, 48
     means, quats, scales, opacity = (x.float() for x in cases.shell(n))
     R, t, focal = (x.float() for x in cases.camera(size, size))
@@ -283,17 +283,17 @@ def test_a_convex_object_hardly_shades_itself(backend: backends.Backend) -> None
     assert (points.norm(dim=-1) - 1).abs().mean() < 0.01
     directions = cases.fibonacci(256).float()
     lifted = points + 2 * scales[0, 0] * normals
-    seen = _brute.unpack(
+    visible = _brute.unpack(
         backend.visible(backend.build(means, quats, scales, opacity), lifted, normals, directions), 256
     )
-    assert seen.sum() / (normals @ directions.T > 0).sum() > 0.985
+    assert visible.sum() / (normals @ directions.T > 0).sum() > 0.985
 
 
 # ---------------------------------------------------------------------------------------------------- shade
 
 
 def _surface(p: int, rough: tuple[float, float]) -> list[torch.Tensor]:
-    """Normals, albedo, roughness and view directions, some of them behind the surface."""
+    """Normals, albedo, roughness and view directions; some views are behind the surface."""
     rng = torch.Generator().manual_seed(11)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 1.1 * normalize(torch.randn(p, 3, generator=rng), dim=-1), dim=-1)
@@ -331,15 +331,15 @@ def test_gradients_of_reference_shading_are_finite_differences() -> None:
     visibility = _brute.pack(torch.rand(4, 9, generator=rng) > 0.3)
     blocker = torch.randint(-1, 9, (4, 9), generator=rng).int()
 
-    def draw(*x: torch.Tensor) -> torch.Tensor:
+    def render(*x: torch.Tensor) -> torch.Tensor:
         return reference.shade(*x[:4], cases.fibonacci(9), x[4], visibility, blocker, x[5], 0.04)
 
-    assert torch.autograd.gradcheck(draw, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
-def test_a_sphere_in_constant_light_shows_the_textbook_integral(backend: backends.Backend, roughness: float) -> None:
-    """Lambert gives albedo; GGX as D F G / (4 n.l n.v) with half vectors, integrated on another grid."""
+def test_a_sphere_in_uniform_light_matches_the_integrated_brdf(backend: backends.Backend, roughness: float) -> None:
+    """The Lambertian part equals the albedo; GGX is D F G / (4 n.l n.v), integrated on another grid."""
     normal = cases.fibonacci(40)
     view = torch.tensor([0.0, 0.0, 1.0]).double()
     front = normal @ view > 0.2
@@ -360,12 +360,12 @@ def test_a_sphere_in_constant_light_shows_the_textbook_integral(backend: backend
         *black,
         0.04,
     )
-    expected = 1.5 * (albedo.numpy() + _textbook_ggx(normal.numpy(), view.numpy(), roughness)[:, None])
+    expected = 1.5 * (albedo.numpy() + _integrated_ggx(normal.numpy(), view.numpy(), roughness)[:, None])
     # Both grids resolve the narrowest of these lobes to about 1e-3.
     np.testing.assert_allclose(shaded.numpy(), expected, rtol=3e-3)
 
 
-def _textbook_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: float = 0.04) -> np.ndarray:
+def _integrated_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: float = 0.04) -> np.ndarray:
     """Integral of f_s cos over the hemisphere by the midpoint rule in polar angles about each normal."""
     a = roughness**2
     mu = (np.arange(400) + 0.5) / 400
@@ -393,5 +393,5 @@ def _textbook_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: f
 # --------------------------------------------------------------------------------------------------- choice
 
 
-def test_doubles_are_drawn_by_the_reference() -> None:
+def test_float64_is_rendered_by_the_reference() -> None:
     assert backends.choose(CPU, torch.float64) is reference

@@ -1,6 +1,6 @@
-"""The GPU's kernels: their arithmetic on the CPU, that they compile for a GPU, and what they do on one where there is.
+"""The Warp kernels: their results on the CPU, their compilation for a GPU, and their results on a GPU if there is one.
 
-The cases and what they must show are those of `test_backends.py`.
+The conformance tests are those of `test_backends.py`.
 """
 
 import importlib.util
@@ -22,15 +22,15 @@ GPU = torch.device("cuda")
 
 CONFORMANCE = [
     *[(conformance.test_values_and_gradients_are_those_of_the_reference, name) for name in cases.SCENES],
-    *[(conformance.test_any_number_of_features_is_drawn, c) for c in (0, 8, 21)],
-    *[(conformance.test_rays_meet_what_brute_force_meets, name) for name in ("shell", "hard", "empty")],
+    *[(conformance.test_any_number_of_features_is_rendered, c) for c in (0, 8, 21)],
+    *[(conformance.test_hits_are_those_of_brute_force, name) for name in ("shell", "hard", "empty")],
     (conformance.test_a_ray_through_hundreds_of_faint_gaussians_is_exact,),
     (conformance.test_visibility_bits_and_blockers_are_those_of_brute_force, "hard"),
-    (conformance.test_a_convex_object_hardly_shades_itself,),
+    (conformance.test_a_convex_object_hardly_shadows_itself,),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 100, 0, (0.3, 1.0)),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 256, 7, (0.03, 0.6)),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 1, 3, (0.5, 0.5)),
-    (conformance.test_a_sphere_in_constant_light_shows_the_textbook_integral, 0.3),
+    (conformance.test_a_sphere_in_uniform_light_matches_the_integrated_brdf, 0.3),
 ]
 every_case = pytest.mark.parametrize(
     "case", CONFORMANCE, ids=lambda case: "-".join([case[0].__name__, *map(str, case[1:])])
@@ -39,20 +39,20 @@ every_case = pytest.mark.parametrize(
 
 @pytest.fixture
 def kernels() -> Any:
-    """The backend, if Warp is here; tensors on the CPU run its kernels there."""
+    """The backend if Warp is installed; it is called with tensors on the CPU."""
     if importlib.util.find_spec("warp") is None:
         pytest.skip("needs NVIDIA Warp: pip install 'tumble[cuda]'")
     return cuda
 
 
 @every_case
-def test_the_kernels_keep_the_contract_on_the_cpu(kernels: Any, case: tuple[Callable[..., None], ...]) -> None:
+def test_the_kernels_conform_on_the_cpu(kernels: Any, case: tuple[Callable[..., None], ...]) -> None:
     check, *arguments = case
     check(kernels, *arguments)
 
 
-def test_rays_along_the_axes_meet_what_brute_force_meets(kernels: Any) -> None:
-    """They run in the sides of boxes, where the inverse of a direction is infinite."""
+def test_hits_of_rays_along_the_axes_are_those_of_brute_force(kernels: Any) -> None:
+    """Such rays lie in the sides of boxes, and the inverse of their direction is infinite."""
     cloud = [x.float() for x in cases.shell(300)]
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
     starts = torch.tensor([[0.3, -0.2, 0.4], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
@@ -66,8 +66,8 @@ def test_rays_along_the_axes_meet_what_brute_force_meets(kernels: Any) -> None:
     assert cases.difference(hits.transmittance, truth.transmittance) < conformance.RELATIVE
 
 
-def test_tile_lists_hold_the_tiles_that_are_touched_and_hardly_any_other(kernels: Any) -> None:
-    """Against every Gaussian at every pixel."""
+def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any) -> None:
+    """Compared with the response of every Gaussian at every pixel."""
     from tumble.backends import _warp, _warp_project
 
     scene = cases.hard()
@@ -95,15 +95,15 @@ def test_tile_lists_hold_the_tiles_that_are_touched_and_hardly_any_other(kernels
         off = torch.linalg.cross(Wd, Wp.expand_as(Wd)).square().sum(-1) / Wd.square().sum(-1)
         alpha = opacity[view.index] * torch.exp(-0.5 * off)
         touched[tile, view.index] = (alpha >= backends.ALPHA_MIN).any(0)
-    # On the border of the threshold, 32 bits may decide otherwise.
+    # Alphas close to the threshold may differ in float32.
     assert (touched & ~in_list).sum() <= 1e-3 * touched.sum()
-    # What is listed in excess: the pixel centres miss needles, and outlines are a fiftieth of a pixel wider.
+    # Excess tiles: needles between pixel centres, and footprints that are a fiftieth of a pixel wider.
     assert (in_list & ~touched).sum() < 0.01 * touched.sum()
     ordered = depth[listed.long()].split(starts.diff().tolist())
     assert all((x.diff() >= 0).all() for x in ordered)
 
 
-def test_every_kernel_compiles_for_a_gpu_that_is_not_here(kernels: Any, tmp_path: Path) -> None:
+def test_every_kernel_compiles_for_a_gpu_without_having_one(kernels: Any, tmp_path: Path) -> None:
     import warp
 
     from tumble.backends import _warp_adjoint, _warp_composite, _warp_project, _warp_shade, _warp_trace
@@ -111,14 +111,14 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_here(kernels: Any, tmp_path
     if 90 not in warp.get_cuda_supported_archs():
         pytest.skip("this build of Warp has no compiler for sm_90")
     modules = [warp.get_module(file.__name__) for file in (_warp_project, _warp_adjoint, _warp_trace, _warp_shade)]
-    made = _warp_composite.forward, _warp_composite.adjoint
-    modules += [make(channels).module for make in made for channels in _warp_composite.WIDTHS]
+    factories = _warp_composite.forward, _warp_composite.adjoint
+    modules += [make(channels).module for make in factories for channels in _warp_composite.WIDTHS]
     for module in modules:
         (path,) = warp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
         assert b".target sm_90" in path.read_bytes()
 
 
-def test_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ready_returns_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "not torch.float32 on cpu" in cuda.ready(torch.device("cpu"), torch.float32)
     assert "not torch.float64 on cuda" in cuda.ready(GPU, torch.float64)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -145,7 +145,7 @@ def test_warp_is_not_loaded_before_it_is_needed() -> None:
 
 
 class OnGpu:
-    """The backend for callers whose tensors are on the CPU."""
+    """The backend wrapped for tensors on the CPU, which are copied to the GPU and back."""
 
     def __getattr__(self, verb: str) -> Callable[..., Any]:
         def call(*arguments: Any) -> Any:
@@ -167,14 +167,14 @@ def on_gpu() -> Any:
 
 @pytest.mark.gpu
 @every_case
-def test_the_kernels_keep_the_contract_on_a_gpu(on_gpu: Any, case: tuple[Callable[..., None], ...]) -> None:
+def test_the_kernels_conform_on_a_gpu(on_gpu: Any, case: tuple[Callable[..., None], ...]) -> None:
     check, *arguments = case
     check(on_gpu, *arguments)
 
 
 @pytest.mark.gpu
-def test_runs_on_a_gpu_agree_to_rounding_in_any_stream(on_gpu: Any) -> None:
-    """Atomic additions come in any order, a few thousand of them, each rounded to 6e-8."""
+def test_runs_on_a_gpu_differ_by_rounding_in_any_stream(on_gpu: Any) -> None:
+    """The order of a few thousand atomic additions varies, and each is rounded to 6e-8."""
     scene = cases.hard()
     view, gradients = cases.render(on_gpu, scene, torch.float32)
     with torch.cuda.stream(torch.cuda.Stream()):

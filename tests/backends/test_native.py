@@ -1,4 +1,4 @@
-"""Compiling the CPU kernels on first use, with a compiler and without, and what the compiled code may not do."""
+"""Compilation of the CPU kernels on first use, with and without a compiler, and memory safety of the kernels."""
 
 import ctypes
 import os
@@ -21,7 +21,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def no_library() -> Iterator[None]:
-    """As in a fresh process; afterwards too."""
+    """Unload the kernels before and after the test."""
     _native.library.cache_clear()
     backends._warn_once.cache_clear()
     yield
@@ -36,14 +36,14 @@ def no_warp(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def no_compiler(no_library: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only Warp's own Clang is left."""
+    """Hide all C++ compilers, so that only the Clang of Warp remains."""
     pytest.importorskip("warp", reason="needs Warp: pip install 'tumble[cuda]'")
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(_native, "COMPILERS", ())
 
 
 @pytest.mark.usefixtures("no_library", "no_warp")
-def test_without_a_compiler_the_reference_draws_and_one_warning_says_what_to_do(
+def test_without_a_compiler_the_reference_is_used_with_one_warning(
     monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
@@ -53,7 +53,7 @@ def test_without_a_compiler_the_reference_draws_and_one_warning_says_what_to_do(
 
 
 @pytest.mark.usefixtures("no_library", "no_warp")
-def test_a_failing_compiler_is_named_with_what_it_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_a_failing_compiler_contains_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CXX", _script(tmp_path / "broken", "echo out of cheese >&2; exit 1"))
     assert "out of cheese" in backends.load("cpu").ready(CPU, torch.float32)
@@ -62,7 +62,7 @@ def test_a_failing_compiler_is_named_with_what_it_said(tmp_path: Path, monkeypat
 
 @pytest.mark.parametrize("name", cases.SCENES)
 @pytest.mark.usefixtures("no_compiler")
-def test_without_a_compiler_the_kernels_of_warps_clang_draw_as_the_reference(name: str) -> None:
+def test_kernels_compiled_by_warp_match_the_reference(name: str) -> None:
     cpu, scene = backends.load("cpu"), cases.SCENES[name]()
     assert backends.choose(CPU, torch.float32) is cpu
     assert not isinstance(_native.library(), ctypes.CDLL)
@@ -78,7 +78,7 @@ def test_without_a_compiler_the_kernels_of_warps_clang_draw_as_the_reference(nam
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.usefixtures("no_compiler")
-def test_without_a_compiler_every_verb_works_on_any_number_of_threads(threads: int) -> None:
+def test_kernels_compiled_by_warp_work_with_any_number_of_threads(threads: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -88,29 +88,29 @@ def test_without_a_compiler_every_verb_works_on_any_number_of_threads(threads: i
 
 
 @pytest.mark.usefixtures("no_compiler")
-def test_warps_clang_takes_the_vectors_of_the_machine() -> None:
-    """Narrower ones cost half the speed, wider ones far more. The flags are those that a compiler would look at."""
+def test_kernels_compiled_by_warp_use_the_vectors_of_the_machine() -> None:
+    """Narrower vectors cost half of the speed, wider ones far more."""
     flags = next((x.split() for x in _native._cpu_features().splitlines() if x.startswith("flags")), None)
     if flags is None:
-        pytest.skip("this system does not list what its processor can")
+        pytest.skip("this system does not list the features of its processor")
     lanes = 16 if {"avx512f", "avx512dq"} <= set(flags) else 8 if "avx2" in flags else 4
     assert _native.library().lanes() == lanes
 
 
 @pytest.mark.usefixtures("no_compiler")
-def test_a_warp_that_cannot_compile_is_named_and_the_reference_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As an older or a later Warp, which may lack what is used of it."""
+def test_if_warp_cannot_compile_the_reference_is_used_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other versions of Warp may lack its experimental functions."""
     import warp
 
     monkeypatch.delitem(sys.modules, "tumble.backends._jit", raising=False)
     monkeypatch.delattr(backends, "_jit", raising=False)
     monkeypatch.delattr(warp, "ModuleBuildOptions")
-    with pytest.warns(RuntimeWarning, match=r"no C\+\+ compiler.*nor can Warp [0-9.]+.*ModuleBuildOptions"):
+    with pytest.warns(RuntimeWarning, match=r"no C\+\+ compiler.*installed Warp [0-9.]+ cannot.*ModuleBuildOptions"):
         assert backends.choose(CPU, torch.float32) is reference
 
 
-def test_two_processes_that_start_at_once_compile_to_one_whole_file(tmp_path: Path) -> None:
-    """The compiler here is a script that takes its time to copy what was compiled before."""
+def test_concurrent_processes_write_one_complete_library(tmp_path: Path) -> None:
+    """The compiler is replaced by a script that slowly copies the library compiled before."""
     library = compiled()
     to_output = 'while [ "$1" != -o ]; do [ "$1" = --version ] && exit; shift; done'
     copy = f'{to_output}; sleep .3; cp {library._name} "$2"'
@@ -121,8 +121,8 @@ def test_two_processes_that_start_at_once_compile_to_one_whole_file(tmp_path: Pa
     assert [path.suffix for path in (tmp_path / "tumble").iterdir()] == [".so"]
 
 
-def test_threads_of_python_may_draw_at_once() -> None:
-    """One has the pool of workers, the other draws alone: the same picture."""
+def test_python_threads_can_render_concurrently() -> None:
+    """One thread uses the pool, the others render without it; the images are equal."""
     cpu, scene = backends.load("cpu"), cases.hard()
     if reason := cpu.ready(CPU, torch.float32):
         pytest.skip(reason)
@@ -130,25 +130,23 @@ def test_threads_of_python_may_draw_at_once() -> None:
     torch.set_num_threads(2)
     try:
         with ThreadPoolExecutor(4) as pool:
-            drawn = list(pool.map(lambda _: cases.render(cpu, scene, torch.float32), range(12)))
+            results = list(pool.map(lambda _: cases.render(cpu, scene, torch.float32), range(12)))
     finally:
         torch.set_num_threads(threads)
-    for view, gradients in drawn[1:]:
-        assert torch.equal(view.rgb, drawn[0][0].rgb)
-        # Other threads of torch may see another number of threads: sums in another order.
-        assert all(cases.difference(a, b) < 1e-5 for a, b in zip(gradients, drawn[0][1], strict=True))
+    for view, gradients in results[1:]:
+        assert torch.equal(view.rgb, results[0][0].rgb)
+        # The number of threads may differ between Python threads, which changes the order of sums.
+        assert all(cases.difference(a, b) < 1e-5 for a, b in zip(gradients, results[0][1], strict=True))
 
 
 WIDTHS = {"16": ["-march=x86-64-v4"], "8": ["-march=x86-64-v3"], "4": ["-march=x86-64"]}
-"""Floats in a vector, and the flag that brings it about."""
+"""Numbers of floats in a vector, and the compiler flags for each."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lanes", WIDTHS)
 @pytest.mark.usefixtures("no_library")
-def test_every_vector_width_gives_the_same_pictures(
-    lanes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_vector_width_matches_the_reference(lanes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if compiled().lanes() < int(lanes):
         pytest.skip("this machine has no such vectors")
     monkeypatch.setattr(_native, "VARIANTS", (WIDTHS[lanes],))
@@ -159,7 +157,7 @@ def test_every_vector_width_gives_the_same_pictures(
 
 
 def compiled() -> ctypes.CDLL:
-    """What the system's compiler made of the kernels."""
+    """The kernels compiled by the system's compiler."""
     if reason := backends.load("cpu").ready(CPU, torch.float32):
         pytest.skip(reason)
     library = _native.library()
@@ -169,7 +167,7 @@ def compiled() -> ctypes.CDLL:
 
 
 def exercise() -> None:
-    """Every verb of the CPU backend on the hard scene, held against the reference."""
+    """Compare every function of the CPU backend with the reference on the hard scene."""
     cpu, scene = backends.load("cpu"), cases.hard()
     view, gradients = cases.render(cpu, scene, torch.float32)
     truth, true_gradients = cases.render(reference, scene, torch.float64)
@@ -194,13 +192,13 @@ def exercise() -> None:
     for backend in (cpu, reference):
         shaded = backend.shade(*inputs[:4], directions, inputs[4], bits, blockers, inputs[5], 0.04)
         results.append([shaded, *torch.autograd.grad(shaded.sum(), inputs)])
-    # Both in 32 bits.
+    # Both are computed in float32.
     assert max(cases.difference(a, b) for a, b in zip(*results, strict=True)) < 1e-3
 
 
 @pytest.mark.slow
-def test_the_kernels_touch_no_memory_but_their_own(tmp_path: Path) -> None:
-    """Address and undefined-behaviour sanitizers watch every verb, with no Gaussians too, on one and three threads."""
+def test_the_kernels_access_their_own_memory_only(tmp_path: Path) -> None:
+    """Every function passes the address and undefined-behaviour sanitizers, also without Gaussians and with threads."""
     try:
         compiler = _native.find_compiler()
     except _native.CannotCompile as reason:
@@ -209,9 +207,9 @@ def test_the_kernels_touch_no_memory_but_their_own(tmp_path: Path) -> None:
     if not Path(runtime).is_file():
         pytest.skip("the compiler has no address sanitizer")
     library = tmp_path / "kernels.so"
-    watch = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-march=native", "-O1"]
+    sanitize = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-march=native", "-O1"]
     source = str(_native.SOURCES / "kernels.cpp")
-    subprocess.run([compiler, *_native.FLAGS, *watch, source, "-o", str(library)], check=True)
+    subprocess.run([compiler, *_native.FLAGS, *sanitize, source, "-o", str(library)], check=True)
     program = (
         "import ctypes, torch; from tumble.backends import _native, load; "
         f"kernels = ctypes.CDLL({str(library)!r}); _native.library = lambda: kernels; "

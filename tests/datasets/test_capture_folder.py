@@ -1,4 +1,4 @@
-"""The capture folder of docs/format.md: what is written comes back, and every broken rule names its file."""
+"""The capture folder of docs/format.md: saved captures are loaded unchanged, violations are reported with the file."""
 
 import json
 import math
@@ -23,19 +23,19 @@ from tumble.scene.trajectory import Trajectory
 CAMERA = Camera(torch.tensor([12.0, 13.0, 4.5, 2.5]), height=6, width=8)
 
 
-def a_capture() -> tuple[Capture, Truth]:
+def example_capture() -> tuple[Capture, Truth]:
     torch.manual_seed(0)
 
-    def photographs(n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def images_and_masks(n: int) -> tuple[torch.Tensor, torch.Tensor]:
         masks = torch.tensor([OBJECT, UNKNOWN, BACKGROUND], dtype=torch.uint8)[torch.randint(3, (n, 6, 8))]
         return torch.randint(256, (n, 6, 8, 3), dtype=torch.uint8), masks
 
     def poses(n: int) -> Trajectory:
         return Trajectory(SE3.from_rotation(SO3.exp(torch.randn(n, 3)), torch.randn(n, 3)), "camera")
 
-    images, masks = photographs(3)
+    images, masks = images_and_masks(3)
     capture = Capture(images, masks, CAMERA, ("a.png", "b.png", "c.png"), "camera", poses(3))
-    images, masks = photographs(2)
+    images, masks = images_and_masks(2)
     truth = Truth(
         images=images,
         masks=masks,
@@ -46,7 +46,7 @@ def a_capture() -> tuple[Capture, Truth]:
         roughness=torch.rand(2, 6, 8),
         normals=torch.nn.functional.normalize(torch.randn(2, 6, 8, 3), dim=-1),
         depth=torch.rand(2, 6, 8) + 3,
-        relit={"sun": photographs(2)[0]},
+        relit={"sun": images_and_masks(2)[0]},
         light=Environment.from_radiance(torch.rand(4, 8, 3)),
         lights={"sun": Environment.from_radiance(torch.rand(4, 8, 3))},
         poses=capture.trajectory,
@@ -56,7 +56,7 @@ def a_capture() -> tuple[Capture, Truth]:
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    _capture_folder.save_capture(tmp_path / "capture", *a_capture(), setting="handheld")
+    _capture_folder.save_capture(tmp_path / "capture", *example_capture(), setting="handheld")
     return tmp_path / "capture"
 
 
@@ -73,58 +73,58 @@ def assert_same_poses(a: Trajectory | None, b: Trajectory | None) -> None:
     torch.testing.assert_close(a.T_cam_obj.matrix(), b.T_cam_obj.matrix(), atol=1e-5, rtol=0)
 
 
-def test_a_capture_comes_back_as_it_was_written(written: Path) -> None:
-    capture, truth = a_capture()
-    again, truth_again = folder.load(written), folder.load_truth(written)
-    assert truth_again is not None
-    assert torch.equal(again.images, capture.images)
-    assert torch.equal(again.masks, capture.masks)
-    assert again.names == capture.names
-    assert again.light == "camera"
-    torch.testing.assert_close(again.camera.fx_fy_cx_cy, CAMERA.fx_fy_cx_cy)
-    assert_same_poses(again.trajectory, capture.trajectory)
-    assert_same_poses(truth_again.trajectory, truth.trajectory)
-    assert_same_poses(truth_again.poses, truth.poses)
-    assert (truth_again.names, truth_again.regions) == (truth.names, truth.regions)
-    assert (truth_again.views("shared"), truth_again.views("sphere")) == ([0], [1])
+def test_a_capture_is_loaded_as_it_was_saved(written: Path) -> None:
+    capture, truth = example_capture()
+    loaded, loaded_truth = folder.load(written), folder.load_truth(written)
+    assert loaded_truth is not None
+    assert torch.equal(loaded.images, capture.images)
+    assert torch.equal(loaded.masks, capture.masks)
+    assert loaded.names == capture.names
+    assert loaded.light == "camera"
+    torch.testing.assert_close(loaded.camera.fx_fy_cx_cy, CAMERA.fx_fy_cx_cy)
+    assert_same_poses(loaded.trajectory, capture.trajectory)
+    assert_same_poses(loaded_truth.trajectory, truth.trajectory)
+    assert_same_poses(loaded_truth.poses, truth.poses)
+    assert (loaded_truth.names, loaded_truth.regions) == (truth.names, truth.regions)
+    assert (loaded_truth.views("shared"), loaded_truth.views("sphere")) == ([0], [1])
     for name in ("images", "masks", "albedo", "roughness", "depth"):
-        assert torch.equal(getattr(truth_again, name), getattr(truth, name)), name
-    torch.testing.assert_close(truth_again.normals, truth.normals)
-    assert torch.equal(truth_again.relit["sun"], truth.relit["sun"])
+        assert torch.equal(getattr(loaded_truth, name), getattr(truth, name)), name
+    torch.testing.assert_close(loaded_truth.normals, truth.normals)
+    assert torch.equal(loaded_truth.relit["sun"], truth.relit["sun"])
     # Radiance HDR keeps eight bits of the brightest channel.
-    torch.testing.assert_close(truth_again.light.radiance, truth.light.radiance, atol=1 / 128, rtol=0)
-    torch.testing.assert_close(truth_again.lights["sun"].radiance, truth.lights["sun"].radiance, atol=1 / 128, rtol=0)
+    torch.testing.assert_close(loaded_truth.light.radiance, truth.light.radiance, atol=1 / 128, rtol=0)
+    torch.testing.assert_close(loaded_truth.lights["sun"].radiance, truth.lights["sun"].radiance, atol=1 / 128, rtol=0)
 
 
 def test_a_capture_loads_when_its_truth_is_deleted(written: Path) -> None:
-    whole = folder.load(written)
+    capture = folder.load(written)
     for path in sorted((written / "truth").rglob("*"), reverse=True):
         path.rmdir() if path.is_dir() else path.unlink()
-    assert torch.equal(folder.load(written).images, whole.images)
+    assert torch.equal(folder.load(written).images, capture.images)
 
 
-def test_a_pose_free_capture_keeps_its_true_poses_apart(tmp_path: Path) -> None:
-    capture, truth = a_capture()
-    bare = Capture(capture.images, capture.masks, capture.camera, capture.names, capture.light)
-    _capture_folder.save_capture(tmp_path / "capture", bare, truth)
-    again = folder.load_truth(tmp_path / "capture")
+def test_the_true_poses_of_a_capture_without_poses_are_part_of_its_truth(tmp_path: Path) -> None:
+    capture, truth = example_capture()
+    without_poses = Capture(capture.images, capture.masks, capture.camera, capture.names, capture.light)
+    _capture_folder.save_capture(tmp_path / "capture", without_poses, truth)
+    loaded = folder.load_truth(tmp_path / "capture")
     assert folder.load(tmp_path / "capture").trajectory is None
-    assert again is not None
-    assert_same_poses(again.poses, truth.poses)
+    assert loaded is not None
+    assert_same_poses(loaded.poses, truth.poses)
 
 
-def test_a_guessed_focal_length_stays_one(tmp_path: Path) -> None:
-    capture, truth = a_capture()
-    _capture_folder.save_capture(tmp_path / "guess", replace(capture, focal_guessed=True), truth)
+def test_an_assumed_focal_length_is_marked_as_assumed(tmp_path: Path) -> None:
+    capture, truth = example_capture()
+    _capture_folder.save_capture(tmp_path / "assumed", replace(capture, focal_assumed=True), truth)
     _capture_folder.save_capture(tmp_path / "known", capture, truth)
-    assert folder.load(tmp_path / "guess").focal_guessed
-    assert folder.load(tmp_path / "guess").select([1]).focal_guessed
-    assert not folder.load(tmp_path / "known").focal_guessed
+    assert folder.load(tmp_path / "assumed").focal_assumed
+    assert folder.load(tmp_path / "assumed").select([1]).focal_assumed
+    assert not folder.load(tmp_path / "known").focal_assumed
 
 
 def test_saving_over_a_folder_is_refused(written: Path) -> None:
-    with pytest.raises(BadFile, match="is there already"):
-        _capture_folder.save_capture(written, *a_capture())
+    with pytest.raises(BadFile, match="exists already"):
+        _capture_folder.save_capture(written, *example_capture())
 
 
 # Folders of other tools -----------------------------------------------------------------------------------------------
@@ -147,53 +147,53 @@ def test_a_plain_instant_ngp_folder_is_a_static_capture(tmp_path: Path) -> None:
     assert folder.load_truth(tmp_path) is None or folder.load_truth(tmp_path).poses is not None
 
 
-def test_straight_alpha_becomes_colour_over_black_and_a_mask(tmp_path: Path) -> None:
+def test_alpha_becomes_a_mask_and_colour_over_black(tmp_path: Path) -> None:
     rgba = np.zeros((2, 3, 4), np.uint8)
     rgba[0, 0] = [200, 100, 50, 255]
     rgba[0, 1] = [200, 100, 50, 128]
     rgba[0, 2] = [200, 100, 50, 0]
     files.write_png(tmp_path / "r_0.png", rgba)
-    # NeRF's synthetic scenes leave the ending out.
+    # NeRF's synthetic scenes omit the file ending.
     files.write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "frames": [{"file_path": "r_0"}]})
     capture = folder.load(tmp_path)
     assert capture.masks[0, 0].tolist() == [OBJECT, UNKNOWN, BACKGROUND]
     assert capture.images[0, 0, 0].tolist() == [200, 100, 50]
     assert capture.images[0, 0, 2].tolist() == [0, 0, 0]
-    # Half the light of sRGB 200 (0.578 linear) is 0.290 linear, which is sRGB 147: not 100, half the code value.
+    # Half the light of sRGB 200 (0.578 linear) is 0.290 linear, which is sRGB 147; half the code value would be 100.
     assert abs(int(capture.images[0, 0, 1, 0]) - 147) <= 1
 
 
-def test_a_background_that_is_not_black_is_cut_out() -> None:
-    """A photograph over black keeps what is faint beyond its mask; before a wall that belongs to the wall."""
+def test_a_background_that_is_not_black_is_blackened() -> None:
+    """An image over black keeps faint pixels beyond its mask; an image in front of a wall does not."""
     mask = np.full((20, 30), BACKGROUND, np.uint8)
     mask[5:15, 5:15] = OBJECT
-    picture = np.zeros((20, 30, 3), np.uint8)
-    picture[5:15, 4:16] = 90
-    assert folder.cut_out(picture, mask) is picture
-    picture[:, 25:] = 60
-    cut = folder.cut_out(picture, mask)
-    assert (cut[mask == OBJECT] == 90).all()
-    assert not cut[mask == BACKGROUND].any()
+    image = np.zeros((20, 30, 3), np.uint8)
+    image[5:15, 4:16] = 90
+    assert folder.blacken_background(image, mask) is image
+    image[:, 25:] = 60
+    blackened = folder.blacken_background(image, mask)
+    assert (blackened[mask == OBJECT] == 90).all()
+    assert not blackened[mask == BACKGROUND].any()
 
 
-def test_a_distorted_photograph_is_straightened(tmp_path: Path) -> None:
+def test_a_distorted_image_is_undistorted(tmp_path: Path) -> None:
     camera = Camera(torch.tensor([60.0, 60.0, 32.0, 24.0]), 48, 64)
     k1 = 0.3
-    # A photograph whose red channel tells where each pixel's ray crosses the plane z = 1, through the distorted lens.
+    # Grey values encode where each pixel's ray through the distorted lens crosses the plane z = 1.
     uv = camera.pixel_centers().double()
     xy = (uv - torch.tensor([32.0, 24.0])) / 60
-    straight = xy.clone()
+    undistorted = xy.clone()
     for _ in range(50):
-        straight = xy / (1 + k1 * (straight**2).sum(-1, keepdim=True))
-    red = ((straight[..., 0] + 0.6) / 1.2 * 255).clamp(0, 255)
-    picture = torch.stack([red, red, red], -1).round().to(torch.uint8).numpy()
-    files.write_png(tmp_path / "x.png", picture)
+        undistorted = xy / (1 + k1 * (undistorted**2).sum(-1, keepdim=True))
+    values = ((undistorted[..., 0] + 0.6) / 1.2 * 255).clamp(0, 255)
+    image = torch.stack([values, values, values], -1).round().to(torch.uint8).numpy()
+    files.write_png(tmp_path / "x.png", image)
     document = {"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "k1": k1, "frames": [{"file_path": "x.png"}]}
     files.write_json(tmp_path / "transforms.json", document)
-    found = folder.load(tmp_path).images[0, 4:-4, 4:-4, 0].double()
+    loaded_values = folder.load(tmp_path).images[0, 4:-4, 4:-4, 0].double()
     expected = ((xy[..., 0] + 0.6) / 1.2 * 255)[4:-4, 4:-4]
-    # A pixel is 3.5 code values wide; half a pixel off (the trap of OpenCV's pixel centres) would be 1.8.
-    assert (found - expected).abs().max() < 1.0
+    # A pixel is 3.5 code values wide; half a pixel (OpenCV's convention of pixel centres) would be an error of 1.8.
+    assert (loaded_values - expected).abs().max() < 1.0
 
 
 # Broken folders -------------------------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def first(document: dict[str, Any]) -> dict[str, Any]:
 BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "missing image": (lambda d: first(d).update(file_path="images/zzz.png"), r"zzz\.png: is missing"),
     "missing mask": (lambda d: first(d).update(mask_path="masks/zzz.png"), r"zzz\.png: is missing"),
-    "stated size": (lambda d: d.update(w=9), r"a\.png: is 8 x 6 pixels, transforms\.json says w = 9"),
+    "stated size": (lambda d: d.update(w=9), r"a\.png: has 8 x 6 pixels, but transforms\.json has w = 9"),
     "non-rigid matrix": (
         lambda d: first(d)["transform_matrix"][0].__setitem__(0, 3.0),
         r"frame a\.png.*not a rotation",
@@ -217,13 +217,13 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     ),
     "matrix of words": (lambda d: first(d).update(transform_matrix="eye"), "4 x 4 finite numbers"),
     "matrix with NaN": (lambda d: first(d)["transform_matrix"][0].__setitem__(3, math.nan), "holds NaN"),
-    "unknown light": (lambda d: d.update(light="room"), r"\"light\" is 'room' \(it is one of camera, object\)"),
+    "unknown light": (lambda d: d.update(light="room"), r"\"light\" is 'room' \(it must be one of camera, object\)"),
     "duplicate frame": (lambda d: d["frames"].append(dict(first(d))), r"images/a\.png is there twice"),
     "two frames of one name": (lambda d: first(d).update(file_path="masks/b.png"), r"b\.png is there twice"),
     "path leaving the folder": (lambda d: first(d).update(file_path="../a.png"), "leaves the folder"),
     "absolute path": (lambda d: first(d).update(mask_path="/etc/hostname"), "leaves the folder"),
-    "only some poses": (lambda d: first(d).pop("transform_matrix"), r"a\.png has no pose, others do"),
-    "no frames": (lambda d: d.update(frames=[]), 'needs a list "frames"'),
+    "only some poses": (lambda d: first(d).pop("transform_matrix"), r"a\.png has no pose, but others have"),
+    "no frames": (lambda d: d.update(frames=[]), 'must have a list "frames"'),
     "no training frame": (lambda d: d.update(frames=d["frames"][3:]), "no training frame"),
     "no focal length": (lambda d: d.pop("fl_x"), 'positive "fl_x"'),
     "focal length of words": (lambda d: d.update(fl_x="long"), "not a number"),
@@ -233,8 +233,8 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", ["../../elsewhere", "hdr/sun", "..", "", "a\\b"])
-def test_a_light_that_no_folder_can_be_called_is_refused(written: Path, name: str) -> None:
-    """A prediction is written to a folder per light: one of another name would lie outside."""
+def test_a_light_whose_name_is_no_valid_folder_name_is_refused(written: Path, name: str) -> None:
+    """A prediction is written to one folder per light, and a name with a path would be outside."""
 
     def rename(document: dict[str, Any]) -> None:
         for frame in document["frames"]:
@@ -242,12 +242,12 @@ def test_a_light_that_no_folder_can_be_called_is_refused(written: Path, name: st
                 frame["relit"] = {name: frame["relit"]["sun"]}
 
     edit(written, rename)
-    with pytest.raises(BadFile, match=r'"relit" names a light .* which no folder can be called'):
+    with pytest.raises(BadFile, match=r'"relit" has a light .* which is no valid folder name'):
         folder.load_truth(written)
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_document_is_refused_by_file_and_rule(written: Path, name: str) -> None:
+def test_a_broken_document_is_refused_with_file_and_rule(written: Path, name: str) -> None:
     change, message = BROKEN[name]
     edit(written, change)
     with pytest.raises(BadFile, match=message):
@@ -256,7 +256,7 @@ def test_a_broken_document_is_refused_by_file_and_rule(written: Path, name: str)
 
 def test_an_image_of_another_size_is_refused(written: Path) -> None:
     files.write_png(written / "images" / "b.png", np.zeros((5, 8, 3), np.uint8))
-    with pytest.raises(BadFile, match=r"b\.png: is 8 x 5 pixels, the capture is 8 x 6"):
+    with pytest.raises(BadFile, match=r"b\.png: has 8 x 5 pixels, but the capture has 8 x 6"):
         folder.load(written)
 
 
@@ -269,7 +269,7 @@ def test_an_empty_mask_is_refused(written: Path) -> None:
 def test_a_negative_light_is_refused(written: Path) -> None:
     files.write_exr(written / "truth" / "light.exr", np.full((4, 8, 3), -1.0, np.float32))
     edit(written, lambda d: d.update(light_path="truth/light.exr"))
-    with pytest.raises(BadFile, match=r"light\.exr: a light has no negative values"):
+    with pytest.raises(BadFile, match=r"light\.exr: .*negative values"):
         folder.load_truth(written)
 
 
@@ -278,11 +278,11 @@ def test_truth_with_nan_or_of_another_size_is_refused(written: Path) -> None:
     with pytest.raises(BadFile, match=r"albedo/d\.exr: holds NaN"):
         folder.load_truth(written)
     files.write_exr(written / "truth" / "albedo" / "d.exr", np.ones((6, 7, 3), np.float32))
-    with pytest.raises(BadFile, match=r"albedo/d\.exr: is 7 x 6 pixels"):
+    with pytest.raises(BadFile, match=r"albedo/d\.exr: has 7 x 6 pixels"):
         folder.load_truth(written)
 
 
-def test_a_missing_document_or_folder_is_named(tmp_path: Path) -> None:
+def test_a_missing_document_or_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match=r"transforms\.json: is missing"):
         folder.load(tmp_path)
     with pytest.raises(BadFile, match="nowhere: is not a folder"):

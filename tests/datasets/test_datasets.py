@@ -1,7 +1,7 @@
-"""Every dataset reader, and each layout: true poses put three painted points of the object where pictures show them.
+"""Every dataset reader: true poses project painted points of the object to their disks in the images.
 
-The pictures are painted by the formulas of the datasets' own tools (OpenGL axes and whole pixel centres in HO3D,
-millimetres in BOP), the readers' answers are projected by ours.
+The images are painted by the formulas of the datasets' own tools (OpenGL axes and integer pixel centres in HO3D,
+millimetres in BOP), and the poses that are read are projected by `Camera`.
 """
 
 import json
@@ -24,35 +24,35 @@ from tumble.io import files, plugins
 from tumble.io.files import BadFile
 from tumble.maths.se3 import SE3, SO3
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, content_key, no_views
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, content_key, truth_without_views
 from tumble.scene.trajectory import Trajectory
 
 HEIGHT, WIDTH = 96, 128
 K = np.array([[150.0, 0, 60.0], [0, 155.0, 50.0], [0, 0, 1]])
-"""Of pictures whose first pixel has its centre at (0, 0)."""
+"""Camera matrix; the centre of the first pixel is (0, 0)."""
 POINTS = np.array([[0.06, 0.0, 0.01], [0.0, 0.05, -0.02], [-0.04, -0.03, 0.03]])
-"""Of the object, in metres."""
+"""Points of the object [metres]."""
 COLOURS = np.array([[255, 40, 40], [40, 255, 40], [40, 40, 255]], np.uint8)
 RADIUS = 7
 
 
-def motions(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vectors and positions [m] of an object half a metre before an OpenCV camera."""
+def random_poses(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation vectors and positions [m] of an object half a metre in front of an OpenCV camera."""
     rng = np.random.default_rng(seed)
     return Rotation.random(n, rng=rng).as_rotvec(), rng.normal([0, 0, 0.5], [0.02, 0.02, 0.03], (n, 3))
 
 
-def painted(turn: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A disk per point on a grey table, and which pixels show a disk; the nearest point last."""
-    x = Rotation.from_rotvec(turn).apply(POINTS) + position
+def painted(rotvec: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A disk per point on a grey background, the nearest on top; and which pixels show a disk."""
+    x = Rotation.from_rotvec(rotvec).apply(POINTS) + position
     image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
-    shown = np.zeros((HEIGHT, WIDTH), bool)
+    covered = np.zeros((HEIGHT, WIDTH), bool)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     for i in np.argsort(-x[:, 2]):
         u, v = x[i, :2] / x[i, 2] * [K[0, 0], K[1, 1]] + K[:2, 2]
         disk = (columns - u) ** 2 + (rows - v) ** 2 < RADIUS**2
-        image[disk], shown = COLOURS[i], shown | disk
-    return image, shown
+        image[disk], covered = COLOURS[i], covered | disk
+    return image, covered
 
 
 def save(path: Path, pixels: np.ndarray) -> None:
@@ -61,7 +61,7 @@ def save(path: Path, pixels: np.ndarray) -> None:
 
 
 def python_2(value: Any) -> bytes:
-    """A value as Python 2 and its numpy pickled it, without memo."""
+    """A value as pickled by Python 2 and its numpy, without memo."""
     if value is None:
         return b"N"
     if isinstance(value, int):
@@ -81,17 +81,17 @@ def python_2(value: Any) -> bytes:
 
 
 def write_ho3d(root: Path, seed: int = 0, *, ending: str = ".jpg", masks: str = "masks") -> Path:
-    """A sequence of six frames; those numbered 0 and 3 have no annotation, and 3 not even a camera."""
+    """A sequence of six frames; frames 0 and 3 have no annotation, and frame 3 has no camera either."""
     path = root / "evaluation" / "SM1"
-    pictures = [painted(*motion) for motion in zip(*motions(6, 0), strict=True)]
-    for i, (turn, position) in enumerate(zip(*motions(6, seed), strict=True)):
-        image, shown = pictures[i]
+    images = [painted(*pose) for pose in zip(*random_poses(6, 0), strict=True)]
+    for i, (rotvec, position) in enumerate(zip(*random_poses(6, seed), strict=True)):
+        image, covered = images[i]
         save(path / "rgb" / f"{i:04}{ending}", image)
-        # To OpenGL axes: y and z turned over.
+        # OpenGL axes: y and z are inverted.
         flip = np.diag([1.0, -1.0, -1.0])
-        R_gl_obj = flip @ Rotation.from_rotvec(turn).as_matrix()
-        rotvec = Rotation.from_matrix(R_gl_obj).as_rotvec()[:, None]
-        meta = {"camMat": K, "objRot": rotvec, "objTrans": flip @ position, "objName": "021_bleach", "objLabel": 12}
+        R_gl_obj = flip @ Rotation.from_rotvec(rotvec).as_matrix()
+        rotvec_gl = Rotation.from_matrix(R_gl_obj).as_rotvec()[:, None]
+        meta = {"camMat": K, "objRot": rotvec_gl, "objTrans": flip @ position, "objName": "021_bleach", "objLabel": 12}
         meta |= {"handPose": np.zeros(48), "objCorners3D": np.zeros((8, 3))}
         if i in (0, 3):
             meta = dict.fromkeys(meta)
@@ -99,136 +99,136 @@ def write_ho3d(root: Path, seed: int = 0, *, ending: str = ".jpg", masks: str = 
             meta["camMat"] = K
         (path / "meta").mkdir(exist_ok=True)
         (path / "meta" / f"{i:04}.pkl").write_bytes(b"\x80\x02" + python_2(meta) + b".")
-        _write_ho3d_mask(root, path, i, shown, masks)
+        _write_ho3d_mask(root, path, i, covered, masks)
     return path
 
 
-def _write_ho3d_mask(root: Path, path: Path, i: int, shown: np.ndarray, masks: str) -> None:
-    hand = np.zeros_like(shown)
+def _write_ho3d_mask(root: Path, path: Path, i: int, covered: np.ndarray, masks: str) -> None:
+    hand = np.zeros_like(covered)
     hand[-16:] = True
     if masks == "masks":
-        values = np.where(shown, OBJECT, np.where(hand, UNKNOWN, BACKGROUND)).astype(np.uint8)
+        values = np.where(covered, OBJECT, np.where(hand, UNKNOWN, BACKGROUND)).astype(np.uint8)
         save(path / "masks" / f"{i:04}.png", values)
     elif masks == "masks_XMem":
-        save(root / "masks_XMem" / "SM1" / f"{i:05}.png", shown.astype(np.uint8))
+        save(root / "masks_XMem" / "SM1" / f"{i:05}.png", covered.astype(np.uint8))
         save(root / "masks_XMem" / "SM1_hand" / f"{i:04}.png", hand.astype(np.uint8) * 255)
     else:
-        colours = np.stack([~shown & ~hand, shown, hand & ~shown], -1)[2::4, 2::4]
+        colours = np.stack([~covered & ~hand, covered, hand & ~covered], -1)[2::4, 2::4]
         save(path / "seg" / f"{i:04}.png", colours.astype(np.uint8) * 255)
 
 
 def write_bop(root: Path, seed: int = 0, *, objects: int = 1, moving: bool | None = None) -> Path:
-    """A scene of four frames; the last one does not show the object, which is the last in its list, under a bar."""
+    """A scene of four frames; the object is the last in the list, behind a bar, and missing in the last frame."""
     path = root / "test" / "000048"
     cameras: dict[str, Any] = {}
     annotation: dict[str, Any] = {}
     numbers = (2, 10, 11, 30)
-    pictures = [painted(*motion) for motion in zip(*motions(4, 0), strict=True)]
-    for k, (frame, turn, position) in enumerate(zip(numbers, *motions(4, seed), strict=True)):
-        image, shown = pictures[k]
-        bar = np.zeros_like(shown)
+    images = [painted(*pose) for pose in zip(*random_poses(4, 0), strict=True)]
+    for k, (frame, rotvec, position) in enumerate(zip(numbers, *random_poses(4, seed), strict=True)):
+        image, covered = images[k]
+        bar = np.zeros_like(covered)
         bar[:, 60:64] = True
         image[bar] = 200
         save(path / "rgb" / f"{frame:06}.png", image)
-        place = objects - 1
+        index = objects - 1
         if frame != 30:
-            save(path / "mask" / f"{frame:06}_{place:06}.png", shown.astype(np.uint8) * 255)
-            save(path / "mask_visib" / f"{frame:06}_{place:06}.png", (shown & ~bar).astype(np.uint8) * 255)
-        R = Rotation.from_rotvec(turn).as_matrix()
-        mine = {"obj_id": 5, "cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": (1000 * position).tolist()}
+            save(path / "mask" / f"{frame:06}_{index:06}.png", covered.astype(np.uint8) * 255)
+            save(path / "mask_visib" / f"{frame:06}_{index:06}.png", (covered & ~bar).astype(np.uint8) * 255)
+        R = Rotation.from_rotvec(rotvec).as_matrix()
+        wanted = {"obj_id": 5, "cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": (1000 * position).tolist()}
         others = [{"obj_id": 2, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 900]}] * (objects - 1)
-        annotation[str(frame)] = others + [mine] * (frame != 30)
+        annotation[str(frame)] = others + [wanted] * (frame != 30)
         cameras[str(frame)] = {"cam_K": K.ravel().tolist(), "depth_scale": 0.1}
         if moving is not None:
-            still = {"cam_R_w2c": np.eye(3).ravel().tolist(), "cam_t_w2c": [0, 0, 10.0 * k * moving]}
-            cameras[str(frame)] |= still
-    # Keys in the order of text, as some writers leave them.
+            pose = {"cam_R_w2c": np.eye(3).ravel().tolist(), "cam_t_w2c": [0, 0, 10.0 * k * moving]}
+            cameras[str(frame)] |= pose
+    # Keys sorted as text, as by some writers.
     for name, document in ((bop.CAMERAS, cameras), (bop.ANNOTATION, annotation)):
         (path / name).write_text(json.dumps(document, sort_keys=True))
     return path
 
 
 def write_folder(root: Path, seed: int = 0) -> Path:
-    turns, positions = motions(3, seed)
-    T = SE3.from_rotation(SO3.exp(torch.from_numpy(turns).float()), torch.from_numpy(positions).float())
-    images, shown = (
+    rotvecs, positions = random_poses(3, seed)
+    T = SE3.from_rotation(SO3.exp(torch.from_numpy(rotvecs).float()), torch.from_numpy(positions).float())
+    images, covered = (
         torch.from_numpy(np.stack(parts))
-        for parts in zip(*(painted(*motion) for motion in zip(*motions(3, 0), strict=True)), strict=True)
+        for parts in zip(*(painted(*pose) for pose in zip(*random_poses(3, 0), strict=True)), strict=True)
     )
     camera = Camera(torch.tensor([150.0, 155.0, 60.5, 50.5]), HEIGHT, WIDTH)
-    masks = torch.where(shown, OBJECT, BACKGROUND).to(torch.uint8)
-    capture = Capture(images * shown[..., None], masks, camera, ("a.png", "b.png", "c.png"), "camera")
-    truth = Truth(**{**vars(no_views(camera)), "poses": Trajectory(T, "camera")})
+    masks = torch.where(covered, OBJECT, BACKGROUND).to(torch.uint8)
+    capture = Capture(images * covered[..., None], masks, camera, ("a.png", "b.png", "c.png"), "camera")
+    truth = Truth(**{**vars(truth_without_views(camera)), "poses": Trajectory(T, "camera")})
     _capture_folder.save_capture(root / "mug", capture, truth)
     return root / "mug"
 
 
 LAYOUTS: dict[str, Callable[..., Path]] = {"bop": write_bop, "folder": write_folder, "ho3d": write_ho3d}
-"""One writer for each reader: `(root, seed of the true poses) -> path`; the pictures do not depend on the seed."""
+"""One writer per reader: `(root, seed of the true poses) -> path`; the images do not depend on the seed."""
 
 
-def assert_points_lie_where_they_are_painted(capture: Capture, truth: Truth) -> None:
-    """The middle of a disk's own pixels is where the true pose puts its point, unless another disk covers it."""
+def assert_points_project_to_their_disks(capture: Capture, truth: Truth) -> None:
+    """The mean of a disk's pixels is the projection of its point by the true pose, unless another disk covers it."""
     assert truth.poses is not None
-    seen = 0
-    for name, place in truth.posed(capture).items():
+    n_checked = 0
+    for name, index in truth.pose_indices(capture).items():
         image, mask = (x[capture.names.index(name)] for x in (capture.images, capture.masks))
-        x_cam = truth.poses.T_cam_obj[place] @ torch.from_numpy(POINTS).float()
+        x_cam = truth.poses.T_cam_obj[index] @ torch.from_numpy(POINTS).float()
         uv = capture.camera.project(x_cam)
-        apart = (torch.cdist(uv, uv) + 99 * torch.eye(3)).amin(-1) > 2 * RADIUS
-        for centre, colour, alone in zip(uv, COLOURS, apart, strict=True):
-            mine = ((image.float() - torch.from_numpy(colour).float()).abs().amax(-1) < 60) & (mask == OBJECT)
+        separate = (torch.cdist(uv, uv) + 99 * torch.eye(3)).amin(-1) > 2 * RADIUS
+        for centre, colour, isolated in zip(uv, COLOURS, separate, strict=True):
+            disk = ((image.float() - torch.from_numpy(colour).float()).abs().amax(-1) < 60) & (mask == OBJECT)
             near = (capture.camera.pixel_centers() - centre).norm(dim=-1) < RADIUS
-            if alone and mine.any() and not (mask[near] == UNKNOWN).any():
-                # A disk of whole pixels has its middle within 0.15 of its centre; a wrong pixel centre is 0.5 off.
-                found = capture.camera.pixel_centers()[mine].mean(0)
-                torch.testing.assert_close(found, centre, atol=0.16, rtol=0)
-                seen += 1
-    assert seen >= 4
+            if isolated and disk.any() and not (mask[near] == UNKNOWN).any():
+                # The mean of a rasterised disk is within 0.15 of its centre; a wrong pixel centre is an error of 0.5.
+                mean = capture.camera.pixel_centers()[disk].mean(0)
+                torch.testing.assert_close(mean, centre, atol=0.16, rtol=0)
+                n_checked += 1
+    assert n_checked >= 4
 
 
 # Conformance ----------------------------------------------------------------------------------------------------------
 
 
-def test_every_reader_has_a_layout_here() -> None:
-    assert set(LAYOUTS) == set(plugins.names("datasets"))
+def test_every_reader_has_a_test_layout() -> None:
+    assert set(LAYOUTS) == set(plugins.plugin_names("datasets"))
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_reader_is_found_by_its_layout_and_keeps_its_word(name: str, tmp_path: Path) -> None:
+def test_a_reader_is_selected_by_layout_and_reads_capture_and_truth(name: str, tmp_path: Path) -> None:
     path = LAYOUTS[name](tmp_path)
-    reader = datasets.which(path)
-    assert reader is plugins.named("datasets", name)
+    reader = datasets.reader_for(path)
+    assert reader is plugins.load_plugin("datasets", name)
     assert isinstance(reader.LAYOUT, str)
     capture, truth = reader.load(path), reader.load_truth(path)
     assert isinstance(capture, Capture)
     assert isinstance(truth, Truth)
     assert len(capture) >= 3
-    assert set(truth.posed(capture)) <= set(capture.names)
+    assert set(truth.pose_indices(capture)) <= set(capture.names)
     assert (capture.images[capture.masks == BACKGROUND] == 0).all()
-    assert_points_lie_where_they_are_painted(capture, truth)
+    assert_points_project_to_their_disks(capture, truth)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_a_capture_does_not_depend_on_its_truth(name: str, tmp_path: Path) -> None:
-    reader = plugins.named("datasets", name)
-    one, other = (LAYOUTS[name](tmp_path / str(seed), seed) for seed in (0, 1))
-    assert content_key(reader.load(one)) == content_key(reader.load(other))
-    a, b = (reader.load_truth(path).poses.T_cam_obj.matrix() for path in (one, other))
+    reader = plugins.load_plugin("datasets", name)
+    path_a, path_b = (LAYOUTS[name](tmp_path / str(seed), seed) for seed in (0, 1))
+    assert content_key(reader.load(path_a)) == content_key(reader.load(path_b))
+    a, b = (reader.load_truth(path).poses.T_cam_obj.matrix() for path in (path_a, path_b))
     assert (a - b).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_poses_in_a_frame_of_their_own_score_full_marks(name: str, tmp_path: Path) -> None:
+def test_true_poses_in_another_object_frame_have_the_best_score(name: str, tmp_path: Path) -> None:
     path = LAYOUTS[name](tmp_path)
-    known = evaluate.read_subject(path)
-    assert known.truth.poses is not None
-    names = tuple(known.truth.posed(known.capture))
-    other = metrics.Similarity(
+    subject = evaluate.read_with_truth(path)
+    assert subject.truth.poses is not None
+    names = tuple(subject.truth.pose_indices(subject.capture))
+    similarity = metrics.Similarity(
         torch.tensor(3.0), SO3.exp(torch.tensor([0.3, 1.0, -2.0])), torch.tensor([1.0, 0.0, 2.0])
     )
-    Prediction(poses=other.to_truth(known.truth.poses), pose_names=names).write(tmp_path / "mine")
-    poses = evaluate.score(tmp_path / "mine", known, tmp_path / "out")["poses"]
+    Prediction(poses=similarity.to_truth(subject.truth.poses), pose_names=names).write(tmp_path / "prediction")
+    poses = evaluate.score(tmp_path / "prediction", subject, tmp_path / "out")["poses"]
     assert poses["poses.lost_frames"] == 0
     assert poses["poses.auc_percent"] == pytest.approx(100, abs=0.01)
     assert poses["poses.rpe_translation"] == pytest.approx(0, abs=1e-5)
@@ -236,73 +236,75 @@ def test_poses_in_a_frame_of_their_own_score_full_marks(name: str, tmp_path: Pat
     assert poses["poses.alignment"]["scale"] == pytest.approx(1 / 3, rel=1e-4)
 
 
-def test_an_unknown_layout_is_refused_with_those_that_are_known(tmp_path: Path) -> None:
+def test_an_unknown_layout_is_refused_with_a_list_of_the_known_ones(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(BadFile, match=r"known are bop: .*scene_gt\.json.*folder: .*transforms\.json.*ho3d: .*meta"):
-            datasets.which(path)
+        with pytest.raises(
+            BadFile, match=r"known layouts: bop: .*scene_gt\.json.*folder: .*transforms\.json.*ho3d: .*meta"
+        ):
+            datasets.reader_for(path)
     both = write_ho3d(tmp_path)
     (both / folder.TRANSFORMS).write_text("{}")
-    with pytest.raises(BadFile, match="has the layouts of folder and ho3d"):
-        datasets.which(both)
+    with pytest.raises(BadFile, match="has the layouts folder and ho3d"):
+        datasets.reader_for(both)
 
 
 # HO3D -----------------------------------------------------------------------------------------------------------------
 
 
-def test_version_2_has_png_pictures(tmp_path: Path) -> None:
+def test_images_of_ho3d_version_2_are_png(tmp_path: Path) -> None:
     path = write_ho3d(tmp_path, ending=".png")
     capture, truth = ho3d.load(path), ho3d.load_truth(path)
     assert truth is not None
     assert capture.names == tuple(f"{i:04}.png" for i in range(6))
-    assert_points_lie_where_they_are_painted(capture, truth)
+    assert_points_project_to_their_disks(capture, truth)
 
 
-def test_frames_without_annotation_stay_and_have_no_true_pose(tmp_path: Path) -> None:
+def test_frames_without_annotation_are_kept_without_a_true_pose(tmp_path: Path) -> None:
     path = write_ho3d(tmp_path)
     capture, truth = ho3d.load(path), ho3d.load_truth(path)
     assert truth is not None
     assert len(capture) == 6
     assert capture.trajectory is None
     assert truth.pose_names == ("0001.jpg", "0002.jpg", "0004.jpg", "0005.jpg")
-    assert list(truth.posed(capture).values()) == [0, 1, 2, 3]
+    assert list(truth.pose_indices(capture).values()) == [0, 1, 2, 3]
     assert truth.units == "m"
     assert capture.camera.fx_fy_cx_cy.tolist() == [150, 155, 60.5, 50.5]
 
 
 @pytest.mark.parametrize("masks", ["masks_XMem", "seg"])
-def test_other_masks_name_object_and_hand(masks: str, tmp_path: Path) -> None:
+def test_masks_of_other_kinds_label_object_and_hand(masks: str, tmp_path: Path) -> None:
     path = write_ho3d(tmp_path, ending=".png", masks=masks)
     capture = ho3d.load(path)
-    for i, motion in enumerate(zip(*motions(6, 0), strict=True)):
-        shown = torch.from_numpy(painted(*motion)[1])
-        hand = torch.zeros_like(shown)
+    for i, pose in enumerate(zip(*random_poses(6, 0), strict=True)):
+        covered = torch.from_numpy(painted(*pose)[1])
+        hand = torch.zeros_like(covered)
         hand[-16:] = True
-        found = capture.masks[i]
+        labels = capture.masks[i]
         if masks == "masks_XMem":
-            assert torch.equal(found == OBJECT, shown)
-            assert torch.equal(found == UNKNOWN, hand & ~shown)
-        # A quarter of the size: what is said to be sure is right, but of a small disk only the middle is.
-        wrong = ((found == OBJECT) & ~shown) | ((found == BACKGROUND) & (shown | hand))
+            assert torch.equal(labels == OBJECT, covered)
+            assert torch.equal(labels == UNKNOWN, hand & ~covered)
+        # At a quarter of the resolution known pixels are right, but of a small disk only the middle is known.
+        wrong = ((labels == OBJECT) & ~covered) | ((labels == BACKGROUND) & (covered | hand))
         assert wrong.float().mean() < 0.01
-        assert ((found == OBJECT) & shown).sum() > 0.15 * shown.sum()
-        assert (found[-12:][hand[-12:] & ~shown[-12:]] != BACKGROUND).all()
+        assert ((labels == OBJECT) & covered).sum() > 0.15 * covered.sum()
+        assert (labels[-12:][hand[-12:] & ~covered[-12:]] != BACKGROUND).all()
 
 
-def test_frames_without_a_mask_are_left_out(tmp_path: Path) -> None:
+def test_frames_without_a_mask_are_omitted(tmp_path: Path) -> None:
     path = write_ho3d(tmp_path)
     (path / "masks" / "0001.png").unlink()
     save(path / "masks" / "0004.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     capture, truth = ho3d.load(path), ho3d.load_truth(path)
     assert truth is not None
     assert capture.names == ("0000.jpg", "0002.jpg", "0003.jpg", "0005.jpg")
-    assert truth.posed(capture) == {"0002.jpg": 1, "0005.jpg": 3}
+    assert truth.pose_indices(capture) == {"0002.jpg": 1, "0005.jpg": 3}
     for mask in (path / "masks").iterdir():
         mask.unlink()
     with pytest.raises(BadFile, match="no frame with a mask"):
         ho3d.load(path)
 
 
-def test_known_mistakes_of_the_annotation_are_no_truth(tmp_path: Path) -> None:
+def test_known_errors_of_the_annotation_are_not_read(tmp_path: Path) -> None:
     path = write_ho3d(tmp_path)
     for i in (4, 5):
         for name, ending in (("rgb", ".jpg"), ("meta", ".pkl"), ("masks", ".png")):
@@ -320,22 +322,22 @@ def test_a_sequence_without_annotation_has_no_truth(tmp_path: Path) -> None:
         (path / "meta" / f"{i:04}.pkl").write_bytes(b"\x80\x02" + python_2({"camMat": K, "objRot": None}) + b".")
     assert ho3d.load_truth(path) is None
     with pytest.raises(BadFile, match="has no truth to score against"):
-        evaluate.read_subject(path)
+        evaluate.read_with_truth(path)
 
 
-def spoil(name: str, content: bytes) -> Callable[[Path], None]:
+def overwrite(name: str, content: bytes) -> Callable[[Path], None]:
     return lambda path: (path / name).write_bytes(content) and None
 
 
 BROKEN_HO3D: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "a program": (spoil("meta/0000.pkl", b"cos\nsystem\n(S'touch harm'\ntR."), r"0000\.pkl: .*os\.system"),
-    "a list": (spoil("meta/0000.pkl", b"]."), r"0000\.pkl: holds a list"),
+    "a program": (overwrite("meta/0000.pkl", b"cos\nsystem\n(S'touch harm'\ntR."), r"0000\.pkl: .*os\.system"),
+    "a list": (overwrite("meta/0000.pkl", b"]."), r"0000\.pkl: contains a list"),
     "no meta": (lambda path: (path / "meta" / "0000.pkl").unlink(), r"0000\.pkl: is missing"),
     "a camera of eight numbers": (
-        spoil("meta/0000.pkl", b"\x80\x02" + python_2({"camMat": np.ones(8)}) + b"."),
+        overwrite("meta/0000.pkl", b"\x80\x02" + python_2({"camMat": np.ones(8)}) + b"."),
         '"camMat" is not 9 finite numbers',
     ),
-    "an odd name": (
+    "a name that is no number": (
         lambda path: save(path / "rgb" / "cover.png", np.zeros((2, 2, 3), np.uint8)),
         "cover.png: .*number",
     ),
@@ -343,15 +345,15 @@ BROKEN_HO3D: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda path: save(path / "masks" / "0001.png", np.full((4, 4), 255, np.uint8)),
         r"0001\.jpg: has a mask of 4 x 4",
     ),
-    "a text as a picture": (spoil("rgb/0001.jpg", b"hello"), r"0001\.jpg: is not a picture"),
+    "text as an image": (overwrite("rgb/0001.jpg", b"hello"), r"0001\.jpg: is not an image"),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN_HO3D)
-def test_a_broken_sequence_is_refused_by_file_and_rule(name: str, tmp_path: Path) -> None:
+def test_a_broken_sequence_is_refused_with_file_and_rule(name: str, tmp_path: Path) -> None:
     path = write_ho3d(tmp_path)
-    spoiled, message = BROKEN_HO3D[name]
-    spoiled(path)
+    damage, message = BROKEN_HO3D[name]
+    damage(path)
     with pytest.raises(BadFile, match=message):
         ho3d.load(path)
 
@@ -359,33 +361,33 @@ def test_a_broken_sequence_is_refused_by_file_and_rule(name: str, tmp_path: Path
 # BOP ------------------------------------------------------------------------------------------------------------------
 
 
-def test_one_object_of_several_is_read_when_it_is_named(tmp_path: Path) -> None:
+def test_one_of_several_objects_is_selected_by_its_id(tmp_path: Path) -> None:
     path = write_bop(tmp_path, objects=3)
     with pytest.raises(BadFile, match=r"has the objects \[2, 5\].*object_id"):
         bop.load(path)
     capture, truth = bop.load(path, object_id=5), bop.load_truth(path, object_id=5)
     assert truth is not None
     assert capture.names == truth.pose_names == ("000002.png", "000010.png", "000011.png")
-    assert_points_lie_where_they_are_painted(capture, truth)
+    assert_points_project_to_their_disks(capture, truth)
     with pytest.raises(BadFile, match="no object 7"):
         bop.load(path, object_id=7)
     with pytest.raises(BadFile, match="the object 2 2 times"):
         bop.load(path, object_id=2)
 
 
-def test_what_hides_the_object_is_unknown(tmp_path: Path) -> None:
+def test_occluded_parts_are_unknown(tmp_path: Path) -> None:
     capture = bop.load(write_bop(tmp_path))
-    for i, motion in enumerate(list(zip(*motions(4, 0), strict=True))[:3]):
-        shown = torch.from_numpy(painted(*motion)[1])
-        hidden = torch.zeros_like(shown)
+    for i, pose in enumerate(list(zip(*random_poses(4, 0), strict=True))[:3]):
+        covered = torch.from_numpy(painted(*pose)[1])
+        hidden = torch.zeros_like(covered)
         hidden[:, 60:64] = True
-        assert torch.equal(capture.masks[i] == UNKNOWN, shown & hidden)
-        assert torch.equal(capture.masks[i] == OBJECT, shown & ~hidden)
+        assert torch.equal(capture.masks[i] == UNKNOWN, covered & hidden)
+        assert torch.equal(capture.masks[i] == OBJECT, covered & ~hidden)
     assert capture.camera.fx_fy_cx_cy.tolist() == [150, 155, 60.5, 50.5]
 
 
 @pytest.mark.parametrize(("moving", "light"), [(None, "camera"), (False, "camera"), (True, "object")])
-def test_the_light_stays_with_the_room(moving: bool | None, light: str, tmp_path: Path) -> None:
+def test_the_light_is_fixed_to_the_object_if_the_camera_moves(moving: bool | None, light: str, tmp_path: Path) -> None:
     path = write_bop(tmp_path, moving=moving)
     truth = bop.load_truth(path)
     assert truth is not None
@@ -403,13 +405,16 @@ def change(name: str, how: Callable[[dict[str, Any]], Any]) -> Callable[[Path], 
 
 
 BROKEN_BOP: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "a zoom": (change(bop.CAMERAS, lambda d: d["10"].update(cam_K=(2 * K).ravel().tolist())), 'differ in "cam_K"'),
+    "another focal length": (
+        change(bop.CAMERAS, lambda d: d["10"].update(cam_K=(2 * K).ravel().tolist())),
+        'differ in "cam_K"',
+    ),
     "no camera": (change(bop.CAMERAS, lambda d: d.pop("10")), r"has no frame 10"),
     "a scaled rotation": (
         change(bop.ANNOTATION, lambda d: d["10"][0].update(cam_R_m2c=(2 * np.eye(3)).ravel().tolist())),
         'frame 10: "cam_R_m2c" is not a rotation',
     ),
-    "a place in the plane": (
+    "a position with two numbers": (
         change(bop.ANNOTATION, lambda d: d["10"][0].update(cam_t_m2c=[1, 2])),
         '"cam_t_m2c" is not 3 finite numbers',
     ),
@@ -423,10 +428,10 @@ BROKEN_BOP: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", BROKEN_BOP)
-def test_a_broken_scene_is_refused_by_file_and_rule(name: str, tmp_path: Path) -> None:
+def test_a_broken_scene_is_refused_with_file_and_rule(name: str, tmp_path: Path) -> None:
     path = write_bop(tmp_path)
-    spoiled, message = BROKEN_BOP[name]
-    spoiled(path)
+    damage, message = BROKEN_BOP[name]
+    damage(path)
 
     def read() -> None:
         bop.load(path)

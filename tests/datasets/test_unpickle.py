@@ -1,4 +1,4 @@
-"""Pickled metadata: what Python's own unpickler makes of harmless files comes out, and nothing else comes in."""
+"""Pickled metadata: harmless files are read as by Python's own unpickler, and everything else is refused."""
 
 import datetime
 import pickle
@@ -71,8 +71,8 @@ s.""",
     b"J\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x10\x00\x00\x00\x00\x00\x00\xf0?\x00\x00\x00\x00\x00\x00\x00\xc0tb"
     b"U\x07objNameq\x0aU\x0a021_bleachq\x0bU\x08objLabelq\x0cK\x05U\x05againq\x0dh\x05u.",
 }
-"""Dictionaries as Python 2 and its numpy wrote them, with an array that is there twice."""
-ENDINGS = {"<f8": np.float64, ">f4": ">f4", "i8": np.int64, "u1": np.uint8, "?": np.bool_, "i2": np.int16}
+"""Dictionaries as written by Python 2 and its numpy, with an array that occurs twice."""
+DTYPES = {"<f8": np.float64, ">f4": ">f4", "i8": np.int64, "u1": np.uint8, "?": np.bool_, "i2": np.int16}
 
 
 @pytest.fixture
@@ -103,26 +103,26 @@ def assert_same(a: Any, b: Any) -> None:
 
 
 @pytest.mark.parametrize("name", PYTHON_2)
-def test_files_of_python_2_are_what_python_makes_of_them(name: str, file: Path) -> None:
-    found = read(file, PYTHON_2[name])
+def test_files_of_python_2_are_read_as_by_pickle(name: str, file: Path) -> None:
+    value = read(file, PYTHON_2[name])
     with pytest.MonkeyPatch.context() as patch:
         import warnings
 
-        # numpy.core is called numpy._core now, and says so.
+        # numpy warns that numpy.core is now called numpy._core.
         patch.setattr(warnings, "warn", lambda *_, **__: None)
-        assert_same(found, pickle.loads(PYTHON_2[name], encoding="latin1"))
-    assert found["objRot"].tolist() == [[1.0], [-2.0]]
-    assert found["again"] is found["objRot"]
+        assert_same(value, pickle.loads(PYTHON_2[name], encoding="latin1"))
+    assert value["objRot"].tolist() == [[1.0], [-2.0]]
+    assert value["again"] is value["objRot"]
 
 
 @pytest.mark.parametrize("protocol", range(5))
-@pytest.mark.parametrize("dtype", ENDINGS)
-def test_arrays_come_back_at_every_protocol(dtype: str, protocol: int, file: Path) -> None:
-    values = np.arange(24).reshape(2, 3, 4).astype(ENDINGS[dtype])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_arrays_are_read_at_every_protocol(dtype: str, protocol: int, file: Path) -> None:
+    values = np.arange(24).reshape(2, 3, 4).astype(DTYPES[dtype])
     arrays = [values, np.asfortranarray(values), values[:0], np.array(values[0, 0, 0]), values[:, ::2]]
-    for found, array in zip(read(file, pickle.dumps(arrays, protocol)), arrays, strict=True):
-        np.testing.assert_array_equal(found, array)
-        assert found.dtype == array.dtype
+    for array_read, array in zip(read(file, pickle.dumps(arrays, protocol)), arrays, strict=True):
+        np.testing.assert_array_equal(array_read, array)
+        assert array_read.dtype == array.dtype
 
 
 plain = st.recursive(
@@ -139,18 +139,18 @@ plain = st.recursive(
 
 @settings(deadline=None)
 @given(value=plain, protocol=st.integers(0, 4))
-def test_plain_data_comes_back(value: Any, protocol: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_plain_data_is_read_unchanged(value: Any, protocol: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     file = tmp_path_factory.getbasetemp() / "plain.pkl"
     assert_same(read(file, pickle.dumps(value, protocol)), value)
 
 
-def test_single_numbers_of_numpy_become_pythons(file: Path) -> None:
-    found = read(file, pickle.dumps([np.float32(0.5), np.int64(-3), np.bool_(True)], 2))
-    assert_same(found, [0.5, -3, True])
+def test_numpy_scalars_become_python_numbers(file: Path) -> None:
+    value = read(file, pickle.dumps([np.float32(0.5), np.int64(-3), np.bool_(True)], 2))
+    assert_same(value, [0.5, -3, True])
 
 
-class Evil:
-    """Runs when it is unpickled."""
+class Malicious:
+    """An object that executes code when it is unpickled."""
 
     def __reduce__(self) -> tuple:
         return (Path.touch, (Path("harm"),))
@@ -160,8 +160,8 @@ class Evil:
 @pytest.mark.parametrize(
     "value",
     [
-        Evil(),
-        [1, {"x": Evil()}],
+        Malicious(),
+        [1, {"x": Malicious()}],
         datetime.date(2020, 1, 1),
         OrderedDict(a=1),
         {1, 2},
@@ -175,25 +175,25 @@ class Evil:
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_is_not_plain_data_is_refused(value: Any, protocol: int, file: Path) -> None:
+def test_anything_but_plain_data_is_refused(value: Any, protocol: int, file: Path) -> None:
     with pytest.raises(BadFile, match=r"0000\.pkl: cannot be read as pickled metadata.*only numbers, strings"):
         read(file, pickle.dumps(value, protocol))
     assert not Path("harm").exists()
 
 
-HOSTILE = {
+MALICIOUS = {
     "a command": b"cos\nsystem\n(S'touch harm'\ntR.",
     "a command by object": b"(cos\nsystem\nS'touch harm'\no.",
     "a command by instance": b"(S'touch harm'\nios\nsystem\n.",
     "a module by stack": b"\x8c\x08builtins\x8c\x04eval\x93(S'1'\ntR.",
     "an attribute of a known name": b"cnumpy\nndarray.tofile\n.",
     "state for a name": b"cnumpy\nndarray\n(dS'x'\nI1\nstb.",
-    "a huge place in the memo": b"Nr\xff\xff\xff\x7f0.",
+    "a huge index of the memo": b"Nr\xff\xff\xff\x7f0.",
     "a string longer than the file": b"\x8e" + struct.pack("<Q", 1 << 60) + b"x.",
     "no end": b"(lp0\n",
     "an empty stack": b"a.",
     "a mark as a value": b"](a.",
-    "an unknown place in the memo": b"h\x07.",
+    "an unknown index of the memo": b"h\x07.",
     "no pickle": b"hello",
     "nothing": b"",
     "an array of pointers": b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I1\nt"
@@ -203,17 +203,17 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_programs_are_refused_and_do_nothing(
+@pytest.mark.parametrize("name", MALICIOUS)
+def test_malicious_programs_are_refused_without_effect(
     name: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(BadFile, match=r"0000\.pkl"):
-        read(file, HOSTILE[name])
+        read(file, MALICIOUS[name])
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
 
 
-def test_every_shape_must_be_that_of_the_numbers(file: Path) -> None:
+def test_the_shape_of_an_array_must_match_its_values(file: Path) -> None:
     program = PYTHON_2["protocol 2"]
     assert program.count(b"(K\x01K\x02K\x01\x86") == 1
     for shape in (b"K\x02K\x02", b"K\x01K\x01", b"J\xff\xff\xff\xffK\x01", b"U\x012K\x01"):
@@ -221,15 +221,15 @@ def test_every_shape_must_be_that_of_the_numbers(file: Path) -> None:
             read(file, program.replace(b"K\x02K\x01\x86", shape + b"\x86"))
 
 
-def test_one_string_cannot_be_many_arrays(file: Path) -> None:
-    """Half a megabyte in the file, told to become an array a hundred times."""
+def test_a_string_cannot_be_used_for_unlimited_arrays(file: Path) -> None:
+    """Half a megabyte in the file, converted to an array a hundred times."""
     encode = b"c_codecs\nencode\nh\x01\x8c\x06latin1\x86Rq\x02"
     program = b"\x80\x04](X" + struct.pack("<I", 1 << 19) + b"0" * (1 << 19) + b"q\x01" + 100 * encode + b"e."
     with pytest.raises(BadFile, match="more than"):
         read(file, program)
 
 
-def test_a_file_over_the_limit_and_no_file_are_refused(file: Path) -> None:
+def test_missing_and_too_large_files_are_refused(file: Path) -> None:
     with pytest.raises(BadFile, match="is missing"):
         _unpickle.read(file)
     with pytest.raises(BadFile, match=r"over the limit of 1048576"):

@@ -1,4 +1,4 @@
-"""The loop, driving this very module as a stage: stopped and taken up again in every way, it comes to the same bits."""
+"""The training loop with this module as a stage: interrupted and resumed runs have the bits of uninterrupted ones."""
 
 import io
 import os
@@ -23,11 +23,11 @@ from tumble.engine.optim import NotFinite
 from tumble.io import files, tree
 from tumble.io.files import BadFile
 
-# A stage: points that move to a target, are born and die, under a light on a growing grid -----------------------------
+# A stage: points that move to a target with densification and pruning, and a light on a growing grid ------------------
 
 VERSION = 1
 NOISE = 0.1
-"""A setting that nobody sets."""
+"""A module constant that affects the result."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Config:
 class Inputs:
     target: Tensor = field(default_factory=lambda: torch.tensor([0.3, -0.2]))
     at: dict[int, Callable[[State], Any]] = field(default_factory=dict)
-    """Accidents by step; no part of the settings, as accidents are not."""
+    """Functions called at given steps, which simulate interrupts and errors; not part of the settings."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Params:
 class Output:
     params: Params
     rest: dict[str, Tensor]
-    """Moments, memory and the generator: two runs are equal only if these are."""
+    """Moments, memory and generator, which must be equal in equal runs."""
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
@@ -68,7 +68,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     points = torch.randn(6, 2, generator=rng)
     params = optim.leaves(Params(points, torch.ones(()), torch.zeros(2, 3), torch.ones(2)))
     optimizer = optim.adam(params, {"": cfg.rate, "frozen": 0.0})
-    return State(0, params, optimizer, rng, {"seen": torch.zeros(6), "least": torch.tensor(float("inf"))})
+    return State(0, params, optimizer, rng, {"distance": torch.zeros(6), "minimum": torch.tensor(float("inf"))})
 
 
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
@@ -80,8 +80,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     inputs.at.get(state.step, lambda state: None)(state)
     optim.anneal(optimizer, {"points": 1 - state.step / cfg.steps})
     optim.descend(loss, optimizer, step=state.step)
-    state.memory["seen"] += away.detach()
-    state.memory["least"] = torch.minimum(state.memory["least"], loss.detach())
+    state.memory["distance"] += away.detach()
+    state.memory["minimum"] = torch.minimum(state.memory["minimum"], loss.detach())
     if (state.step + 1) % cfg.regrow == 0:
         densify(state)
     if state.step + 1 == cfg.finer:
@@ -90,16 +90,16 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 
 
 def densify(state: State) -> None:
-    """Drop a point and split others, by lot."""
+    """Prune and split randomly chosen points."""
     assert state.optimizer is not None
     n = len(state.params.points)
-    index = torch.multinomial(state.memory["seen"] + 1, n + 1, replacement=True, generator=state.rng)
+    index = torch.multinomial(state.memory["distance"] + 1, n + 1, replacement=True, generator=state.rng)
     fresh = torch.rand(n + 1, generator=state.rng) < 0.5
     grown = optim.regrow({"points": state.params.points}, state.optimizer, index, fresh)
     state.params = replace(state.params, **grown)
     with torch.no_grad():
         state.params.points[fresh] += 0.01 * torch.randn(int(fresh.sum()), 2, generator=state.rng)
-    state.memory["seen"] = torch.zeros(n + 1)
+    state.memory["distance"] = torch.zeros(n + 1)
 
 
 def finish(cfg: Config, inputs: Inputs, state: State) -> Output:
@@ -112,7 +112,7 @@ THIS = sys.modules[__name__]
 
 
 class Previewed:
-    """The same stage with a preview that draws at random."""
+    """The same stage with a preview that uses random numbers."""
 
     VERSION, Config = VERSION, Config
     length, init, step, finish = staticmethod(length), staticmethod(init), staticmethod(step), staticmethod(finish)
@@ -126,7 +126,7 @@ def bits(output: Output) -> dict[str, bytes]:
     return {name: x.numpy().tobytes() for name, x in tree.named_tensors(output).items()}
 
 
-def whole(**settings: Any) -> dict[str, bytes]:
+def uninterrupted(**settings: Any) -> dict[str, bytes]:
     return bits(drive(THIS, Config(**settings), Inputs(), seed=3))
 
 
@@ -143,58 +143,56 @@ def poison(state: State) -> None:
         state.params.points[0, 0] = float("nan")
 
 
-# Stopping and going on ------------------------------------------------------------------------------------------------
+# Interrupting and resuming --------------------------------------------------------------------------------------------
 
 
-def test_a_module_is_a_stage_and_learns() -> None:
+def test_a_module_can_be_driven_as_a_stage() -> None:
     assert isinstance(THIS, Stage)
     assert not isinstance(loop, Stage)
     output = drive(THIS, Config(steps=400), Inputs(), seed=0)
     assert output.params.light.shape == (4, 3)
-    # Adam's steps shrink to nothing with the rate: what remains is the noise of the last ones.
+    # Adam's steps vanish with the learning rate; the remaining error is the noise of the last steps.
     assert (output.params.light - 1).abs().max() < 0.05
     assert torch.equal(output.params.frozen, torch.ones(2))
 
 
 def test_the_seed_decides_the_result() -> None:
-    assert whole() == whole()
-    assert whole() != bits(drive(THIS, Config(), Inputs(), seed=4))
+    assert uninterrupted() == uninterrupted()
+    assert uninterrupted() != bits(drive(THIS, Config(), Inputs(), seed=4))
 
 
 @pytest.mark.parametrize("stops", [[0], [3], [10], [11], [29], [2, 5, 12, 20]])
-def test_a_run_stopped_by_ctrl_c_and_taken_up_again_equals_a_whole_one_bit_for_bit(
-    tmp_path: Path, stops: list[int]
-) -> None:
-    """Stops lie before, at and after the steps in which leaves change their shapes."""
+def test_a_run_resumed_after_ctrl_c_equals_an_uninterrupted_one_bit_for_bit(tmp_path: Path, stops: list[int]) -> None:
+    """Some interrupts are before, at and after the steps in which leaves change their shapes."""
     path = tmp_path / "1-toy" / "state.safetensors"
     for stop in stops:
-        with pytest.raises(KeyboardInterrupt, match=rf"toy stopped at step {stop + 1} of 30; the same .* from {path}"):
+        with pytest.raises(KeyboardInterrupt, match=rf"toy stopped at step {stop + 1} of 30; run .* from {path}"):
             drive(THIS, Config(), Inputs(at={stop: press_ctrl_c}), seed=3, checkpoint=path, name="toy")
     resumed = drive(THIS, Config(), Inputs(at={stops[-1]: crash}), seed=3, checkpoint=path)
-    assert bits(resumed) == whole()
+    assert bits(resumed) == uninterrupted()
     assert [p.name for p in path.parent.iterdir()] == ["state.safetensors"]
 
 
 @pytest.mark.parametrize("stop", [7, 8, 9, 22])
-def test_a_run_that_crashed_goes_on_from_its_last_checkpoint_bit_for_bit(tmp_path: Path, stop: int) -> None:
+def test_a_crashed_run_resumes_from_its_last_checkpoint_bit_for_bit(tmp_path: Path, stop: int) -> None:
     path = tmp_path / "state"
     with pytest.raises(RuntimeError, match="power cut"):
         drive(THIS, Config(), Inputs(at={stop: crash}), seed=3, checkpoint=path, every=8)
-    redone: list[int] = []
-    at = {n: lambda state, n=n: redone.append(n) for n in range(30)}
+    repeated: list[int] = []
+    at = {n: lambda state, n=n: repeated.append(n) for n in range(30)}
     resumed = drive(THIS, Config(), Inputs(at=at), seed=3, checkpoint=path, every=8)
-    assert redone[0] == stop // 8 * 8
-    assert bits(resumed) == whole()
+    assert repeated[0] == stop // 8 * 8
+    assert bits(resumed) == uninterrupted()
 
 
-def test_a_finished_training_is_not_repeated_when_finishing_failed(tmp_path: Path) -> None:
+def test_training_is_not_repeated_after_its_last_step(tmp_path: Path) -> None:
     drive(THIS, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state")
     again = drive(THIS, Config(), Inputs(at=dict.fromkeys(range(30), crash)), seed=3, checkpoint=tmp_path / "state")
-    assert bits(again) == whole()
+    assert bits(again) == uninterrupted()
 
 
 @pytest.mark.parametrize("other", [{"cfg": Config(rate=0.06)}, {"seed": 4}, {"key": "other inputs"}])
-def test_a_checkpoint_of_other_settings_is_started_over(tmp_path: Path, other: dict[str, Any]) -> None:
+def test_a_checkpoint_of_other_settings_is_ignored(tmp_path: Path, other: dict[str, Any]) -> None:
     usual: dict[str, Any] = {"cfg": Config(), "seed": 3, "key": "inputs"}
     with pytest.raises(KeyboardInterrupt):
         drive(THIS, inputs=Inputs(at={9: press_ctrl_c}), checkpoint=tmp_path / "state", **usual)
@@ -203,7 +201,7 @@ def test_a_checkpoint_of_other_settings_is_started_over(tmp_path: Path, other: d
     assert bits(drive(THIS, inputs=Inputs(), checkpoint=tmp_path / "state", **changed)) == bits(fresh)
 
 
-def test_a_second_ctrl_c_stops_at_once_and_the_handler_is_put_back(tmp_path: Path) -> None:
+def test_a_second_ctrl_c_stops_immediately_and_the_handler_is_restored(tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGINT)
 
     def press_twice(state: State) -> None:
@@ -214,32 +212,32 @@ def test_a_second_ctrl_c_stops_at_once_and_the_handler_is_put_back(tmp_path: Pat
     with pytest.raises(KeyboardInterrupt):
         drive(THIS, Config(), Inputs(at={10: press_twice}), seed=3, checkpoint=path, every=8)
     assert signal.getsignal(signal.SIGINT) is before
-    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == whole()
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == uninterrupted()
 
 
-def test_without_a_checkpoint_ctrl_c_says_that_nothing_is_kept() -> None:
+def test_without_a_checkpoint_the_message_of_ctrl_c_is_that_nothing_was_saved() -> None:
     with pytest.raises(KeyboardInterrupt, match="nothing was saved"):
         drive(THIS, Config(), Inputs(at={2: press_ctrl_c}), seed=3)
 
 
 def test_a_stage_can_be_driven_from_another_thread() -> None:
-    """Signals cannot be handled there."""
+    """Python can handle signals in the main thread only."""
     results: list[dict[str, bytes]] = []
-    thread = threading.Thread(target=lambda: results.append(whole()))
+    thread = threading.Thread(target=lambda: results.append(uninterrupted()))
     thread.start()
     thread.join()
-    assert results == [whole()]
+    assert results == [uninterrupted()]
 
 
-def test_tensors_without_gradients_or_optimizer_come_back(tmp_path: Path) -> None:
-    """Booleans, empty tensors and shared storage are all a state may hold."""
+def test_states_without_gradients_or_optimizer_are_restored(tmp_path: Path) -> None:
+    """A state may hold booleans, empty tensors and tensors with shared storage."""
 
     class Plain(Previewed):
         @staticmethod
         def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
             shared = torch.arange(6)
             memory = {"flags": torch.tensor([True, False]), "none": torch.zeros(0, 3), "tail": shared[3:].flip(0)}
-            return State(0, {"all": shared, "turned": shared.reshape(2, 3).T}, None, rng, memory)
+            return State(0, {"all": shared, "transposed": shared.reshape(2, 3).T}, None, rng, memory)
 
         @staticmethod
         def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
@@ -264,19 +262,19 @@ def test_tensors_without_gradients_or_optimizer_come_back(tmp_path: Path) -> Non
     assert torch.equal(again["rest.tail"], torch.tensor([5, 4, 3]))
 
 
-# What goes wrong ------------------------------------------------------------------------------------------------------
+# Errors ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_nan_raises_with_its_name_its_step_and_the_last_good_state(tmp_path: Path) -> None:
+def test_a_nan_raises_with_its_name_its_step_and_the_last_valid_state(tmp_path: Path) -> None:
     path = tmp_path / "state"
-    with pytest.raises(NotFinite, match=r"not finite at step 10; the last good state is in .*state") as caught:
+    with pytest.raises(NotFinite, match=r"not finite at step 10; the last valid state is in .*state") as caught:
         drive(THIS, Config(), Inputs(at={9: poison}), seed=3, checkpoint=path, every=8)
     assert (caught.value.state_file, caught.value.step) == (path, 10)
-    # The state of step 8 is there still, and good.
-    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == whole()
+    # The state of step 8 is still stored and valid.
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == uninterrupted()
 
 
-def test_a_nan_that_no_step_notices_is_neither_saved_nor_handed_on(tmp_path: Path) -> None:
+def test_a_nan_outside_of_the_loss_is_neither_saved_nor_returned(tmp_path: Path) -> None:
     def hide(state: State) -> None:
         with torch.no_grad():
             state.params.frozen[1] = float("inf")
@@ -286,12 +284,12 @@ def test_a_nan_that_no_step_notices_is_neither_saved_nor_handed_on(tmp_path: Pat
         with pytest.raises(NotFinite, match="frozen is not finite") as caught:
             drive(THIS, Config(), Inputs(at={n: hide}), seed=3, checkpoint=checkpoint, every=8)
         assert caught.value.state_file == checkpoint
-    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == whole()
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == uninterrupted()
 
 
 @contextmanager
 def full_disk(room: int) -> Iterator[None]:
-    """No file may grow beyond `room` bytes: the system refuses the write as it does on a full disk."""
+    """Context in which writing beyond `room` bytes of a file fails as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
     try:
@@ -300,25 +298,25 @@ def full_disk(room: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_is_told_and_the_state_before_survives_it(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_and_the_previous_checkpoint_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
         drive(THIS, Config(), Inputs(at={4: press_ctrl_c}), seed=3, checkpoint=path)
-    with full_disk(3000), pytest.raises(OSError, match=r"state: cannot be written: .*; the same command goes on"):
+    with full_disk(3000), pytest.raises(OSError, match=r"state: cannot be written: .*then run the same command again"):
         drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
     assert [p.name for p in tmp_path.iterdir()] == ["state"]
-    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)) == whole()
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)) == uninterrupted()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_write_permission_is_an_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(OSError, match=r"state: cannot .* \(choose a folder that you may write to"):
         drive(THIS, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state")
     tmp_path.chmod(0o700)
 
 
-def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path) -> None:
+def test_errors_name_files_that_are_not_checkpoints(tmp_path: Path) -> None:
     path = tmp_path / "state"
     path.write_bytes(b"junk" * 20)
     with pytest.raises(BadFile, match="state: is not a checkpoint"):
@@ -328,8 +326,8 @@ def test_a_file_that_is_no_checkpoint_is_refused_by_name(tmp_path: Path) -> None
         drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
 
 
-def test_a_checkpoint_of_another_structure_is_refused(tmp_path: Path) -> None:
-    """The stage was edited and its VERSION was not."""
+def test_a_checkpoint_of_another_structure_is_rejected(tmp_path: Path) -> None:
+    """The stage was edited without incrementing VERSION."""
 
     class Edited(Previewed):
         @staticmethod
@@ -339,17 +337,17 @@ def test_a_checkpoint_of_another_structure_is_refused(tmp_path: Path) -> None:
 
     path = tmp_path / "state"
     drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
-    with pytest.raises(BadFile, match="does not fit this stage"):
+    with pytest.raises(BadFile, match="does not match this stage"):
         drive(Edited, Config(), Inputs(), seed=3, checkpoint=path)
 
 
-# What people see ------------------------------------------------------------------------------------------------------
+# Progress -------------------------------------------------------------------------------------------------------------
 
 
-def test_reports_are_few_and_hold_what_a_log_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_are_rate_limited_and_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     records: list[Progress] = []
     drive(THIS, Config(), Inputs(), seed=3, report=records.append, name="toy")
-    # Thirty steps of a millisecond: the first and the last.
+    # Thirty steps take milliseconds, so that only the first and the last one are reported.
     assert (records[0].step, records[-1].step) == (1, 30)
     assert len(records) < 5
     assert records[-1].of == 30
@@ -364,7 +362,7 @@ def test_reports_are_few_and_hold_what_a_log_needs(tmp_path: Path, monkeypatch: 
     drive(THIS, Config(), Inputs(), seed=3, report=records.append, checkpoint=path)
     assert [record.step for record in records] == list(range(1, 31))
     seconds = [record.seconds for record in records]
-    assert seconds == sorted(seconds), "the clock of a resumed run goes on"
+    assert seconds == sorted(seconds), "the time of a resumed run includes that before the interrupt"
 
 
 def test_a_terminal_shows_the_stage_its_metric_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -372,8 +370,8 @@ def test_a_terminal_shows_the_stage_its_metric_and_the_time_left(monkeypatch: py
     monkeypatch.setattr(loop, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120))
     monkeypatch.setattr(loop, "BAR_SECONDS", 0.0)
     drive(THIS, Config(), Inputs(), seed=3, name="toy")
-    shown = screen.getvalue()
-    assert all(word in shown for word in ("toy", "30/30", "loss", "0:00:0"))
+    text = screen.getvalue()
+    assert all(word in text for word in ("toy", "30/30", "loss", "0:00:0"))
 
 
 def test_nothing_is_printed_without_a_terminal(capfd: pytest.CaptureFixture[str]) -> None:
@@ -381,13 +379,13 @@ def test_nothing_is_printed_without_a_terminal(capfd: pytest.CaptureFixture[str]
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_preview_lies_beside_the_checkpoint_and_changes_nothing(tmp_path: Path) -> None:
+def test_a_preview_is_written_beside_the_checkpoint_and_does_not_affect_the_result(tmp_path: Path) -> None:
     output = drive(Previewed, Config(), Inputs(), seed=3, checkpoint=tmp_path / "state", every=3)
     assert files.read_image(tmp_path / "preview.png").shape == (4, 5, 3)
-    assert bits(output) == whole()
+    assert bits(output) == uninterrupted()
 
 
-def test_fingerprints_tell_settings_and_their_classes_apart() -> None:
+def test_fingerprints_differ_between_settings_and_between_classes() -> None:
     @dataclass(frozen=True)
     class Other:
         steps: int = 30
@@ -396,8 +394,8 @@ def test_fingerprints_tell_settings_and_their_classes_apart() -> None:
         finer: int = 11
 
     assert fingerprint("a", Config()) == fingerprint("a", Config())
-    prints = [fingerprint("a", x) for x in (Config(), Config(rate=0.06), Other(), {"x": Config()}, float("inf"), None)]
-    assert len(set(prints)) == len(prints)
-    assert all(len(x) == 64 for x in prints)
+    hashes = [fingerprint("a", x) for x in (Config(), Config(rate=0.06), Other(), {"x": Config()}, float("inf"), None)]
+    assert len(set(hashes)) == len(hashes)
+    assert all(len(x) == 64 for x in hashes)
     with pytest.raises(TypeError, match="not a Tensor"):
         fingerprint(torch.zeros(2))

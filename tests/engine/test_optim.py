@@ -1,4 +1,4 @@
-"""Leaves, rates and moments, against Adam written out in float64."""
+"""Leaves, learning rates and moments, compared with Adam written out in float64."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from tumble.io import tree
 
 @dataclass(frozen=True)
 class Cloud:
-    """Rows that come and go."""
+    """Leaves whose rows are regrown."""
 
     means: Tensor
     sdf: Tensor
@@ -30,7 +30,7 @@ class Scene:
     word: str
 
 
-def a_scene(n: int = 5, dtype: torch.dtype = torch.float64) -> Scene:
+def make_scene(n: int = 5, dtype: torch.dtype = torch.float64) -> Scene:
     torch.manual_seed(0)
     cloud = Cloud(torch.randn(n, 3, dtype=dtype), torch.randn(n, dtype=dtype), torch.zeros(n, 0, 3, dtype=dtype))
     light, gamma = torch.randn(2, 4, 3, dtype=dtype), torch.tensor(2.0, dtype=dtype)
@@ -38,7 +38,7 @@ def a_scene(n: int = 5, dtype: torch.dtype = torch.float64) -> Scene:
 
 
 def bowl(scene: Scene) -> Tensor:
-    """A loss whose gradient differs everywhere and from step to step."""
+    """A loss whose gradient differs between all elements and steps."""
     floats = [x for x in tree.named_tensors(scene).values() if x.is_floating_point()]
     return sum(((x - 1) ** 2 * torch.linspace(1, 2, x.numel()).reshape(x.shape)).sum() for x in floats).to(floats[0])
 
@@ -60,7 +60,7 @@ class ByHand:
 # Rates ----------------------------------------------------------------------------------------------------------------
 
 
-def test_leaves_are_copies_that_ask_for_gradients_where_they_are_floats() -> None:
+def test_leaves_are_copies_and_floats_require_gradients() -> None:
     source = Scene(
         Cloud(torch.ones(2, 3).T, torch.ones(2), torch.ones(2)), torch.ones(1), torch.ones(()), torch.arange(2), "a"
     )
@@ -74,8 +74,8 @@ def test_leaves_are_copies_that_ask_for_gradients_where_they_are_floats() -> Non
     assert scene.word == "a"
 
 
-def test_the_longest_name_decides_the_rate_and_a_name_ends_at_a_dot() -> None:
-    scene = a_scene()
+def test_the_longest_matching_key_sets_the_rate_and_keys_end_at_a_dot() -> None:
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1, "cloud": 0.2, "cloud.sdf": 0.3})
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
     assert rates == {"cloud.means": 0.2, "cloud.sdf": 0.3, "cloud.empty": 0.2, "light": 0.1, "gamma": 0.1}
@@ -87,7 +87,7 @@ def test_the_longest_name_decides_the_rate_and_a_name_ends_at_a_dot() -> None:
 
 
 def test_rate_zero_freezes_a_leaf() -> None:
-    scene = a_scene()
+    scene = make_scene()
     before = scene.light.clone()
     optimizer = adam(scene, {"": 0.1, "light": 0.0})
     descend(bowl(scene), optimizer, step=0)
@@ -99,7 +99,7 @@ def test_rate_zero_freezes_a_leaf() -> None:
 
 
 def test_annealing_scales_base_rates_and_leaves_other_leaves_alone() -> None:
-    optimizer = adam(a_scene(), {"": 0.1, "cloud": 0.2})
+    optimizer = adam(make_scene(), {"": 0.1, "cloud": 0.2})
     anneal(optimizer, 0.5)
     anneal(optimizer, {"cloud": 0.25, "cloud.sdf": 0.0})
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
@@ -112,7 +112,7 @@ def test_annealing_scales_base_rates_and_leaves_other_leaves_alone() -> None:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_steps_follow_adam_written_out(dtype: torch.dtype, tolerance: float) -> None:
     """The tolerance is the rounding of ten steps."""
-    scene = a_scene(dtype=dtype)
+    scene = make_scene(dtype=dtype)
     optimizer = adam(scene, {"": 0.05, "cloud.means": 0.01})
     hand = {"cloud.means": ByHand(scene.cloud.means, 0.01), "light": ByHand(scene.light, 0.05)}
     for step in range(10):
@@ -127,8 +127,8 @@ def test_steps_follow_adam_written_out(dtype: torch.dtype, tolerance: float) -> 
 
 @pytest.mark.parametrize("steep", [lambda x: x.sqrt(), lambda x: x.abs().sqrt()], ids=["infinity", "nan"])
 def test_a_gradient_that_is_not_finite_is_named_before_anything_changes(steep: Callable[[Tensor], Tensor]) -> None:
-    """A square root has an infinite slope at 0 where its value is finite: only the gradient can tell."""
-    scene = a_scene()
+    """A square root has an infinite slope at 0 where its value is finite, so only the gradient is not finite."""
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1})
     descend(bowl(scene), optimizer, step=0)
     before = {name: x.clone() for name, x in (tree.named_tensors(scene) | pack(optimizer)).items()}
@@ -140,7 +140,7 @@ def test_a_gradient_that_is_not_finite_is_named_before_anything_changes(steep: C
 
 
 def test_a_loss_that_is_not_finite_is_named() -> None:
-    scene = a_scene()
+    scene = make_scene()
     with pytest.raises(NotFinite, match="the loss is not finite at step 3"):
         descend(bowl(scene) * float("nan"), adam(scene, {"": 0.1}), step=3)
 
@@ -152,8 +152,8 @@ def test_gradients_whose_norm_overflows_are_still_finite() -> None:
     torch.testing.assert_close(x["x"].detach(), torch.full((3,), -0.1))
 
 
-def test_a_leaf_out_of_the_losss_reach_waits() -> None:
-    scene = a_scene()
+def test_leaves_that_the_loss_does_not_depend_on_are_unchanged() -> None:
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1})
     descend(bowl(scene), optimizer, step=0)
     before, moment = scene.gamma.clone(), optimizer.state[scene.gamma]["exp_avg"].clone()
@@ -167,7 +167,7 @@ def test_a_leaf_out_of_the_losss_reach_waits() -> None:
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_regrowing_moves_rows_with_their_moments_and_clears_fresh_ones(frozen: bool) -> None:
-    scene = a_scene()
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1, "cloud.sdf": 0.0 if frozen else 0.1})
     for step in range(3):
         descend(bowl(scene), optimizer, step=step)
@@ -190,10 +190,10 @@ def test_regrowing_moves_rows_with_their_moments_and_clears_fresh_ones(frozen: b
     assert moved == {"cloud.means", "light", "gamma"} | (set() if frozen else {"cloud.sdf"})
 
 
-def test_kept_rows_go_on_as_if_nothing_had_been_pruned() -> None:
-    """The loss is a sum over rows: a row's path does not depend on the others."""
+def test_pruning_does_not_affect_the_remaining_rows() -> None:
+    """The loss is a sum over rows, so rows are independent of each other."""
     target = torch.arange(15.0).reshape(5, 3)
-    whole, keep = a_scene(dtype=torch.float32).cloud, torch.tensor([3, 1])
+    whole, keep = make_scene(dtype=torch.float32).cloud, torch.tensor([3, 1])
     part = leaves(whole)
     of_whole, of_part = (adam(cloud, {"": 0.1, "empty": 0.0, "sdf": 0.0}) for cloud in (whole, part))
     for step in range(8):
@@ -201,12 +201,12 @@ def test_kept_rows_go_on_as_if_nothing_had_been_pruned() -> None:
             part, target_of_part = regrow(part, of_part, keep, torch.zeros(2, dtype=torch.bool)), target[keep]
         descend(((whole.means - target) ** 2).sum(), of_whole, step=step)
         descend(((part.means - (target if step < 4 else target_of_part)) ** 2).sum(), of_part, step=step)
-    # Vectorised and scalar square roots may round differently at a row's new place: a few units in the last place.
+    # Vectorised and scalar square roots may round differently at another row index, by a few units in the last place.
     torch.testing.assert_close(part.means, whole.means[keep], rtol=1e-6, atol=1e-6)
 
 
 def test_regrowing_before_the_first_step_and_down_to_nothing_works() -> None:
-    scene = a_scene()
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1})
     none = torch.zeros(0, dtype=torch.long)
     cloud = regrow(scene.cloud, optimizer, none, none.bool())
@@ -214,8 +214,8 @@ def test_regrowing_before_the_first_step_and_down_to_nothing_works() -> None:
     descend(bowl(replace(scene, cloud=cloud)), optimizer, step=0)
 
 
-def test_trees_that_cannot_be_regrown_are_refused() -> None:
-    scene = a_scene()
+def test_trees_that_cannot_be_regrown_are_rejected() -> None:
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1})
     index, fresh = torch.tensor([0]), torch.tensor([True])
     with pytest.raises(ValueError, match="same number of rows"):
@@ -232,8 +232,8 @@ def finer(x: Tensor) -> Tensor:
     return x.repeat_interleave(2, 0).repeat_interleave(2, 1)
 
 
-def test_a_resampled_leaf_learns_on_as_the_coarse_one_would_have() -> None:
-    """A loss that sees only means of 2 x 2 cells has the same descent on both grids, cell for cell."""
+def test_a_resampled_leaf_trains_like_the_coarse_one() -> None:
+    """A loss of the means of 2 x 2 cells has the same descent on both grids, cell for cell."""
     coarse = leaves({"light": torch.randn(2, 4, 3, dtype=torch.float64), "x": torch.ones(2, dtype=torch.float64)})
     fine = leaves(coarse)
     of_coarse, of_fine = adam(coarse, {"": 0.1}), adam(fine, {"": 0.1})
@@ -244,18 +244,18 @@ def test_a_resampled_leaf_learns_on_as_the_coarse_one_would_have() -> None:
     for step in range(12):
         if step == 5:
             fine = resample(fine, of_fine, "light", finer)
-        seen = fine["light"] if step < 5 else fine["light"].reshape(2, 2, 4, 2, 3).mean((1, 3))
+        means = fine["light"] if step < 5 else fine["light"].reshape(2, 2, 4, 2, 3).mean((1, 3))
         descend(loss(coarse["light"], coarse["x"], step), of_coarse, step=step)
-        descend(loss(seen, fine["x"], step), of_fine, step=step)
-    # Equal but for the order of float64 sums.
+        descend(loss(means, fine["x"], step), of_fine, step=step)
+    # Equal except for the order of float64 sums.
     torch.testing.assert_close(fine["light"], finer(coarse["light"]), rtol=1e-12, atol=1e-12)
     assert fine["light"].shape == (4, 8, 3)
     assert of_fine.state[fine["light"]]["step"] == 12
 
 
-def test_a_map_that_is_not_linear_needs_to_say_how_gradients_move() -> None:
-    """exp, upsample, log is right for log radiance and would put out the second moments, which are tiny."""
-    scene = a_scene()
+def test_a_nonlinear_map_requires_a_map_of_moments() -> None:
+    """exp, upsample, log is right for log radiance, but would erase second moments, which are tiny."""
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1})
     descend(bowl(scene), optimizer, step=0)
     with pytest.raises(ValueError, match="light is not linear"):
@@ -263,15 +263,15 @@ def test_a_map_that_is_not_linear_needs_to_say_how_gradients_move() -> None:
     scene = resample(scene, optimizer, "light", lambda x: finer(x.exp()).log() + 0.1, moments=finer)
     assert scene.light.shape == (4, 8, 3)
     assert (optimizer.state[scene.light]["exp_avg_sq"] > 0).all()
-    with pytest.raises(ValueError, match=r"no leaf 'lamp'; there are cloud\.means"):
+    with pytest.raises(ValueError, match=r"no leaf 'lamp'; leaves are cloud\.means"):
         resample(scene, optimizer, "lamp", finer)
 
 
-def test_a_map_with_overshoots_leaves_no_negative_second_moment() -> None:
+def test_second_moments_stay_non_negative_under_a_map_that_overshoots() -> None:
     def sharpened(x: Tensor) -> Tensor:
         return finer(2 * x - x.mean())
 
-    scene = a_scene()
+    scene = make_scene()
     optimizer = adam(scene, {"": 0.1})
     descend(bowl(scene), optimizer, step=0)
     scene = resample(scene, optimizer, "light", sharpened)
@@ -282,7 +282,7 @@ def test_a_map_with_overshoots_leaves_no_negative_second_moment() -> None:
 
 
 def trained(steps: int) -> tuple[Scene, torch.optim.Adam]:
-    scene = a_scene(dtype=torch.float32)
+    scene = make_scene(dtype=torch.float32)
     optimizer = adam(scene, {"": 0.1, "gamma": 0.0})
     for step in range(steps):
         anneal(optimizer, 0.9**step)
@@ -291,7 +291,7 @@ def trained(steps: int) -> tuple[Scene, torch.optim.Adam]:
 
 
 @pytest.mark.parametrize("steps", [0, 6])
-def test_unpacked_moments_go_on_bit_for_bit(steps: int) -> None:
+def test_training_with_unpacked_moments_continues_bit_for_bit(steps: int) -> None:
     scene, optimizer = trained(steps)
     index = torch.tensor([1, 1, 3])
     scene = replace(scene, cloud=regrow(scene.cloud, optimizer, index, torch.tensor([False, True, False])))
@@ -311,21 +311,21 @@ def test_unpacked_moments_go_on_bit_for_bit(steps: int) -> None:
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
-def test_moments_of_other_leaves_are_refused() -> None:
+def test_moments_of_other_leaves_are_rejected() -> None:
     _, optimizer = trained(2)
     packed = pack(optimizer)
     other = adam(leaves({"light": torch.zeros(2, 4, 3)}), {"": 0.1})
-    with pytest.raises(ValueError, match=r"do not fit the leaves light"):
+    with pytest.raises(ValueError, match=r"do not match the leaves light"):
         unpack(other, packed)
     scene, same = trained(0)
     regrow(scene.cloud, same, torch.tensor([0]), torch.tensor([False]))
     with pytest.raises(ValueError, match=r"exp_avg of cloud\.means has the shape \[5, 3\], not \[1, 3\]"):
         unpack(same, packed)
-    with pytest.raises(ValueError, match="do not fit the tree"):
+    with pytest.raises(ValueError, match="do not match the tree"):
         optim.overwrite(scene, None, {"means": torch.zeros(1)})
 
 
-def test_linear_maps_are_told_from_others() -> None:
+def test_linear_maps_are_recognised() -> None:
     like = torch.zeros(3, 4)
     assert all(optim._is_linear(fn, like) for fn in (finer, lambda x: x.mean(0)))
     assert not any(optim._is_linear(fn, like) for fn in (lambda x: x + 1, lambda x: x.exp().mean(0).log()))

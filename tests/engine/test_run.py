@@ -1,4 +1,4 @@
-"""Run directories: what is done is kept, what differs is named, and what is kept decides nothing but time."""
+"""Run directories: finished stages are kept, differing settings are errors, and results do not depend on interrupts."""
 
 import errno
 import json
@@ -36,27 +36,27 @@ class Recipe:
 
 
 Steps = list[int]
-"""Steps that were really taken."""
+"""Steps that were made."""
 
 
-def counted(steps: Steps, accidents: dict[int, Callable[..., Any]] | None = None) -> toy.Inputs:
+def counting_inputs(steps: Steps, events: dict[int, Callable[..., Any]] | None = None) -> toy.Inputs:
     at = {n: lambda state, n=n: steps.append(n) for n in range(100)}
-    return toy.Inputs(at=at | (accidents or {}))
+    return toy.Inputs(at=at | (events or {}))
 
 
-def pipeline(path: Path, recipe: Recipe, steps: Steps, **accidents: dict[int, Callable[..., Any]]) -> Any:
+def pipeline(path: Path, recipe: Recipe, steps: Steps, **events: dict[int, Callable[..., Any]]) -> Any:
     """Two stages, the second of which reads the first's output."""
     opened = run.open(path, Path("clip"), recipe)
-    first, own = run.stage(opened, "1-first", toy, recipe.first, counted(steps, accidents.get("first")), ["clip"])
+    first, own = run.stage(opened, "1-first", toy, recipe.first, counting_inputs(steps, events.get("first")), ["clip"])
     target = first.params.points.mean(0)
-    inputs = replace(counted(steps, accidents.get("second")), target=target)
+    inputs = replace(counting_inputs(steps, events.get("second")), target=target)
     return run.stage(opened, "2-second", toy, recipe.second, inputs, [own])[0]
 
 
 # Stages ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_finished_stage_is_not_run_again_and_its_output_is_the_same(tmp_path: Path) -> None:
+def test_a_finished_stage_is_not_run_again_and_its_output_is_loaded(tmp_path: Path) -> None:
     steps: Steps = []
     once = pipeline(tmp_path / "run", Recipe(), steps)
     assert len(steps) == 30 + 12
@@ -69,29 +69,29 @@ def test_a_finished_stage_is_not_run_again_and_its_output_is_the_same(tmp_path: 
 
 
 @pytest.mark.parametrize("stage", ["first", "second"])
-def test_an_interrupted_pipeline_goes_on_to_the_bits_of_a_whole_one(tmp_path: Path, stage: str) -> None:
+def test_a_resumed_pipeline_equals_an_uninterrupted_one_bit_for_bit(tmp_path: Path, stage: str) -> None:
     whole = pipeline(tmp_path / "whole", Recipe(), [])
-    with pytest.raises(KeyboardInterrupt, match=f"{stage} stopped at step 8 of .*; the same command goes on from"):
+    with pytest.raises(KeyboardInterrupt, match=f"{stage} stopped at step 8 of .*; run the same command again"):
         pipeline(tmp_path / "run", Recipe(), [], **{stage: {7: press_ctrl_c}})
     steps: Steps = []
     assert toy.bits(pipeline(tmp_path / "run", Recipe(), steps)) == toy.bits(whole)
     assert len(steps) == (42 - 8 if stage == "first" else 12 - 8)
     same = ("1-first/stage.json", "2-second/stage.json")
     assert all((tmp_path / "whole" / x).read_text() == (tmp_path / "run" / x).read_text() for x in same)
-    # The time of a stage is that of all processes that worked on it.
-    records = [record for record in run.records(tmp_path / "run") if record.get("name") == stage]
+    # The time of a stage includes that of interrupted processes.
+    records = [record for record in run.log_records(tmp_path / "run") if record.get("name") == stage]
     last, done = (next(x for x in reversed(records) if key in x) for key in ("step", "event"))
     assert done["seconds"] >= last["seconds"]
 
 
-def test_stages_draw_from_seeds_of_their_own(tmp_path: Path) -> None:
+def test_every_stage_has_its_own_seed(tmp_path: Path) -> None:
     seeds = [run.stage_seed(seed, name) for seed in (0, 1) for name in ("refine", "decompose")]
     assert len(set(seeds)) == 4
     one, other = (pipeline(tmp_path / str(seed), Recipe(seed=seed), []) for seed in (0, 1))
     assert toy.bits(one) != toy.bits(other)
 
 
-def test_what_decides_a_result_decides_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_key_depends_on_everything_that_affects_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     usual = ("refine", toy, toy.Config(), ["capture"])
     variants = [
         ("decompose", *usual[1:]),
@@ -108,31 +108,31 @@ def test_what_decides_a_result_decides_its_key(monkeypatch: pytest.MonkeyPatch) 
     assert run.key(*usual) == keys[0]
 
 
-def test_a_stage_whose_inputs_changed_is_made_anew(tmp_path: Path) -> None:
+def test_a_stage_with_changed_inputs_is_run_again(tmp_path: Path) -> None:
     opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
     for keys in (["a"], ["b"], ["b"]):
-        run.stage(opened, "1-first", toy, toy.Config(), counted(steps), keys)
+        run.stage(opened, "1-first", toy, toy.Config(), counting_inputs(steps), keys)
     assert len(steps) == 60
 
 
-def test_a_stage_of_another_seed_is_made_anew(tmp_path: Path) -> None:
+def test_a_stage_with_another_seed_is_run_again(tmp_path: Path) -> None:
     steps: Steps = []
     for seed in (0, 1, 1):
         opened = run.Run(tmp_path, Recipe(seed=seed))
-        run.stage(opened, "1-first", toy, toy.Config(), counted(steps), ["a"])
+        run.stage(opened, "1-first", toy, toy.Config(), counting_inputs(steps), ["a"])
     assert len(steps) == 60
 
 
-def test_a_stored_output_goes_where_the_inputs_are() -> None:
-    elsewhere = toy.Inputs(target=torch.zeros(2, device="meta"))
-    assert run._device((Recipe(), (elsewhere, a_capture()))).type == "meta"
+def test_a_stored_output_is_loaded_to_the_device_of_the_inputs() -> None:
+    on_meta = toy.Inputs(target=torch.zeros(2, device="meta"))
+    assert run._device((Recipe(), (on_meta, make_capture()))).type == "meta"
     assert run._device(()).type == "cpu"
 
 
-def test_a_key_never_stands_beside_the_output_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The power fails between the two files of a stage; then the stage's old settings come back."""
+def test_a_stored_key_always_matches_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A crash between writing the two files of a stage, followed by a run with the old settings."""
     opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
-    inputs = counted(steps)
+    inputs = counting_inputs(steps)
     once = run.stage(opened, "1-first", toy, toy.Config(), inputs, ["a"])[0]
     monkeypatch.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(RuntimeError("power cut")))
     with pytest.raises(RuntimeError, match="power cut"):
@@ -143,7 +143,7 @@ def test_a_key_never_stands_beside_the_output_of_another(tmp_path: Path, monkeyp
     assert toy.bits(again) == toy.bits(once)
 
 
-def test_a_full_disk_is_told_and_costs_no_step(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_and_finished_stages_are_kept(tmp_path: Path) -> None:
     steps: Steps = []
     whole = pipeline(tmp_path / "whole", Recipe(), [])
     path = tmp_path / "run"
@@ -155,27 +155,27 @@ def test_a_full_disk_is_told_and_costs_no_step(tmp_path: Path) -> None:
     assert not list(path.rglob("*partial*"))
     assert len(steps) == 30 + 12
     assert toy.bits(pipeline(path, Recipe(), steps)) == toy.bits(whole)
-    assert len(steps) == 30 + 24, "the finished stage was kept"
+    assert len(steps) == 30 + 24, "the finished stage must be kept"
 
 
-def test_an_output_that_does_not_fit_on_the_disk_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_an_output_that_does_not_fit_on_the_disk_leaves_no_file(tmp_path: Path) -> None:
     class Big(toy.Previewed):
         @staticmethod
         def finish(cfg: toy.Config, inputs: toy.Inputs, state: toy.State) -> toy.Output:
             return toy.Output(toy.finish(cfg, inputs, state).params, {"big": torch.zeros(100_000)})
 
     opened, steps = run.open(tmp_path / "run", Path("clip"), Recipe()), []
-    inputs = counted(steps)
+    inputs = counting_inputs(steps)
     with full_disk(100_000), pytest.raises(OSError, match=r"out\.safetensors: cannot be written"):
         run.stage(opened, "1-big", Big, toy.Config(), inputs, [])
     names = sorted(p.name for p in (tmp_path / "run" / "1-big").iterdir())
     assert names == ["preview.png", "state.safetensors"]
     run.stage(opened, "1-big", Big, toy.Config(), inputs, [])
-    assert len(steps) == 30, "training was not repeated"
+    assert len(steps) == 30, "training must not be repeated"
 
 
-def test_a_stage_without_steps_and_one_without_a_class_of_output(tmp_path: Path) -> None:
-    class Untold(toy.Previewed):
+def test_stages_without_steps_work_and_stages_without_an_output_class_are_rejected(tmp_path: Path) -> None:
+    class WithoutAnnotation(toy.Previewed):
         @staticmethod
         def finish(cfg: toy.Config, inputs: toy.Inputs, state: toy.State):
             return toy.finish(cfg, inputs, state)
@@ -184,10 +184,10 @@ def test_a_stage_without_steps_and_one_without_a_class_of_output(tmp_path: Path)
     output = run.stage(opened, "1-none", toy, toy.Config(steps=0), toy.Inputs(), [])[0]
     assert output.params.points.shape == (6, 2)
     with pytest.raises(TypeError, match="return annotation"):
-        run.stage(opened, "2-untold", Untold, toy.Config(), toy.Inputs(), [])
+        run.stage(opened, "2-bare", WithoutAnnotation, toy.Config(), toy.Inputs(), [])
 
 
-def test_the_log_has_a_line_of_json_for_what_happened(tmp_path: Path) -> None:
+def test_the_log_has_one_json_document_per_line(tmp_path: Path) -> None:
     pipeline(tmp_path / "run", Recipe(), [])
     lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert all("time" in line for line in lines)
@@ -201,7 +201,7 @@ def test_the_log_has_a_line_of_json_for_what_happened(tmp_path: Path) -> None:
 # The folder -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_recipe_is_saved_and_the_same_one_goes_on(tmp_path: Path) -> None:
+def test_the_recipe_is_saved_and_the_same_recipe_continues_the_run(tmp_path: Path) -> None:
     for _ in range(2):
         opened = run.open(tmp_path / "runs" / "mug", tmp_path / "clip.mp4", Recipe())
         assert opened.recipe == Recipe()
@@ -210,57 +210,58 @@ def test_the_recipe_is_saved_and_the_same_one_goes_on(tmp_path: Path) -> None:
     assert document["capture"]["path"] == str(tmp_path / "clip.mp4")
 
 
-def test_another_recipe_is_refused_with_what_differs(tmp_path: Path) -> None:
+def test_another_recipe_is_rejected_with_the_differences(tmp_path: Path) -> None:
     run.open(tmp_path, Path("clip"), Recipe())
-    make_something(tmp_path)
+    write_result(tmp_path)
     other = Recipe(second=toy.Config(steps=13), seed=5)
     with pytest.raises(
-        BadFile, match=r"recipe\.second\.steps is 12 there and 13 here; recipe\.seed is 0 there and 5 here"
+        BadFile,
+        match=r"second\.steps is 12 in the folder, 13 was requested; recipe\.seed is 0 in the folder, 5 was requested",
     ):
         run.open(tmp_path, Path("clip"), other)
 
 
-def test_a_run_that_has_made_nothing_takes_another_recipe(tmp_path: Path) -> None:
+def test_a_run_without_results_accepts_another_recipe(tmp_path: Path) -> None:
     run.open(tmp_path, Path("clip"), Recipe(seed=5))
     run.open(tmp_path, Path("clip"), Recipe())
-    make_something(tmp_path)
+    write_result(tmp_path)
     run.open(tmp_path, Path("clip"), Recipe())
-    with pytest.raises(BadFile, match=r"recipe\.seed is 0 there and 5 here"):
+    with pytest.raises(BadFile, match=r"recipe\.seed is 0 in the folder, 5 was requested"):
         run.open(tmp_path, Path("clip"), Recipe(seed=5))
 
 
-def make_something(path: Path) -> None:
-    """As if a stage had begun."""
-    files.write_whole(path / "1-first" / run.CHECKPOINT, lambda partial: partial.write_bytes(b"a state"))
+def write_result(path: Path) -> None:
+    """Write a checkpoint, as a stage does."""
+    files.write_atomically(path / "1-first" / run.CHECKPOINT, lambda partial: partial.write_bytes(b"a state"))
 
 
-def test_a_capture_is_known_by_its_content_where_there_is_one_else_by_its_path(tmp_path: Path) -> None:
+def test_captures_are_compared_by_content_if_known_else_by_path(tmp_path: Path) -> None:
     run.open(tmp_path / "a", Path("clip"), Recipe(), content="key")
-    make_something(tmp_path / "a")
+    write_result(tmp_path / "a")
     run.open(tmp_path / "a", Path("moved"), Recipe(), content="key")
-    with pytest.raises(BadFile, match=r"capture\.content is 'key' there and 'other' here"):
+    with pytest.raises(BadFile, match=r"capture\.content is 'key' in the folder, 'other' was requested"):
         run.open(tmp_path / "a", Path("clip"), Recipe(), content="other")
     run.open(tmp_path / "a", Path("clip"), Recipe())
-    with pytest.raises(BadFile, match=r"capture\.path is '.*clip' there and '.*moved' here"):
+    with pytest.raises(BadFile, match=r"capture\.path is '.*clip' in the folder, '.*moved' was requested"):
         run.open(tmp_path / "a", Path("moved"), Recipe())
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_folders_of_something_else_are_not_changed(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.png").write_bytes(b"cat")
-    with pytest.raises(BadFile, match="is there already and is no run"):
+    with pytest.raises(BadFile, match="exists and is not a run directory"):
         run.open(tmp_path / "photos", Path("clip"), Recipe())
     with pytest.raises(BadFile, match="is a file"):
         run.open(tmp_path / "photos" / "cat.png", Path("clip"), Recipe())
-    with pytest.raises(BadFile, match="is there already and is no run"), run.alone(tmp_path / "photos"):
-        raise AssertionError("nobody works in here")
+    with pytest.raises(BadFile, match="exists and is not a run directory"), run.exclusive_access(tmp_path / "photos"):
+        raise AssertionError("the folder must not be opened")
     (tmp_path / "photos" / "recipe.json").write_text('{"eggs": 3}')
-    with pytest.raises(BadFile, match="is no recipe of a run"):
+    with pytest.raises(BadFile, match="is not the recipe of a run"):
         run.open(tmp_path / "photos", Path("clip"), Recipe())
     assert sorted(p.name for p in (tmp_path / "photos").iterdir()) == ["cat.png", "recipe.json"]
 
 
-def test_a_read_only_place_is_told_with_the_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_only_folder_is_an_error_with_the_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
@@ -270,7 +271,7 @@ def test_a_read_only_place_is_told_with_the_fix(tmp_path: Path, monkeypatch: pyt
     assert e.value.errno == errno.EROFS
 
 
-def test_a_finished_run_can_be_read_where_nothing_can_be_written(
+def test_a_finished_run_can_be_read_from_a_read_only_file_system(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     once = pipeline(tmp_path / "run", Recipe(), [])
@@ -283,10 +284,10 @@ def test_a_finished_run_can_be_read_where_nothing_can_be_written(
     assert toy.bits(pipeline(tmp_path / "run", Recipe(), [])) == toy.bits(once)
 
 
-# The capture's key ----------------------------------------------------------------------------------------------------
+# Keys of captures -----------------------------------------------------------------------------------------------------
 
 
-def a_capture() -> Capture:
+def make_capture() -> Capture:
     torch.manual_seed(0)
     images, masks = torch.randint(0, 255, (2, 6, 8, 3)).to(torch.uint8), torch.full((2, 6, 8), 255, dtype=torch.uint8)
     poses = Trajectory(SE3.exp(torch.randn(2, 6)), "camera")
@@ -299,29 +300,29 @@ def changed(x: Tensor) -> Tensor:
     return y
 
 
-def test_all_that_a_method_may_see_decides_the_captures_key() -> None:
-    capture = a_capture()
-    poses, lens = capture.trajectory, capture.camera
+def test_the_key_of_a_capture_depends_on_every_field() -> None:
+    capture = make_capture()
+    poses, camera = capture.trajectory, capture.camera
     assert poses is not None
     variants = [
         capture,
         replace(capture, images=changed(capture.images)),
         replace(capture, masks=changed(capture.masks)),
-        replace(capture, camera=replace(lens, fx_fy_cx_cy=changed(lens.fx_fy_cx_cy))),
+        replace(capture, camera=replace(camera, fx_fy_cx_cy=changed(camera.fx_fy_cx_cy))),
         replace(capture, trajectory=None),
         replace(
             capture, trajectory=replace(poses, T_cam_obj=replace(poses.T_cam_obj, xyz=changed(poses.T_cam_obj.xyz)))
         ),
         replace(capture, light="object", trajectory=replace(poses, light="object")),
         replace(capture, names=("0.png", "2.png")),
-        replace(capture, focal_guessed=True),
+        replace(capture, focal_assumed=True),
     ]
     keys = [content_key(variant) for variant in variants]
     assert len(set(keys)) == len(keys)
-    assert content_key(a_capture()) == keys[0]
+    assert content_key(make_capture()) == keys[0]
 
 
-def test_truth_never_enters_the_captures_key(tmp_path: Path) -> None:
+def test_the_key_of_a_capture_does_not_depend_on_ground_truth(tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(1, 255, (6, 8, 3), dtype=np.uint8)
     pose = np.eye(4)
     pose[2, 3] = 4.0
@@ -341,6 +342,6 @@ def test_truth_never_enters_the_captures_key(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "truth")
     assert content_key(datasets_folder.load(tmp_path)) == before
     files.write_png(tmp_path / "images" / "1.png", 255 - pixels)
-    assert content_key(datasets_folder.load(tmp_path)) == before, "evaluation views are truth"
+    assert content_key(datasets_folder.load(tmp_path)) == before, "evaluation views belong to the ground truth"
     files.write_png(tmp_path / "images" / "0.png", 255 - pixels)
     assert content_key(datasets_folder.load(tmp_path)) != before

@@ -1,6 +1,7 @@
-"""Scores of whole predictions: perfect for the truth, as expected for known damage, clear words for broken files.
+"""Scores of whole predictions: perfect for the truth, as computed for known errors, clear messages for broken files.
 
-The capture is a sphere of radius 1 drawn in closed form: 6 training frames, 3 views of region shared and 2 of sphere.
+The capture is a sphere of radius 1 rendered in closed form: 6 training frames, 3 views of region "shared" and 2 of
+region "sphere".
 """
 
 import dataclasses
@@ -90,15 +91,15 @@ def synthetic() -> tuple[Capture, Truth]:
 
 @pytest.fixture(scope="module")
 def capture_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("captures") / "ball"
+    path = tmp_path_factory.mktemp("captures") / "sphere"
     _capture_folder.save_capture(path, *synthetic(), setting="handheld")
     return path
 
 
 @pytest.fixture(scope="module")
 def perfect_path(capture_path: Path) -> Path:
-    """The truth as a prediction folder; copy it before breaking it."""
-    the_truth(capture_path).write(capture_path.parent / "perfect")
+    """The truth as a prediction folder, shared by tests: copy it before changing it."""
+    perfect_prediction(capture_path).write(capture_path.parent / "perfect")
     return capture_path.parent / "perfect"
 
 
@@ -109,8 +110,8 @@ def load(path: Path) -> tuple[Capture, Truth]:
     return folder.load(path), truth
 
 
-def the_truth(path: Path) -> Prediction:
-    """A prediction that knows everything."""
+def perfect_prediction(path: Path) -> Prediction:
+    """The prediction that equals the truth in all parts."""
     capture, truth = load(path)
     return Prediction(
         albedo=truth.albedo,
@@ -126,28 +127,28 @@ def the_truth(path: Path) -> Prediction:
 
 
 def score(capture_path: Path, **changes: Any) -> dict[str, Any]:
-    """The scores of the truth with some parts changed; without LPIPS, which takes most of the time."""
-    changed = dataclasses.replace(the_truth(capture_path), **changes)
+    """Scores of the truth with some parts changed; without LPIPS, which takes most of the time."""
+    changed = dataclasses.replace(perfect_prediction(capture_path), **changes)
     return evaluate.compare(changed, *load(capture_path), [])
 
 
-def everything(report: dict[str, Any]) -> dict[str, float]:
-    """All numbers of the report but those of single views."""
+def all_scores(report: dict[str, Any]) -> dict[str, float]:
+    """All scores of the report except those of single views."""
     parts = {**report["regions"], "light": report["light"], "poses": report["poses"]}
     return {f"{part}: {key}": value for part, scores in parts.items() for key, value in scores.items()}
 
 
 def perfect(key: str) -> float | None:
-    """The best value of a number, by its name; None when it is not a score."""
-    worst_first = {"psnr": 100.0, "ssim": 1.0, "iou": 1.0, "correlation": 1.0, "percent": 100.0, "lost": 0.0}
-    best = {**worst_first, "lpips": 0.0, "degrees": 0.0, "rmse": 0.0, "ate": 0.0, "rpe": 0.0}
+    """The best value of a score, by its key; None for numbers that are no scores."""
+    high = {"psnr": 100.0, "ssim": 1.0, "iou": 1.0, "correlation": 1.0, "percent": 100.0, "lost": 0.0}
+    best = {**high, "lpips": 0.0, "degrees": 0.0, "rmse": 0.0, "ate": 0.0, "rpe": 0.0}
     return next((value for word, value in best.items() if word in key), None)
 
 
-def assert_perfect(report: dict[str, Any], *, but: tuple[str, ...] = ()) -> None:
-    for key, value in everything(report).items():
-        if not any(word in key for word in but) and perfect(key) is not None:
-            # Poses go through quaternions and matrices in float32; one degree has 3e6 of its roundings.
+def assert_perfect(report: dict[str, Any], *, except_for: tuple[str, ...] = ()) -> None:
+    for key, value in all_scores(report).items():
+        if not any(word in key for word in except_for) and perfect(key) is not None:
+            # Poses are converted between quaternions and matrices in float32, which rounds at 1e-6 degrees.
             assert value == pytest.approx(perfect(key), abs=2e-4), key
 
 
@@ -162,7 +163,7 @@ def test_the_truth_is_a_perfect_prediction(capture_path: Path, perfect_path: Pat
     assert report["poses"]["poses.alignment"]["identity"] is True
     assert report["regions"].keys() == {"shared", "sphere"}
     assert [row["region"] for row in report["views"]] == list(REGIONS)
-    assert len(everything(report)) > 60
+    assert len(all_scores(report)) > 60
 
 
 def test_a_brighter_albedo_under_a_darker_light_is_perfect_after_the_scale(capture_path: Path) -> None:
@@ -172,7 +173,7 @@ def test_a_brighter_albedo_under_a_darker_light_is_perfect_after_the_scale(captu
     darker = Environment.from_radiance(truth.light.radiance / 1.1)
     report = score(capture_path, albedo=truth.albedo * 1.1, light=darker)
     assert report["albedo_scale"] == pytest.approx([1 / 1.1] * 3, rel=1e-6)
-    assert_perfect(report, but=("unscaled",))
+    assert_perfect(report, except_for=("unscaled",))
     for region in ("shared", "sphere"):
         errors = [(0.1 * truth.albedo[i][truth.foreground[i]]).square().mean() for i in truth.views(region)]
         expected = np.mean([-10 * math.log10(error) for error in errors])
@@ -190,11 +191,11 @@ def test_normals_turned_by_two_degrees_score_two_degrees(capture_path: Path) -> 
         assert scores["normal.mean_fg_degrees"] == pytest.approx(2, abs=1e-4)
         assert scores["normal.median_fg_degrees"] == pytest.approx(2, abs=1e-4)
         assert scores["normal.mean_all_degrees"] == pytest.approx(2 * share, abs=1e-4)
-    assert_perfect(report, but=("normal",))
+    assert_perfect(report, except_for=("normal",))
 
 
 def test_damage_in_one_region_leaves_the_other_perfect(capture_path: Path) -> None:
-    truth = the_truth(capture_path)
+    truth = perfect_prediction(capture_path)
     assert truth.roughness is not None
     assert truth.images is not None
     roughness, images = truth.roughness.clone(), truth.images.clone()
@@ -203,14 +204,14 @@ def test_damage_in_one_region_leaves_the_other_perfect(capture_path: Path) -> No
     report = score(capture_path, roughness=roughness, images=images)
     assert report["regions"]["shared"]["roughness.rmse_fg"] == 0
     assert report["regions"]["shared"]["image.psnr_full_srgb"] == 100
-    # The mean over two views, of which one is perfect.
+    # The mean over two views, one of which is perfect.
     assert report["regions"]["sphere"]["roughness.rmse_fg"] == pytest.approx(0.05, abs=1e-6)
     assert report["regions"]["sphere"]["image.psnr_full_srgb"] < 70
 
 
-def test_relit_pictures_are_taken_as_they_are_and_averaged_over_lights(capture_path: Path) -> None:
-    """Ten code values off under one light of two: 20 log10(255 / 10) dB there, and the mean with 100 dB in all."""
-    truth = the_truth(capture_path)
+def test_relit_images_are_scored_unscaled_and_averaged_over_lights(capture_path: Path) -> None:
+    """Ten code values off under one of two lights: 20 log10(255 / 10) dB there, and the mean of that and 100 dB."""
+    truth = perfect_prediction(capture_path)
     off = {**truth.relit, "sun": truth.relit["sun"] + 10 * truth.masks[..., None].to(torch.uint8)}
     report = score(capture_path, relit=off, albedo=truth.albedo * 0.5)
     shared = report["regions"]["shared"]
@@ -220,7 +221,7 @@ def test_relit_pictures_are_taken_as_they_are_and_averaged_over_lights(capture_p
 
 
 def test_without_masks_the_silhouette_is_where_the_albedo_is_not_black(capture_path: Path) -> None:
-    truth = the_truth(capture_path)
+    truth = perfect_prediction(capture_path)
     assert truth.albedo is not None
     albedo = truth.albedo.clone()
     albedo[:, :, SIZE // 2 :] = 0
@@ -229,14 +230,14 @@ def test_without_masks_the_silhouette_is_where_the_albedo_is_not_black(capture_p
 
 
 def turned(path: Trajectory, omega: Tensor) -> Trajectory:
-    """Poses turned in the object frame."""
+    """Poses rotated in the object frame."""
     turns = SE3.from_rotation(SO3.exp(omega), torch.zeros(len(path), 3))
     return Trajectory(path.T_cam_obj @ turns, path.light)
 
 
 def test_poses_turned_by_three_degrees_each_are_off_by_nearly_that(capture_path: Path) -> None:
-    """Six opposite axes have no turn in common, so that alignment takes nothing away: every error is 3 degrees."""
-    truth = the_truth(capture_path)
+    """The mean of rotations about six opposite axes is the identity, so alignment leaves every error at 3 degrees."""
+    truth = perfect_prediction(capture_path)
     assert truth.poses is not None
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
     report = score(capture_path, poses=turned(truth.poses, math.radians(3) * axes))
@@ -245,14 +246,14 @@ def test_poses_turned_by_three_degrees_each_are_off_by_nearly_that(capture_path:
     assert poses["poses.rotation_median_degrees"] == pytest.approx(3, abs=1e-3)
     assert poses["poses.rotation_below_2_percent"] == 0
     assert poses["poses.rotation_below_5_percent"] == 100
-    # A camera 4 away moves by 4 * 2 sin(1.5 deg) = 0.209 at most, and alignment can only lessen it.
+    # A camera 4 away moves by 4 * 2 sin(1.5 deg) = 0.209 at most, and alignment can only reduce it.
     assert 0.05 < poses["poses.ate"] < 0.21
     assert poses["poses.tolerance"] == pytest.approx(0.4, abs=1e-5)
-    assert_perfect(report, but=("poses",))
+    assert_perfect(report, except_for=("poses",))
 
 
-def test_a_common_turn_and_another_unit_of_all_poses_are_no_error(capture_path: Path) -> None:
-    truth = the_truth(capture_path)
+def test_a_common_rotation_and_unit_of_all_poses_are_no_error(capture_path: Path) -> None:
+    truth = perfect_prediction(capture_path)
     assert truth.poses is not None
     poses = turned(truth.poses, torch.tensor([0.0, math.radians(3), 0.0]).expand(6, 3))
     poses = Trajectory(SE3(poses.T_cam_obj.wxyz, 0.25 * poses.T_cam_obj.xyz), "camera")
@@ -265,7 +266,7 @@ def test_a_common_turn_and_another_unit_of_all_poses_are_no_error(capture_path: 
 
 
 def test_lost_frames_are_counted(capture_path: Path) -> None:
-    truth = the_truth(capture_path)
+    truth = perfect_prediction(capture_path)
     assert truth.poses is not None
     kept = [0, 1, 2, 5]
     names = tuple(truth.pose_names[i] for i in kept)
@@ -278,18 +279,18 @@ def test_lost_frames_are_counted(capture_path: Path) -> None:
 
 
 def rewritten(root: Path, change: Callable[[dict[str, Any]], None]) -> Path:
-    """A copy of the capture with another transforms.json."""
+    """A copy of the capture with a changed transforms.json."""
     capture, truth = synthetic()
-    _capture_folder.save_capture(root / "ball", capture, truth, setting="handheld")
-    document = json.loads((root / "ball" / "transforms.json").read_text())
+    _capture_folder.save_capture(root / "sphere", capture, truth, setting="handheld")
+    document = json.loads((root / "sphere" / "transforms.json").read_text())
     change(document)
-    (root / "ball" / "transforms.json").write_text(json.dumps(document))
-    return root / "ball"
+    (root / "sphere" / "transforms.json").write_text(json.dumps(document))
+    return root / "sphere"
 
 
 def test_in_metres_the_tolerance_is_ten_centimetres(tmp_path: Path) -> None:
     metric = rewritten(tmp_path, lambda document: document.update(units="m"))
-    truth = the_truth(metric)
+    truth = perfect_prediction(metric)
     Prediction(poses=truth.poses, pose_names=truth.pose_names).write(tmp_path / "mine")
     report = evaluate.score(tmp_path / "mine", metric, tmp_path / "out")
     assert report["poses"]["poses.tolerance"] == 0.1
@@ -302,7 +303,7 @@ def test_an_unknown_unit_is_refused(tmp_path: Path, perfect_path: Path) -> None:
         evaluate.score(perfect_path, inches, tmp_path / "out")
 
 
-def test_positions_on_a_line_are_not_scored_and_the_report_says_why(tmp_path: Path) -> None:
+def test_positions_on_a_line_are_not_scored_and_a_note_gives_the_reason(tmp_path: Path) -> None:
     capture, truth = synthetic()
     xyz = torch.tensor([0.0, 0.0, 4.0]) + torch.linspace(0, 1, 6)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     line = Trajectory(SE3.from_rotation(SO3.identity((6,)), xyz), "camera")
@@ -310,8 +311,8 @@ def test_positions_on_a_line_are_not_scored_and_the_report_says_why(tmp_path: Pa
         dataclasses.replace(capture, trajectory=line),
         dataclasses.replace(truth, poses=line),
     )
-    _capture_folder.save_capture(tmp_path / "ball", capture, truth)
-    report = score(tmp_path / "ball")
+    _capture_folder.save_capture(tmp_path / "sphere", capture, truth)
+    report = score(tmp_path / "sphere")
     assert report["poses"]["poses.ate"] is None
     assert report["poses"]["poses.auc_percent"] is None
     assert report["poses"]["poses.rpe_translation"] is None
@@ -319,21 +320,21 @@ def test_positions_on_a_line_are_not_scored_and_the_report_says_why(tmp_path: Pa
     assert any("nearly on a line" in note for note in report["notes"])
 
 
-def test_unknown_pixels_count_nowhere(tmp_path: Path) -> None:
+def test_unknown_pixels_change_no_score(tmp_path: Path) -> None:
     capture, truth = synthetic()
     masks = truth.masks.clone()
     masks[:, 10:14] = UNKNOWN
-    _capture_folder.save_capture(tmp_path / "ball", capture, dataclasses.replace(truth, masks=masks))
-    good = the_truth(tmp_path / "ball")
+    _capture_folder.save_capture(tmp_path / "sphere", capture, dataclasses.replace(truth, masks=masks))
+    good = perfect_prediction(tmp_path / "sphere")
     assert good.albedo is not None
     assert good.normals is not None
-    spoilt = {"albedo": good.albedo.clone(), "normals": good.normals.clone()}
-    for values in spoilt.values():
+    damaged = {"albedo": good.albedo.clone(), "normals": good.normals.clone()}
+    for values in damaged.values():
         values[:, 10:14] = 0.3
-    assert_perfect(score(tmp_path / "ball", **spoilt, masks=None))
+    assert_perfect(score(tmp_path / "sphere", **damaged, masks=None))
 
 
-# What is absent, what is broken ---------------------------------------------------------------------------------------
+# Absent and broken parts ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("part", ["albedo", "normals", "roughness", "images", "relit", "light", "poses"])
@@ -344,12 +345,12 @@ def test_an_absent_part_is_noted_and_the_rest_is_scored(capture_path: Path, part
     report = score(capture_path, **changes)
     word = {"normals": "normal", "images": "image"}.get(part, part)
     assert any(note.startswith(word) and "absent from the prediction" in note for note in report["notes"])
-    assert not any(key.split(": ")[1].startswith(word) for key in everything(report))
+    assert not any(key.split(": ")[1].startswith(word) for key in all_scores(report))
     assert_perfect(report)
 
 
 def test_a_single_part_is_enough(capture_path: Path, tmp_path: Path) -> None:
-    Prediction(light=the_truth(capture_path).light).write(tmp_path / "mine")
+    Prediction(light=perfect_prediction(capture_path).light).write(tmp_path / "mine")
     report = evaluate.score(tmp_path / "mine", capture_path, tmp_path / "out")
     assert report["light"]["light.rmse_clip10"] == pytest.approx(0, abs=1e-6)
     assert report["regions"] == {"shared": {}, "sphere": {}}
@@ -359,9 +360,9 @@ def test_a_single_part_is_enough(capture_path: Path, tmp_path: Path) -> None:
 
 def test_a_capture_without_evaluation_views_still_scores_poses(tmp_path: Path) -> None:
     capture, _ = synthetic()
-    _capture_folder.save_capture(tmp_path / "ball", capture)
+    _capture_folder.save_capture(tmp_path / "sphere", capture)
     Prediction(poses=capture.trajectory, pose_names=capture.names).write(tmp_path / "mine")
-    report = evaluate.score(tmp_path / "mine", tmp_path / "ball", tmp_path / "out")
+    report = evaluate.score(tmp_path / "mine", tmp_path / "sphere", tmp_path / "out")
     assert report["poses"]["poses.ate"] == pytest.approx(0, abs=1e-5)
     assert report["regions"] == {}
 
@@ -411,18 +412,18 @@ BROKEN = {
     r"albedo/0001\.exr: holds NaN": break_nan,
     r"albedo/0001\.exr: holds a negative albedo, -0\.5": break_negative,
     r"roughness/0000\.exr: holds roughness from 1\.5": break_roughness,
-    r"roughness/0000\.exr: has 3 channels, roughness has 1": break_channels,
+    r"roughness/0000\.exr: has 3 channels, roughness needs 1": break_channels,
     r"image/0005\.png: is not one of the 5 evaluation views": break_surplus,
-    r"relit/sun/0003\.png: has 1 channels, sun has 3": break_grey,
+    r"relit/sun/0003\.png: has 1 channels, sun needs 3": break_grey,
     r"image/0004\.png: is missing": lambda root: (root / "image" / "0004.png").unlink(),
-    r"light\.exr: a lat-long light map is RGB and twice as wide as high": break_light,
+    r"light\.exr: an equirectangular environment map must be RGB and twice as wide as high": break_light,
     r"poses\.json: frame 0000\.png: .* not a rotation": break_pose,
     r"poses\.json: has a pose for 0006\.png, which is not a training frame": break_name,
 }
 
 
 @pytest.mark.parametrize("message", BROKEN)
-def test_a_broken_file_is_named_with_its_rule_and_nothing_is_written(
+def test_the_error_names_the_broken_file_and_its_rule_and_nothing_is_written(
     capture_path: Path, perfect_path: Path, tmp_path: Path, message: str
 ) -> None:
     shutil.copytree(perfect_path, tmp_path / "mine")
@@ -442,16 +443,16 @@ def test_an_empty_folder_and_no_folder_are_refused(capture_path: Path, tmp_path:
 
 def test_a_capture_without_truth_is_refused(tmp_path: Path) -> None:
     capture, _ = synthetic()
-    _capture_folder.save_capture(tmp_path / "ball", dataclasses.replace(capture, trajectory=None))
+    _capture_folder.save_capture(tmp_path / "sphere", dataclasses.replace(capture, trajectory=None))
     with pytest.raises(BadFile, match="has no truth"):
-        evaluate.score(tmp_path / "mine", tmp_path / "ball", tmp_path / "out")
+        evaluate.score(tmp_path / "mine", tmp_path / "sphere", tmp_path / "out")
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
 def test_a_prediction_comes_back_as_it_was_written(capture_path: Path, tmp_path: Path) -> None:
-    written = the_truth(capture_path)
+    written = perfect_prediction(capture_path)
     written.write(tmp_path / "mine")
     again = Prediction.read(tmp_path / "mine", *load(capture_path))
     for name in ("albedo", "normals", "roughness", "masks", "images"):
@@ -468,7 +469,7 @@ def test_a_prediction_comes_back_as_it_was_written(capture_path: Path, tmp_path:
 
 
 def test_writing_again_replaces_all_parts_and_leaves_other_files(capture_path: Path, tmp_path: Path) -> None:
-    written = the_truth(capture_path)
+    written = perfect_prediction(capture_path)
     written.write(tmp_path / "mine")
     (tmp_path / "mine" / "notes.txt").write_text("keep me")
     Prediction(roughness=written.roughness).write(tmp_path / "mine")
@@ -491,7 +492,7 @@ def test_the_report_on_disk_is_the_one_returned_and_the_same_every_time(
 def test_every_score_has_a_protocol(capture_path: Path, perfect_path: Path, tmp_path: Path) -> None:
     report = evaluate.score(perfect_path, capture_path, tmp_path)
     facts = {"poses.posed_frames", "poses.lost_frames", "poses.tolerance", "poses.alignment"}
-    keys = {key.split(": ")[1] for key in everything(report)}
+    keys = {key.split(": ")[1] for key in all_scores(report)}
     assert keys - facts == set(report["protocol"])
     assert "foreground pixels only" in report["protocol"]["albedo.psnr_fg_linear"]
     assert "alex features" in report["protocol"]["relit.sun.lpips_full_srgb_alex"]
@@ -504,18 +505,18 @@ def test_the_documentation_names_every_score() -> None:
         assert any(name in text for name in (key, word, key.partition("_below")[0])), key
 
 
-def test_vgg_numbers_join_those_of_alexnet(capture_path: Path, tmp_path: Path, shared_data: Path) -> None:
-    Prediction(images=the_truth(capture_path).images).write(tmp_path / "mine")
+def test_vgg_scores_are_added_to_those_of_alexnet(capture_path: Path, tmp_path: Path, shared_data: Path) -> None:
+    Prediction(images=perfect_prediction(capture_path).images).write(tmp_path / "mine")
     weights = shared_data / "lpips" / "lpips_vgg_v01_f16.npz"
     report = evaluate.score(tmp_path / "mine", capture_path, tmp_path / "out", vgg=weights)
     assert report["regions"]["shared"]["image.lpips_full_srgb_vgg"] == 0
     assert "vgg features" in report["protocol"]["image.lpips_full_srgb_vgg"]
 
 
-def test_folders_of_a_run_go_by_the_names_of_their_runs(capture_path: Path, tmp_path: Path) -> None:
-    """`RUN/prediction` and `RUN/capture` would name nothing."""
+def test_folders_of_a_run_are_reported_under_the_name_of_the_run(capture_path: Path, tmp_path: Path) -> None:
+    """The names `prediction` and `capture` would not identify the run."""
     shutil.copytree(capture_path, tmp_path / "runs" / "pot" / "capture")
-    Prediction(light=the_truth(capture_path).light).write(tmp_path / "runs" / "mug" / "prediction")
+    Prediction(light=perfect_prediction(capture_path).light).write(tmp_path / "runs" / "mug" / "prediction")
     report = evaluate.score(
         tmp_path / "runs" / "mug" / "prediction", tmp_path / "runs" / "pot" / "capture", tmp_path / "out"
     )

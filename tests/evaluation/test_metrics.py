@@ -1,4 +1,4 @@
-"""Every metric against its published definition, another implementation, or a case worked out by hand."""
+"""Each metric against its published definition, another implementation, or a case computed by hand."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ from tumble.scene.trajectory import Trajectory
 GREY = 0.5
 
 
-def pictures(height: int = 40, width: int = 50) -> tuple[Tensor, Tensor]:
+def images(height: int = 40, width: int = 50) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(3)
     y = torch.rand(height, width, 3, generator=generator)
     return (y + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1), y
@@ -36,23 +36,23 @@ def everywhere(mask: Tensor) -> Tensor:
     return torch.ones_like(mask)
 
 
-# Pictures -------------------------------------------------------------------------------------------------------------
+# Images ---------------------------------------------------------------------------------------------------------------
 
 
 def test_psnr_is_that_of_scikit_image() -> None:
-    x, y = pictures()
+    x, y = images()
     expected = skimage_metrics.peak_signal_noise_ratio(y.numpy(), x.numpy(), data_range=1)
     # One ulp of a float32 mean is 1e-6 dB.
     assert metrics.psnr(x, y, everywhere(disc())) == pytest.approx(expected, abs=1e-4)
 
 
-def test_equal_pictures_have_the_best_psnr() -> None:
-    _, y = pictures()
-    assert metrics.psnr(y, y, disc()) == metrics.BEST_PSNR
+def test_equal_images_have_the_best_psnr() -> None:
+    _, y = images()
+    assert metrics.psnr(y, y, disc()) == metrics.MAX_PSNR
 
 
-def test_full_picture_psnr_exceeds_that_of_the_foreground_by_the_share_of_background() -> None:
-    """With no error off the object, the two differ by -10 log10(share): why a table must say which one it shows."""
+def test_full_image_psnr_exceeds_that_of_the_foreground_by_the_share_of_background() -> None:
+    """With no error off the object, the two differ by -10 log10(fraction of object pixels)."""
     mask = disc()
     y = GREY * mask[..., None].float().expand(-1, -1, 3)
     scores = metrics.image_scores(y * 1.1, y, mask, everywhere(mask), [])
@@ -61,8 +61,8 @@ def test_full_picture_psnr_exceeds_that_of_the_foreground_by_the_share_of_backgr
     assert scores["psnr_full_srgb"] - scores["psnr_fg_srgb"] == pytest.approx(-10 * math.log10(share), abs=1e-4)
 
 
-def test_ssim_is_that_of_scikit_image_on_picture_and_crop() -> None:
-    x, y = pictures()
+def test_ssim_is_that_of_scikit_image_on_image_and_crop() -> None:
+    x, y = images()
     mask = disc(radius=4.5)
     scores = metrics.image_scores(x, y, mask, everywhere(mask), [])
 
@@ -77,13 +77,13 @@ def test_ssim_is_that_of_scikit_image_on_picture_and_crop() -> None:
 
 
 def test_unknown_pixels_change_no_score() -> None:
-    x, y = pictures(64, 64)
+    x, y = images(64, 64)
     mask = disc(64, 64)
     unknown = torch.zeros_like(mask)
     unknown[10:20, 10:50] = True
-    spoilt = torch.where(unknown[..., None], 1 - x, x)
+    damaged = torch.where(unknown[..., None], 1 - x, x)
     network = lpips.read()
-    before, after = (metrics.image_scores(p, y, mask & ~unknown, ~unknown, [network]) for p in (x, spoilt))
+    before, after = (metrics.image_scores(p, y, mask & ~unknown, ~unknown, [network]) for p in (x, damaged))
     assert before == after
 
 
@@ -91,14 +91,14 @@ def test_unknown_pixels_change_no_score() -> None:
 
 
 def slow_lpips(network: lpips.Network, x: np.ndarray, y: np.ndarray, plan: list[str]) -> float:
-    """The published formula in numpy, by a plan of words: "3/2" pools 3 wide by 2, "4:2" convolves by 4 with padding 2,
-    "!" takes the features."""
+    """The published formula in numpy. In `plan`, "3/2" is a max-pooling with window 3 and stride 2, "4:2" a convolution
+    with stride 4 and padding 2, and "!" takes the features."""
 
     def windows(x: np.ndarray, size: int, stride: int) -> np.ndarray:
         return np.lib.stride_tricks.sliding_window_view(x, (size, size), (1, 2))[:, ::stride, ::stride]
 
-    def taps(picture: np.ndarray) -> list[np.ndarray]:
-        x = (2 * picture - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
+    def taps(image: np.ndarray) -> list[np.ndarray]:
+        x = (2 * image - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
         x, taps, number = x.transpose(2, 0, 1), [], 0
         for word in plan:
             if word == "!":
@@ -126,7 +126,7 @@ VGG = [*["1:1"] * 2, "!", "2/2", *["1:1"] * 2, "!", "2/2", *["1:1"] * 3, "!"] + 
 
 
 def test_lpips_is_the_published_formula() -> None:
-    x, y = (picture.double() for picture in pictures(70, 90))
+    x, y = (image.double() for image in images(70, 90))
     network = lpips.read()
     expected = slow_lpips(network, x.numpy(), y.numpy(), ALEX)
     assert expected > 0.01
@@ -134,7 +134,7 @@ def test_lpips_is_the_published_formula() -> None:
 
 
 def test_lpips_with_vgg_is_the_published_formula(shared_data: Path) -> None:
-    x, y = (picture.double() for picture in pictures(64, 64))
+    x, y = (image.double() for image in images(64, 64))
     network = lpips.read(shared_data / "lpips" / "lpips_vgg_v01_f16.npz")
     expected = slow_lpips(network, x.numpy(), y.numpy(), VGG)
     assert network.name == "vgg"
@@ -143,21 +143,21 @@ def test_lpips_with_vgg_is_the_published_formula(shared_data: Path) -> None:
 
 @pytest.mark.parametrize(("name", "published"), [("ex_p0", 0.7219), ("ex_p1", 0.1376)])
 def test_lpips_of_the_published_examples(shared_data: Path, name: str, published: float) -> None:
-    reference, picture = (
+    reference, image = (
         torch.from_numpy(np.asarray(Image.open(shared_data / "lpips" / f"{n}.png")) / 255.0) for n in ("ex_ref", name)
     )
     # Half a unit of the last printed digit, and as much for weights rounded to 16 bits (3e-5 measured).
-    assert float(lpips.distance(lpips.read(), reference, picture)) == pytest.approx(published, abs=1e-4)
+    assert float(lpips.distance(lpips.read(), reference, image)) == pytest.approx(published, abs=1e-4)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 40), (31, 31), (63, 64)])
-def test_lpips_of_small_pictures_is_that_of_the_enlarged_ones(size: tuple[int, int]) -> None:
-    x, y = pictures(*size)
+def test_lpips_of_small_images_is_that_of_the_enlarged_ones(size: tuple[int, int]) -> None:
+    x, y = images(*size)
     network = lpips.read()
     factor = math.ceil(64 / min(size))
 
-    def enlarged(picture: Tensor) -> Tensor:
-        planes = picture.permute(2, 0, 1)[None]
+    def enlarged(image: Tensor) -> Tensor:
+        planes = image.permute(2, 0, 1)[None]
         planes = torch.nn.functional.interpolate(planes, [factor * side for side in size], mode="bilinear")
         return planes[0].permute(1, 2, 0)
 
@@ -209,8 +209,8 @@ def test_albedo_scale_is_the_median_ratio_over_all_views_together() -> None:
     torch.testing.assert_close(metrics.albedo_scale(predicted, truth, mask), expected)
 
 
-def test_albedo_scale_looks_away_from_dark_pixels() -> None:
-    """Black ink and holes in the prediction have ratios of 0 and infinity."""
+def test_albedo_scale_ignores_dark_pixels() -> None:
+    """Ratios of black ink and of holes in the prediction are near 0 and infinite."""
     truth, mask = albedos()
     predicted = truth * 2
     truth, predicted = truth.clone(), predicted.clone()
@@ -220,7 +220,7 @@ def test_albedo_scale_looks_away_from_dark_pixels() -> None:
 
 
 def test_a_channel_without_bright_pixels_takes_the_scale_of_the_others() -> None:
-    """A red toy says nothing about blue; the geometric mean of the others keeps the common factor."""
+    """A red object does not determine the scale of blue; the geometric mean of the others keeps the common factor."""
     truth, mask = albedos()
     predicted = truth * torch.tensor([2.0, 0.5, 4.0])
     dark = torch.tensor([1.0, 1.0, 0.01])
@@ -234,12 +234,12 @@ def test_a_black_prediction_has_no_albedo_scale() -> None:
         metrics.albedo_scale(torch.zeros_like(truth), truth, mask)
 
 
-def test_albedo_scores_follow_the_scale() -> None:
+def test_albedo_scores_use_the_scale() -> None:
     truth, mask = albedos()
     view = (truth[0] * 1.1, truth[0], mask[0], torch.full((3,), 1 / 1.1), mask[0], everywhere(mask[0]), [])
     scores = metrics.albedo_scores(*view)
     # What 1.1 / 1.1 leaves in float32 is 1e-7, or 140 dB.
-    assert scores["psnr_fg_linear"] == scores["psnr_full_linear"] == metrics.BEST_PSNR
+    assert scores["psnr_fg_linear"] == scores["psnr_full_linear"] == metrics.MAX_PSNR
     error = (0.1 * truth[0][mask[0]]).square().mean()
     assert scores["psnr_fg_linear_unscaled"] == pytest.approx(-10 * math.log10(error), abs=1e-4)
     linear = skimage_metrics.peak_signal_noise_ratio(truth[0].numpy() * 0.5, truth[0].numpy(), data_range=1)
@@ -248,13 +248,13 @@ def test_albedo_scores_follow_the_scale() -> None:
     assert halved["psnr_full_linear"] == pytest.approx(linear, abs=1e-4)
 
 
-def test_a_silhouette_cuts_the_picture_of_the_albedo_but_not_its_map() -> None:
+def test_the_silhouette_masks_the_albedo_in_full_but_not_in_foreground_metrics() -> None:
     truth, mask = albedos()
     half, everything = mask[0].clone(), everywhere(mask[0])
     half[:, : half.shape[1] // 2] = False
     beyond = torch.where(mask[0][..., None], truth[0], 0.7)
     scores = metrics.albedo_scores(beyond, truth[0], half, torch.ones(3), mask[0], everything, [])
-    assert scores["psnr_fg_srgb"] == scores["psnr_fg_linear"] == metrics.BEST_PSNR
+    assert scores["psnr_fg_srgb"] == scores["psnr_fg_linear"] == metrics.MAX_PSNR
     missing = truth[0][mask[0] & ~half].square().sum() / truth[0].numel()
     assert scores["psnr_full_linear"] == pytest.approx(-10 * math.log10(missing), abs=1e-3)
 
@@ -265,14 +265,14 @@ def normals(dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def turned(normals: Tensor, degrees: float) -> Tensor:
-    """Each normal turned about an axis of its own that is perpendicular to it."""
+    """Each normal rotated about its own perpendicular axis."""
     axis = torch.linalg.cross(normals, torch.roll(normals, 1, 0))
     return SO3.exp(torch.nn.functional.normalize(axis, dim=-1) * math.radians(degrees)) @ normals
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("degrees", [0.01, 2.0, 179.0])
-def test_normals_turned_by_an_angle_are_off_by_it(dtype: torch.dtype, degrees: float) -> None:
+def test_the_error_of_rotated_normals_is_their_angle(dtype: torch.dtype, degrees: float) -> None:
     mask = disc()
     scores = metrics.normal_scores(turned(normals(dtype), degrees), normals(dtype), mask, everywhere(mask))
     assert scores["mean_fg_degrees"] == pytest.approx(degrees, abs=2e-5)
@@ -280,8 +280,8 @@ def test_normals_turned_by_an_angle_are_off_by_it(dtype: torch.dtype, degrees: f
     assert scores["mean_all_degrees"] == pytest.approx(degrees * float(mask.float().mean()), abs=2e-5)
 
 
-def test_normals_rounded_to_half_precision_are_as_good_as_equal() -> None:
-    """Rounding to 11 bits moves a unit vector by at most 0.024 degrees; an arccos would make 0.4 of it."""
+def test_normals_rounded_to_half_precision_have_small_errors() -> None:
+    """Rounding to 11 bits moves a unit vector by at most 0.024 degrees; an arccos would report 0.4."""
     assert metrics.normal_angles(normals().half().float(), normals()).max() < 0.024
 
 
@@ -321,13 +321,13 @@ def test_uniform_lights_differ_by_their_difference_at_any_size(height: int) -> N
 
 
 def test_the_light_is_divided_by_the_albedo_scale() -> None:
-    """Albedo times light stays what was seen: an albedo of a tenth goes with ten times the light."""
+    """Images fix the product of albedo and light: a tenth of the albedo needs ten times the light."""
     torch.manual_seed(0)
     truth = torch.rand(32, 64, 3)
     assert light_scores(truth * 10, truth, scale=10.0)["rmse_clip10"] == pytest.approx(0, abs=1e-6)
 
 
-def test_light_errors_count_by_solid_angle() -> None:
+def test_light_errors_are_weighted_by_solid_angle() -> None:
     """An error of 1 within 45 degrees of the zenith covers (1 - cos 45) / 2 of the sphere, and a quarter of the map."""
     off = uniform(1.0, 32)
     off[:8] += 1
@@ -360,8 +360,8 @@ def test_log_correlation_is_the_weighted_one_of_numpy() -> None:
 # Trajectories ---------------------------------------------------------------------------------------------------------
 
 
-def a_path(n: int = 30, seed: int = 0) -> Trajectory:
-    """An object tumbling about 4 away from the camera, float64."""
+def random_path(n: int = 30, seed: int = 0) -> Trajectory:
+    """Poses of an object that rotates at a distance of about 4 from the camera, float64."""
     generator = torch.Generator().manual_seed(seed)
     steps = SO3.exp(0.15 * torch.randn(n, 3, generator=generator, dtype=torch.float64))
     rotations = [SO3.exp(torch.randn(3, generator=generator, dtype=torch.float64))]
@@ -371,8 +371,8 @@ def a_path(n: int = 30, seed: int = 0) -> Trajectory:
     return Trajectory(SE3(torch.stack([R.wxyz for R in rotations]), xyz), "camera")
 
 
-def disguised(path: Trajectory, scale: float = 0.3) -> Trajectory:
-    """The same motion, told in another object frame and unit."""
+def reexpressed(path: Trajectory, scale: float = 0.3) -> Trajectory:
+    """The same motion in another object frame and unit."""
     other = metrics.Similarity(
         torch.tensor(scale, dtype=torch.float64),
         SO3.exp(torch.tensor([0.5, -1.2, 2.0], dtype=torch.float64)),
@@ -381,8 +381,8 @@ def disguised(path: Trajectory, scale: float = 0.3) -> Trajectory:
     return other.to_truth(path)
 
 
-def wobbly(path: Trajectory, degrees: float, seed: int = 1) -> Trajectory:
-    """Each pose turned by the same angle about a random axis of its own through the object's origin."""
+def perturbed(path: Trajectory, degrees: float, seed: int = 1) -> Trajectory:
+    """Each pose rotated by the same angle about its own random axis through the object's origin."""
     generator = torch.Generator().manual_seed(seed)
     axes = torch.randn(len(path), 3, generator=generator, dtype=torch.float64)
     turns = SO3.exp(torch.nn.functional.normalize(axes, dim=-1) * math.radians(degrees))
@@ -390,8 +390,8 @@ def wobbly(path: Trajectory, degrees: float, seed: int = 1) -> Trajectory:
 
 
 def test_another_object_frame_and_unit_is_no_error() -> None:
-    truth = a_path()
-    predicted = disguised(truth)
+    truth = random_path()
+    predicted = reexpressed(truth)
     alignment = metrics.align(predicted, truth)
     assert float(alignment.scale) == pytest.approx(1 / 0.3)
     scores = metrics.position_scores(alignment.to_truth(predicted), truth, tolerance=0.1)
@@ -401,9 +401,9 @@ def test_another_object_frame_and_unit_is_no_error() -> None:
         assert value == pytest.approx(100 if "percent" in key else 0, abs=1e-5), key
 
 
-def test_ate_is_the_least_one_that_any_similarity_reaches() -> None:
-    truth = a_path(12)
-    predicted = disguised(wobbly(truth, 10))
+def test_ate_is_the_minimum_over_all_similarities() -> None:
+    truth = random_path(12)
+    predicted = reexpressed(perturbed(truth, 10))
     x, y = (path.camera_positions.numpy() for path in (predicted, truth))
 
     def residuals(p: np.ndarray) -> np.ndarray:
@@ -417,7 +417,7 @@ def test_ate_is_the_least_one_that_any_similarity_reaches() -> None:
 
 
 def test_auc_is_the_area_under_the_recall_curve() -> None:
-    truth = a_path()
+    truth = random_path()
     generator = torch.Generator().manual_seed(2)
     off = torch.randn(30, 3, generator=generator, dtype=torch.float64) * torch.linspace(0, 0.15, 30)[:, None]
     moved = Trajectory(SE3(truth.T_cam_obj.wxyz, truth.T_cam_obj.xyz + off), "camera")
@@ -430,13 +430,13 @@ def test_auc_is_the_area_under_the_recall_curve() -> None:
     assert scores["auc_percent"] == pytest.approx(100 * recall.mean(), abs=5e-3)
 
 
-def test_poses_turned_about_random_axes_have_scipys_error_after_its_mean_rotation() -> None:
-    truth = a_path()
-    predicted = disguised(wobbly(truth, 3.0))
+def test_rotation_errors_equal_those_of_scipy_after_its_mean_rotation() -> None:
+    truth = random_path()
+    predicted = reexpressed(perturbed(truth, 3.0))
     R_true, R_pred = (Rotation.from_matrix(p.T_cam_obj.rotation.inverse().matrix().numpy()) for p in (truth, predicted))
     errors = np.degrees(((R_true * R_pred.inv()).mean().inv() * R_true * R_pred.inv()).magnitude())
     scores = metrics.rotation_scores(predicted, truth)
-    # Alignment takes away at most what the 30 random axes have in common.
+    # Alignment removes at most the mean of the 30 random rotations.
     assert 2.5 < scores["rotation_mean_degrees"] < 3
     assert scores["rotation_mean_degrees"] == pytest.approx(errors.mean(), abs=1e-6)
     assert scores["rotation_median_degrees"] == pytest.approx(np.median(errors), abs=1e-6)
@@ -444,8 +444,8 @@ def test_poses_turned_about_random_axes_have_scipys_error_after_its_mean_rotatio
     assert scores["rotation_below_5_percent"] == 100
 
 
-def test_a_turn_common_to_all_poses_is_no_rotation_error() -> None:
-    truth = a_path()
+def test_a_rotation_common_to_all_poses_is_no_error() -> None:
+    truth = random_path()
     turn = SE3.from_rotation(
         SO3.exp(torch.tensor([0.0, math.radians(3), 0.0], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64)
     )
@@ -454,13 +454,13 @@ def test_a_turn_common_to_all_poses_is_no_rotation_error() -> None:
 
 
 def test_lost_frames_count_as_wrong_rotations() -> None:
-    scores = metrics.rotation_scores(a_path(), a_path(), lost=10)
+    scores = metrics.rotation_scores(random_path(), random_path(), lost=10)
     assert scores["rotation_below_2_percent"] == pytest.approx(75)
 
 
 def test_the_longest_run_ends_at_bad_and_at_lost_frames() -> None:
-    """Frame 5 is turned by 40 degrees, frames 8 and 9 are lost: of 0 1 2 3 4 | 6 7 | 10 11 the first run is longest."""
-    truth = a_path(12)
+    """Frame 5 is rotated by 40 degrees, frames 8 and 9 are lost: so 0 1 2 3 4 is longer than 6 7 and 10 11."""
+    truth = random_path(12)
     kept = [0, 1, 2, 3, 4, 5, 6, 7, 10, 11]
     offset = torch.zeros(10, 6, dtype=torch.float64)
     offset[5, 3] = math.radians(40)
@@ -471,50 +471,50 @@ def test_the_longest_run_ends_at_bad_and_at_lost_frames() -> None:
     assert scores["rotation_longest_run_percent"] == 100
 
 
-def test_registration_puts_the_object_where_cameras_see_it() -> None:
-    """Under drift, shown points stay nearer to the true ones than after the alignment of camera positions."""
-    truth = a_path(40)
+def test_registration_keeps_the_object_in_place_in_the_camera_frame() -> None:
+    """Under drift, object points stay closer to the true ones than after an alignment of camera positions."""
+    truth = random_path(40)
     drift = torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None] * torch.tensor([0.0, 0.2, 0.1], dtype=torch.float64)
     zero = torch.zeros(40, 3, dtype=torch.float64)
-    predicted = disguised(Trajectory(truth.T_cam_obj @ SE3.from_rotation(SO3.exp(drift), zero), "camera"))
+    predicted = reexpressed(Trajectory(truth.T_cam_obj @ SE3.from_rotation(SO3.exp(drift), zero), "camera"))
     x_true = torch.randn(50, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    disguise = metrics.align(truth, disguised(truth))
-    x_pred = disguise.scale * (disguise.R_true_pred @ x_true) + disguise.shift
+    similarity = metrics.align(truth, reexpressed(truth))
+    x_pred = similarity.scale * (similarity.R_true_pred @ x_true) + similarity.shift
 
-    def off(found: metrics.Similarity) -> float:
-        shown = found.to_prediction(truth).T_cam_obj[:, None] @ x_pred * found.scale
-        return float((shown - truth.T_cam_obj[:, None] @ x_true).norm(dim=-1).mean())
+    def mean_error(alignment: metrics.Similarity) -> float:
+        x_cam = alignment.to_prediction(truth).T_cam_obj[:, None] @ x_pred * alignment.scale
+        return float((x_cam - truth.T_cam_obj[:, None] @ x_true).norm(dim=-1).mean())
 
-    assert off(metrics.register(predicted, truth)) < 0.02
-    assert off(metrics.align(predicted, truth)) > 0.05
+    assert mean_error(metrics.register(predicted, truth)) < 0.02
+    assert mean_error(metrics.align(predicted, truth)) > 0.05
 
 
-def test_registration_does_not_follow_a_few_bad_frames() -> None:
-    """Three of forty frames are 10 degrees and a tenth of the object off; the others are exact in another frame."""
-    truth = a_path(40)
-    exact = disguised(truth)
+def test_registration_is_robust_to_a_few_wrong_frames() -> None:
+    """Three of forty frames are off by 10 degrees and a tenth of the object; the others are exact in another frame."""
+    truth = random_path(40)
+    exact = reexpressed(truth)
     damage = torch.zeros(40, 6, dtype=torch.float64)
     damage[:3] = torch.tensor([0.1, 0.05, 0.2, 0.15, 0.13, 0.05])
     found = metrics.register(Trajectory(SE3.exp(damage) @ exact.T_cam_obj, "camera"), truth)
     known = metrics.align(exact, truth)
-    assert float(angle_between(found.R_true_pred, known.R_true_pred)) < math.radians(0.02)  # a mean: 0.9
+    assert float(angle_between(found.R_true_pred, known.R_true_pred)) < math.radians(0.02)  # a mean would be off by 0.9
     assert float(found.scale / known.scale) == pytest.approx(1, abs=1e-3)
     assert (found.shift - known.shift).abs().max() < 2e-3
 
 
-def test_registration_needs_an_object_that_turns() -> None:
-    still = a_path(10).select([0] * 10)
-    with pytest.raises(ValueError, match="hardly turns"):
+def test_registration_needs_an_object_that_rotates() -> None:
+    still = random_path(10).select([0] * 10)
+    with pytest.raises(ValueError, match="hardly rotates"):
         metrics.register(still, still)
     slow = SO3.exp(torch.linspace(0, 1e-3, 10, dtype=torch.float64)[:, None] * torch.tensor([0.0, 1, 0]).double())
     path = Trajectory(SE3.from_rotation(slow, torch.tensor([0.0, 0, 4]).double()), "camera")
-    with pytest.raises(ValueError, match="hardly turns"):
+    with pytest.raises(ValueError, match="hardly rotates"):
         metrics.register(path, path)
 
 
-def test_one_bad_frame_spoils_the_two_motions_that_touch_it() -> None:
-    """Frame 4 of 11, turned by 3 degrees, or shifted by 0.2, before the camera: two of ten motions are off by that."""
-    truth = a_path(11)
+def test_one_wrong_frame_affects_the_two_motions_before_and_after_it() -> None:
+    """If frame 4 of 11 is rotated by 3 degrees or shifted by 0.2 in the camera frame, two of ten motions are wrong."""
+    truth = random_path(11)
     offset = torch.zeros(11, 6, dtype=torch.float64)
     offset[4, 3] = math.radians(3)
     turned = Trajectory(SE3.exp(offset) @ truth.T_cam_obj, "camera")
@@ -528,10 +528,10 @@ def test_one_bad_frame_spoils_the_two_motions_that_touch_it() -> None:
 
 
 def test_motions_across_a_lost_frame_are_left_out() -> None:
-    truth = a_path(6)
+    truth = random_path(6)
     kept = [0, 1, 2, 4]
     offset = torch.zeros(4, 6, dtype=torch.float64)
-    offset[3, 3] = math.radians(30)  # frame 4 has no neighbour, so its error cannot be seen
+    offset[3, 3] = math.radians(30)  # frame 4 has no neighbour, so its error has no effect
     predicted = Trajectory(SE3.exp(offset) @ truth.select(kept).T_cam_obj, "camera")
     scores = metrics.relative_scores(predicted, truth.select(kept), kept, scale=1.0)
     assert scores["rpe_rotation_degrees"] == pytest.approx(0, abs=1e-6)
@@ -552,32 +552,32 @@ def test_camera_positions_on_a_line_determine_no_alignment() -> None:
         with pytest.raises(ValueError, match="true camera positions"):
             metrics.align(looking_from(centres), looking_from(centres))
     with pytest.raises(ValueError, match="predicted camera positions"):
-        metrics.align(looking_from(line), a_path(10))
+        metrics.align(looking_from(line), random_path(10))
     with pytest.raises(ValueError, match="predicted camera positions"):
-        metrics.align(looking_from(line[:1].expand(10, 3)), a_path(10))
+        metrics.align(looking_from(line[:1].expand(10, 3)), random_path(10))
 
 
-def test_a_similarity_and_its_way_back_cancel() -> None:
-    path = a_path()
-    alignment = metrics.align(disguised(path), path)
-    again = alignment.to_prediction(alignment.to_truth(disguised(path)))
-    torch.testing.assert_close(again.T_cam_obj.matrix(), disguised(path).T_cam_obj.matrix())
+def test_a_similarity_and_its_inverse_cancel() -> None:
+    path = random_path()
+    alignment = metrics.align(reexpressed(path), path)
+    again = alignment.to_prediction(alignment.to_truth(reexpressed(path)))
+    torch.testing.assert_close(again.T_cam_obj.matrix(), reexpressed(path).T_cam_obj.matrix())
 
 
 def test_true_views_in_the_predicted_frame_show_the_same_pixels() -> None:
-    """A point of the object projects to one place, told in either frame: what a producer of predictions relies on."""
-    truth = a_path()
-    alignment = metrics.align(disguised(truth), truth)
+    """A point of the object projects to the same pixel in either frame, as writers of predictions assume."""
+    truth = random_path()
+    alignment = metrics.align(reexpressed(truth), truth)
     x_pred = torch.randn(30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64) * 0.1
     x_true = alignment.scale * (alignment.R_true_pred @ x_pred) + alignment.shift
-    seen_true = truth.T_cam_obj @ x_true
-    seen_pred = alignment.to_prediction(truth).T_cam_obj @ x_pred
-    torch.testing.assert_close(seen_pred[:, :2] / seen_pred[:, 2:], seen_true[:, :2] / seen_true[:, 2:])
+    true_cam = truth.T_cam_obj @ x_true
+    pred_cam = alignment.to_prediction(truth).T_cam_obj @ x_pred
+    torch.testing.assert_close(pred_cam[:, :2] / pred_cam[:, 2:], true_cam[:, :2] / true_cam[:, 2:])
 
 
-def test_what_is_not_a_number_scores_none() -> None:
+def test_psnr_of_nan_or_no_pixels_is_nan() -> None:
     x, everywhere = torch.full((2, 2, 3), 0.5), torch.ones(2, 2, dtype=torch.bool)
     assert math.isnan(metrics.psnr(x, x, ~everywhere))
-    assert metrics.psnr(x, x, everywhere) == metrics.BEST_PSNR
+    assert metrics.psnr(x, x, everywhere) == metrics.MAX_PSNR
     x[0, 0, 0] = math.nan
     assert math.isnan(metrics.psnr(x, torch.full_like(x, 0.5), everywhere))

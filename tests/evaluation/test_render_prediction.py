@@ -1,7 +1,7 @@
-"""A reconstruction in an object frame and unit of its own scores as in the true ones: nothing is left unturned.
+"""Scores do not depend on the object frame and unit of a reconstruction: everything is transformed with the alignment.
 
-The asset is a lopsided body of Gaussians with colours and normal detail that have no symmetry, under a light that has
-none; the truth is what it shows in its own frame, with damage that is fixed in the picture.
+The asset is an ellipsoid of Gaussians off the origin; colours, normal detail and light have no symmetry. The truth is
+its render in its own frame, with errors that are fixed in the image.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from tumble.maths.se3 import SE3, SO3
 from tumble.rendering import relight
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture, Truth, no_views
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture, Truth, truth_without_views
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
 from tumble.scene.material import Material
@@ -31,14 +31,14 @@ CAMERA = Camera.from_fov(math.radians(30), SIZE, SIZE)
 DISTANCE = trajectories.distance_for(math.radians(30))
 CONFIG = relight.Config(brdf_samples=64, light_samples=64)
 OTHER_CONFIG = relight.Config(brdf_samples=80, light_samples=80)
-"""Of the truth, so that its rays are no run's: equal draws would make a run without disguise too good."""
+"""For rendering the truth: with the same random rays as a prediction, the scores would be too good."""
 OTHER = Similarity(torch.tensor(0.8), SO3.exp(torch.tensor([0.7, -1.9, 1.1])), torch.tensor([0.15, -0.1, 0.2]))
-"""From the true object frame to the run's: turned by 132 degrees, smaller, and off the centre."""
+"""From the true object frame to the run's: rotated by 132 degrees, smaller, and shifted."""
 NAMES = tuple(f"{i:04}.png" for i in range(24))
 
 
-def a_light(tilt: float) -> Environment:
-    """Smooth enough to be told in another frame without loss."""
+def smooth_light(tilt: float) -> Environment:
+    """Light that is smooth enough for resampling in a rotated frame without loss."""
     d = texel_directions(32, 64)
     lamp = torch.tensor([math.cos(tilt), 0.6, math.sin(tilt)])
     return Environment.from_radiance(
@@ -46,7 +46,7 @@ def a_light(tilt: float) -> Environment:
     )
 
 
-def an_asset(light: Light) -> Asset:
+def ellipsoid_asset(light: Light) -> Asset:
     """An ellipsoid off the origin, of axes 0.7, 0.45, 0.3."""
     axes, centre = torch.tensor([0.7, 0.45, 0.3]), torch.tensor([0.1, -0.05, 0.1])
     n = 700
@@ -68,11 +68,11 @@ def an_asset(light: Light) -> Asset:
     )
     poses = trajectories.handheld(len(NAMES), DISTANCE, seed=1)
     trajectory = Trajectory(SE3(poses.wxyz.float(), poses.xyz.float()), light)
-    return Asset(gaussians, torch.tensor(200.0), material, a_light(0.4), trajectory, CAMERA)
+    return Asset(gaussians, torch.tensor(200.0), material, smooth_light(0.4), trajectory, CAMERA)
 
 
-def disguised(asset: Asset) -> Asset:
-    """The same object, told in the frame and unit of `OTHER`."""
+def reexpressed(asset: Asset) -> Asset:
+    """The same asset, expressed in the object frame and unit of `OTHER`."""
     R, scale, old, material = OTHER.R_true_pred, OTHER.scale, asset.gaussians, asset.material
     assert material is not None
     fixed = asset.trajectory.light == "object"
@@ -92,88 +92,88 @@ def disguised(asset: Asset) -> Asset:
     )
 
 
-def a_truth(asset: Asset) -> tuple[Capture, Truth]:
-    """What the asset shows, in its own frame, with damage; and the capture without poses."""
+def rendered_truth(asset: Asset) -> tuple[Capture, Truth]:
+    """The capture without poses, and as truth the asset's render in its own frame, with errors."""
     views = trajectories.sphere_views(3, DISTANCE)
     path = Trajectory(SE3(views.wxyz.float(), views.xyz.float()), asset.trajectory.light)
     black = torch.zeros(len(NAMES), SIZE, SIZE, 3, dtype=torch.uint8)
     capture = Capture(black, black[..., 0], CAMERA, NAMES, asset.trajectory.light)
     empty = torch.zeros(3, SIZE, SIZE, 3, dtype=torch.uint8)
     blank = dataclasses.replace(
-        no_views(CAMERA),
+        truth_without_views(CAMERA),
         images=empty,
         masks=empty[..., 0] + OBJECT,
         names=("a.png", "b.png", "c.png"),
         regions=("shared", "sphere", "shared"),
         trajectory=path,
         albedo=torch.full((3, SIZE, SIZE, 3), 0.5),
-        lights={"lamp": a_light(2.5)},
+        lights={"lamp": smooth_light(2.5)},
         poses=asset.trajectory,
     )
-    same = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
-    shown = render_prediction.predict_views(OTHER_CONFIG, asset, capture, blank, same, names=NAMES)
-    assert shown.albedo is not None
-    assert shown.normals is not None
-    assert shown.masks is not None
-    assert shown.images is not None
+    identity = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
+    rendered = render_prediction.predict_views(OTHER_CONFIG, asset, capture, blank, identity, names=NAMES)
+    assert rendered.albedo is not None
+    assert rendered.normals is not None
+    assert rendered.masks is not None
+    assert rendered.images is not None
     damage = 0.06 * torch.randn(3, SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
     truth = dataclasses.replace(
         blank,
-        images=(shown.images + 250 * damage).clamp(0, 255).to(torch.uint8),
-        masks=torch.where(shown.masks, OBJECT, BACKGROUND).to(torch.uint8),
-        albedo=(shown.albedo + damage).clamp_min(0) * shown.masks[..., None],
-        normals=torch.nn.functional.normalize(shown.normals + damage, dim=-1) * shown.masks[..., None],
-        roughness=shown.roughness,
-        relit={"lamp": (shown.relit["lamp"] + 250 * damage).clamp(0, 255).to(torch.uint8)},
-        light=shown.light,
+        images=(rendered.images + 250 * damage).clamp(0, 255).to(torch.uint8),
+        masks=torch.where(rendered.masks, OBJECT, BACKGROUND).to(torch.uint8),
+        albedo=(rendered.albedo + damage).clamp_min(0) * rendered.masks[..., None],
+        normals=torch.nn.functional.normalize(rendered.normals + damage, dim=-1) * rendered.masks[..., None],
+        roughness=rendered.roughness,
+        relit={"lamp": (rendered.relit["lamp"] + 250 * damage).clamp(0, 255).to(torch.uint8)},
+        light=rendered.light,
     )
     return capture, truth
 
 
 def scored(asset: Asset, capture: Capture, truth: Truth) -> tuple[dict[str, Any], str]:
-    given = capture.trajectory is not None
-    alignment, words = render_prediction.align_views(asset.trajectory, NAMES, capture, truth, given=given)
+    known = capture.trajectory is not None
+    alignment, note = render_prediction.align_views(asset.trajectory, NAMES, capture, truth, known_poses=known)
     predicted = render_prediction.predict_views(CONFIG, asset, capture, truth, alignment, names=NAMES)
-    return evaluate.compare(predicted, capture, truth, []), words
+    return evaluate.compare(predicted, capture, truth, []), note
 
 
 @pytest.mark.parametrize("light", ["camera", "object"])
-def test_a_run_in_a_frame_of_its_own_scores_as_in_the_true_one(light: Light) -> None:
-    asset = an_asset(light)
-    capture, truth = a_truth(asset)
+def test_a_run_in_its_own_frame_scores_as_in_the_true_one(light: Light) -> None:
+    asset = ellipsoid_asset(light)
+    capture, truth = rendered_truth(asset)
     known = dataclasses.replace(capture, trajectory=asset.trajectory)
-    mine, given = scored(asset, known, truth)
-    theirs, found = scored(disguised(asset), capture, truth)
-    assert "its poses were given" in given
-    assert "rotation alone (132" in found
+    in_true_frame, known_note = scored(asset, known, truth)
+    in_other_frame, other_note = scored(reexpressed(asset), capture, truth)
+    assert "its poses were given" in known_note
+    assert "first the rotation (132" in other_note
     for region in ("shared", "sphere"):
-        a, b = mine["regions"][region], theirs["regions"][region]
+        a, b = in_true_frame["regions"][region], in_other_frame["regions"][region]
         for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_fg_srgb"):
-            assert 20 < a[key] < 40, "the damage shows"
-            # Rays drawn anew move pixels by 3 code values, a fifth of the damage: 0.15 dB.
+            assert 20 < a[key] < 40, "the errors must be visible"
+            # Other random rays change pixels by 3 code values, a fifth of the errors: 0.15 dB.
             assert b[key] == pytest.approx(a[key], abs=0.25), key
         assert b["normal.mean_fg_degrees"] == pytest.approx(a["normal.mean_fg_degrees"], abs=0.1)
         assert 2 < a["normal.mean_fg_degrees"] < 10
         assert b["roughness.rmse_fg"] < 0.01
         assert b["silhouette.iou"] > 0.98
-    assert theirs["albedo_scale"] == pytest.approx(mine["albedo_scale"], rel=2e-3)
-    assert theirs["light"]["light.rmse_clip10"] < 0.01
-    assert theirs["poses"]["poses.rotation_mean_degrees"] < 0.01
-    assert theirs["poses"]["poses.auc_percent"] > 99.9
+    assert in_other_frame["albedo_scale"] == pytest.approx(in_true_frame["albedo_scale"], rel=2e-3)
+    assert in_other_frame["light"]["light.rmse_clip10"] < 0.01
+    assert in_other_frame["poses"]["poses.rotation_mean_degrees"] < 0.01
+    assert in_other_frame["poses"]["poses.auc_percent"] > 99.9
 
 
-def test_without_the_alignment_nothing_fits() -> None:
-    """The test above sees a frame that is forgotten."""
-    asset = an_asset("object")
-    capture, truth = a_truth(asset)
-    other = disguised(asset)
-    same = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
-    right, _ = render_prediction.align_views(other.trajectory, NAMES, capture, truth, given=False)
+def test_without_the_alignment_each_part_scores_badly() -> None:
+    """Shows that the test above would notice a part that is not transformed."""
+    asset = ellipsoid_asset("object")
+    capture, truth = rendered_truth(asset)
+    other = reexpressed(asset)
+    identity = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
+    right, _ = render_prediction.align_views(other.trajectory, NAMES, capture, truth, known_poses=False)
     assert right is not None
-    wrong = render_prediction.predict_views(CONFIG, other, capture, truth, same, names=NAMES)
+    wrong = render_prediction.predict_views(CONFIG, other, capture, truth, identity, names=NAMES)
     good = render_prediction.predict_views(CONFIG, other, capture, truth, right, names=NAMES)
-    halves = {"normals": wrong.normals, "relit": wrong.relit, "albedo": wrong.albedo, "light": wrong.light}
-    for part, value in halves.items():
+    unaligned = {"normals": wrong.normals, "relit": wrong.relit, "albedo": wrong.albedo, "light": wrong.light}
+    for part, value in unaligned.items():
         scores = evaluate.compare(dataclasses.replace(good, **{part: value}), capture, truth, [])
         shared = scores["regions"]["shared"]
         assert {
@@ -184,74 +184,76 @@ def test_without_the_alignment_nothing_fits() -> None:
         }[part], part
 
 
-def test_a_drifting_tracker_still_shows_the_object_in_its_place() -> None:
-    """Orientations that drift by 12 degrees: the mean turn is right, and so are scale and shift."""
-    asset = an_asset("camera")
-    capture, truth = a_truth(asset)
+def test_under_drift_of_the_poses_the_object_is_rendered_in_its_place() -> None:
+    """With orientations that drift by 12 degrees, the mean rotation, the scale and the shift are still right."""
+    asset = ellipsoid_asset("camera")
+    capture, truth = rendered_truth(asset)
     drift = torch.linspace(-1, 1, len(NAMES))[:, None] * math.radians(6) * torch.tensor([0.6, 0.0, 0.8])
     turns = SE3.from_rotation(SO3.exp(drift), torch.zeros(len(NAMES), 3))
     path = Trajectory(asset.trajectory.T_cam_obj @ turns, "camera")
-    scores, _ = scored(dataclasses.replace(disguised(asset), trajectory=OTHER.to_truth(path)), capture, truth)
+    scores, _ = scored(dataclasses.replace(reexpressed(asset), trajectory=OTHER.to_truth(path)), capture, truth)
     assert scores["poses"]["poses.rotation_mean_degrees"] == pytest.approx(3.1, abs=0.3)
     assert scores["regions"]["shared"]["normal.mean_fg_degrees"] < 6
     assert scores["regions"]["shared"]["silhouette.iou"] > 0.97
 
 
-def test_what_another_lens_saw_is_brought_to_where_this_one_sees_it_as_large() -> None:
-    """A lens longer by a fifth sees the object as large from a fifth farther off: nothing else is to be aligned."""
-    asset = an_asset("camera")
-    capture, truth = a_truth(asset)
+def test_depths_are_scaled_by_the_ratio_of_focal_lengths() -> None:
+    """With a focal length longer by a fifth, an object farther by a fifth has the same size in the image."""
+    asset = ellipsoid_asset("camera")
+    capture, truth = rendered_truth(asset)
     T = asset.trajectory.T_cam_obj
     farther = Trajectory(dataclasses.replace(T, xyz=T.xyz * torch.tensor([1.0, 1.0, 1.2])), "camera")
-    found, words = render_prediction.align_views(farther, NAMES, capture, truth, given=False, lens=1 / 1.2)
-    assert found is not None
-    assert float(found.scale) == pytest.approx(1, abs=1e-4)
-    assert float(found.R_true_pred.angle()) < 1e-3
-    assert found.shift.abs().max() < 1e-4
-    assert "depths times 0.8333" in words
-    plain, words = render_prediction.align_views(farther, NAMES, capture, truth, given=False)
-    assert plain is not None
-    # Otherwise the object would be drawn a fifth too large.
-    assert float(plain.scale) == pytest.approx(1 / 1.2, abs=0.01)
-    assert "depths" not in words
-
-
-def test_what_cannot_be_aligned_is_a_prediction_of_poses_and_says_so() -> None:
-    asset = an_asset("camera")
-    capture, truth = a_truth(asset)
-    still = Trajectory(asset.trajectory.select([0] * len(NAMES)).T_cam_obj, "camera")
-    nothing, words = render_prediction.align_views(
-        still, NAMES, capture, dataclasses.replace(truth, poses=still), given=False
+    alignment, note = render_prediction.align_views(
+        farther, NAMES, capture, truth, known_poses=False, focal_ratio=1 / 1.2
     )
-    assert nothing is None
-    assert "hardly turns" in words
-    made = render_prediction.predict_views(CONFIG, asset, capture, truth, None, names=NAMES)
-    assert made.albedo is None
-    assert made.poses is asset.trajectory
-    assert made.light is asset.environment, "the camera's frame needs no alignment"
-    fixed = render_prediction.predict_views(CONFIG, an_asset("object"), capture, truth, None, names=NAMES)
+    assert alignment is not None
+    assert float(alignment.scale) == pytest.approx(1, abs=1e-4)
+    assert float(alignment.R_true_pred.angle()) < 1e-3
+    assert alignment.shift.abs().max() < 1e-4
+    assert "depths times 0.8333" in note
+    plain, note = render_prediction.align_views(farther, NAMES, capture, truth, known_poses=False)
+    assert plain is not None
+    # Without the ratio, the object would be rendered a fifth too large.
+    assert float(plain.scale) == pytest.approx(1 / 1.2, abs=0.01)
+    assert "depths" not in note
+
+
+def test_without_an_alignment_the_prediction_has_poses_only_and_a_note() -> None:
+    asset = ellipsoid_asset("camera")
+    capture, truth = rendered_truth(asset)
+    still = Trajectory(asset.trajectory.select([0] * len(NAMES)).T_cam_obj, "camera")
+    missing, note = render_prediction.align_views(
+        still, NAMES, capture, dataclasses.replace(truth, poses=still), known_poses=False
+    )
+    assert missing is None
+    assert "hardly rotates" in note
+    unaligned = render_prediction.predict_views(CONFIG, asset, capture, truth, None, names=NAMES)
+    assert unaligned.albedo is None
+    assert unaligned.poses is asset.trajectory
+    assert unaligned.light is asset.environment, "the camera's frame needs no alignment"
+    fixed = render_prediction.predict_views(CONFIG, ellipsoid_asset("object"), capture, truth, None, names=NAMES)
     assert fixed.light is None
     bare = dataclasses.replace(truth, poses=None)
-    blind, words = render_prediction.align_views(asset.trajectory, NAMES, capture, bare, given=False)
-    assert blind is None
-    assert "unknown" in words
+    missing, note = render_prediction.align_views(asset.trajectory, NAMES, capture, bare, known_poses=False)
+    assert missing is None
+    assert "unknown" in note
 
 
-def test_true_poses_of_some_frames_align_and_score_those() -> None:
-    """Frames that nobody annotated are left out, those that the tracker lost are counted."""
-    asset = an_asset("camera")
-    capture, truth = a_truth(asset)
+def test_only_frames_with_true_poses_are_aligned_and_scored() -> None:
+    """Frames without a true pose are left out; frames without an estimated pose count as lost."""
+    asset = ellipsoid_asset("camera")
+    capture, truth = rendered_truth(asset)
     annotated = list(range(0, 24, 2))
     some = dataclasses.replace(
         truth, poses=asset.trajectory.select(annotated), pose_names=tuple(NAMES[i] for i in annotated)
     )
-    other = disguised(asset)
+    other = reexpressed(asset)
     kept = [i for i in range(24) if i not in (4, 7)]
     names = tuple(NAMES[i] for i in kept)
     path = other.trajectory.select(kept)
-    alignment, words = render_prediction.align_views(path, names, capture, some, given=False)
+    alignment, note = render_prediction.align_views(path, names, capture, some, known_poses=False)
     assert alignment is not None
-    assert "11 training poses" in words
+    assert "11 training poses" in note
     torch.testing.assert_close(alignment.to_truth(path).T_cam_obj.xyz, asset.trajectory.select(kept).T_cam_obj.xyz)
     predicted = Prediction(poses=path, pose_names=names)
     scores = evaluate.compare(predicted, capture, some, [])["poses"]
@@ -261,8 +263,8 @@ def test_true_poses_of_some_frames_align_and_score_those() -> None:
     assert scores["poses.rotation_longest_run_percent"] == pytest.approx(100 * 9 / 12)
 
 
-def test_registering_undoes_a_similarity() -> None:
-    truth = an_asset("camera").trajectory
+def test_registration_inverts_a_similarity() -> None:
+    truth = ellipsoid_asset("camera").trajectory
     found = metrics.register(OTHER.to_truth(truth), truth)
     undone = found.to_truth(OTHER.to_truth(truth))
     torch.testing.assert_close(undone.T_cam_obj.matrix(), truth.T_cam_obj.matrix(), atol=1e-5, rtol=0)

@@ -1,4 +1,4 @@
-"""Exported files, read back by hand and by an independent library."""
+"""Exported files, read back by code of the tests and by an independent library."""
 
 import json
 import math
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.export.test_bake import RADIUS, colour, painted, rough
+from tests.export.test_bake import RADIUS, colour, painted, roughness
 from tests.surfaces import sphere
 from tumble.export import asset as export
 from tumble.export import gltf, mesh, ply
@@ -37,7 +37,7 @@ def asset() -> Asset:
 
 @pytest.fixture(scope="module")
 def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The preset "web", small, of a ball of 95 mm."""
+    """Export of a sphere of 95 mm with small settings for the preset "web"."""
     out = tmp_path_factory.mktemp("export")
     patch = pytest.MonkeyPatch()
     patch.setitem(export.PRESETS, "web", SMALL)
@@ -47,7 +47,7 @@ def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def chunks(path: Path) -> tuple[dict, bytes]:
-    """By the layout of glTF 2.0, section 4."""
+    """JSON document and binary chunk of a GLB (glTF 2.0, section 4)."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
@@ -62,7 +62,7 @@ def chunks(path: Path) -> tuple[dict, bytes]:
 
 
 def table(path: Path) -> dict[str, np.ndarray]:
-    """A binary PLY of floats, by its header."""
+    """Columns of a binary PLY of floats, by name."""
     head, body = path.read_bytes().split(b"end_header\n", 1)
     lines = head.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -73,7 +73,7 @@ def table(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(names, np.frombuffer(body, "<f4").reshape(count, -1).T, strict=True))
 
 
-def test_the_glb_is_laid_out_as_the_standard_says(folder: Path) -> None:
+def test_the_glb_follows_the_gltf_layout(folder: Path) -> None:
     document, binary = chunks(folder / "asset.glb")
     assert document["buffers"] == [{"byteLength": len(binary)}]
     for view in document["bufferViews"]:
@@ -85,7 +85,7 @@ def test_the_glb_is_laid_out_as_the_standard_says(folder: Path) -> None:
     vertices = np.frombuffer(binary, "<f4", 3 * position["count"], view["byteOffset"]).reshape(-1, 3)
     assert vertices.min(0).tolist() == position["min"]
     assert vertices.max(0).tolist() == position["max"]
-    # The ball is 95 mm wide, in metres.
+    # The sphere is 95 mm wide, in metres.
     assert mesh.diameter(vertices.astype(np.float64)) == pytest.approx(SCALE_MM / 1000, rel=1e-5)
     indices = document["accessors"][primitive["indices"]]
     assert 900 < indices["count"] / 3 <= SMALL.triangles
@@ -94,81 +94,81 @@ def test_the_glb_is_laid_out_as_the_standard_says(folder: Path) -> None:
     assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
-def test_another_reader_finds_each_colour_where_it_belongs(folder: Path) -> None:
-    """trimesh reads the file; colours differ along all axes, so that a flip of u, v or an axis shows."""
+def test_an_independent_reader_finds_each_colour_in_its_place(folder: Path) -> None:
+    """trimesh reads the file; colours differ along all axes, so a flip of u, v or an axis would be noticed."""
     trimesh = pytest.importorskip("trimesh")
-    (ball,) = trimesh.load_scene(folder / "asset.glb", process=False).geometry.values()
-    material = ball.visual.material
-    picture = np.asarray(material.baseColorTexture.convert("RGB")) / 255.0
-    roughness = np.asarray(material.metallicRoughnessTexture.convert("RGB"))[..., 1] / 255.0
-    # The atlas has no place for a face without area.
-    faces = np.random.default_rng(0).choice(np.nonzero(ball.area_faces > 1e-8)[0], 400)
-    points = torch.from_numpy(ball.triangles_center[faces]).float()
+    (shape,) = trimesh.load_scene(folder / "asset.glb", process=False).geometry.values()
+    material = shape.visual.material
+    image = np.asarray(material.baseColorTexture.convert("RGB")) / 255.0
+    roughness_map = np.asarray(material.metallicRoughnessTexture.convert("RGB"))[..., 1] / 255.0
+    # Faces without area have no texels.
+    faces = np.random.default_rng(0).choice(np.nonzero(shape.area_faces > 1e-8)[0], 400)
+    points = torch.from_numpy(shape.triangles_center[faces]).float()
     x = RADIUS * torch.nn.functional.normalize(points, dim=-1)
-    uv = ball.visual.uv[ball.faces[faces]].mean(1)
-    # trimesh counts v from below.
+    uv = shape.visual.uv[shape.faces[faces]].mean(1)
+    # The v of trimesh starts at the bottom.
     column, row = (np.floor(u * SMALL.texture).astype(int) for u in (uv[:, 0], 1 - uv[:, 1]))
-    error = (linear_from_srgb(torch.from_numpy(picture[row, column]).float()) - colour(x)).abs()
+    error = (linear_from_srgb(torch.from_numpy(image[row, column]).float()) - colour(x)).abs()
     assert error.max() < 0.06
-    assert np.abs(roughness[row, column] - rough(x).numpy()).max() < 0.05
-    assert ball.is_winding_consistent
-    assert (ball.face_normals[faces] * x.numpy()).sum(1).min() > 0.9 * RADIUS
+    assert np.abs(roughness_map[row, column] - roughness(x).numpy()).max() < 0.05
+    assert shape.is_winding_consistent
+    assert (shape.face_normals[faces] * x.numpy()).sum(1).min() > 0.9 * RADIUS
 
 
-def test_a_highlight_below_that_of_glass_is_dimmed_and_one_above_has_an_index() -> None:
-    assert gltf.specular(0.02) == ("KHR_materials_specular", {"specularFactor": 0.5})
-    name, value = gltf.specular(0.0625)
+def test_f0_below_004_is_a_specular_factor_and_above_an_index_of_refraction() -> None:
+    assert gltf.reflectance_extension(0.02) == ("KHR_materials_specular", {"specularFactor": 0.5})
+    name, value = gltf.reflectance_extension(0.0625)
     # ((n - 1) / (n + 1))^2 = 1/16.
     assert name == "KHR_materials_ior"
     assert value["ior"] == pytest.approx(5 / 3)
 
 
 def test_the_ply_has_the_common_layout(folder: Path, asset: Asset) -> None:
-    found = table(folder / "asset.ply")
+    columns = table(folder / "asset.ply")
     rest = [f"f_rest_{i}" for i in range(45)]
-    assert list(found) == [
+    assert list(columns) == [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *(*rest, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
     metres = files.read_json(folder / "export.json")["metres_per_object_radius"]
     gaussians = asset.gaussians
-    assert np.allclose([found["x"], found["y"], found["z"]], gaussians.means.T * metres, atol=1e-7)
-    assert np.allclose(np.exp(found["scale_2"]), gaussians.scales[:, 2] * metres, rtol=1e-5)
+    assert np.allclose([columns["x"], columns["y"], columns["z"]], gaussians.means.T * metres, atol=1e-7)
+    assert np.allclose(np.exp(columns["scale_2"]), gaussians.scales[:, 2] * metres, rtol=1e-5)
     alpha = opacity(gaussians.sdf, asset.gamma).clamp(max=1 - 1e-4)
-    assert np.allclose(1 / (1 + np.exp(-found["opacity"])), alpha, atol=1e-5)
-    # A viewer turns +z by the quaternion w, x, y, z and finds the normal.
-    w, x, y, z = (found[f"rot_{i}"] for i in range(4))
+    assert np.allclose(1 / (1 + np.exp(-columns["opacity"])), alpha, atol=1e-5)
+    # The quaternion w, x, y, z rotates +z to the normal.
+    w, x, y, z = (columns[f"rot_{i}"] for i in range(4))
     axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    assert np.allclose(axis, [found["nx"], found["ny"], found["nz"]], atol=1e-5)
+    assert np.allclose(axis, [columns["nx"], columns["ny"], columns["nz"]], atol=1e-5)
 
 
-def test_a_splat_viewer_shows_the_light_of_the_first_frame(folder: Path, asset: Asset) -> None:
-    """Under white light a viewer's colour, 1/2 + 0.282 f_dc, is about the sRGB of albedo: Lambert and 4 % of gloss."""
+def test_splat_colours_are_those_of_the_first_frame(folder: Path, asset: Asset) -> None:
+    """Under white light a viewer's colour, 1/2 + 0.282 f_dc, is the sRGB of light times albedo plus 4 % specular."""
     lit = Asset(
         **{
             **{name: getattr(asset, name) for name in ("gaussians", "gamma", "material", "trajectory", "camera")},
             "environment": Environment.from_radiance(torch.full((8, 16, 3), 0.8)),
         }
     )
-    columns = ply.splats(lit, 1.0)
-    shown = torch.tensor(np.stack([columns[f"f_dc_{i}"] for i in range(3)], -1)) * 0.28209479 + 0.5
+    columns = ply.splat_columns(lit, 1.0)
+    displayed = torch.tensor(np.stack([columns[f"f_dc_{i}"] for i in range(3)], -1)) * 0.28209479 + 0.5
     expected = 0.8 * colour(asset.gaussians.means)
-    error = linear_from_srgb(shown) - expected
+    error = linear_from_srgb(displayed) - expected
     assert error.min() > 0.0
     assert error.max() < 0.08
 
 
 def test_the_other_ply_adds_the_material(folder: Path, asset: Asset) -> None:
-    found = table(folder / "asset_material.ply")
-    albedo = np.stack([found[f"albedo_{i}"] for i in range(3)], -1)
+    columns = table(folder / "asset_material.ply")
+    albedo = np.stack([columns[f"albedo_{i}"] for i in range(3)], -1)
     assert np.allclose(albedo, colour(asset.gaussians.means), atol=0.01)
-    assert np.allclose(found["roughness"], rough(asset.gaussians.means), atol=0.01)
+    assert np.allclose(columns["roughness"], roughness(asset.gaussians.means), atol=0.01)
     assert asset.material is not None
-    assert np.allclose(found["f0"], asset.material.f0)
+    assert np.allclose(columns["f0"], asset.material.f0)
 
 
-def test_poses_come_back_from_all_three_forms(folder: Path, asset: Asset) -> None:
-    """A point of the object lands on the same pixel by each."""
+def test_poses_are_the_same_in_all_three_formats(folder: Path, asset: Asset) -> None:
+    """In each, a point of the object projects to the same pixel."""
     metres = files.read_json(folder / "export.json")["metres_per_object_radius"]
     x_obj = 0.5 * fibonacci_sphere(20, dtype=torch.float64)
     doubled = SE3(asset.trajectory.T_cam_obj.wxyz.double(), asset.trajectory.T_cam_obj.xyz.double())
@@ -184,7 +184,7 @@ def test_poses_come_back_from_all_three_forms(folder: Path, asset: Asset) -> Non
         (pose,) = truth[number]
         R, t = np.reshape(pose["cam_R_m2c"], (3, 3)), np.array(pose["cam_t_m2c"])
         projected = (x_obj.numpy() * metres * 1000 @ R.T + t) @ np.reshape(cameras[number]["cam_K"], (3, 3)).T
-        # BOP's pixel centres are whole numbers.
+        # Pixel centres of BOP have integer coordinates.
         assert np.allclose(projected[:, :2] / projected[:, 2:] + 0.5, uv[i], atol=1e-3)
         tx, ty, tz, qx, qy, qz, qw = (float(word) for word in line[1:])
         T_obj_cam = SE3(torch.tensor([qw, qx, qy, qz]).double(), torch.tensor([tx, ty, tz]).double())
@@ -192,21 +192,21 @@ def test_poses_come_back_from_all_three_forms(folder: Path, asset: Asset) -> Non
         assert torch.allclose(asset.camera.project(x_cam.float()), uv[i], atol=1e-2)
 
 
-def test_frames_without_numbers_are_counted() -> None:
-    assert pose_files._numbers(["b.png", "a.png"]) == [0, 1]
-    assert pose_files._numbers(["7.png", "007.png"]) == [0, 1]
+def test_frames_without_distinct_numbers_are_numbered_from_0() -> None:
+    assert pose_files._frame_numbers(["b.png", "a.png"]) == [0, 1]
+    assert pose_files._frame_numbers(["7.png", "007.png"]) == [0, 1]
 
 
-def test_the_light_says_how_it_lies(folder: Path, asset: Asset) -> None:
-    about = files.read_json(folder / "light.json")
-    assert about["up"].startswith("+y")
-    assert about["zero_azimuth"].startswith("-z")
+def test_the_light_file_documents_its_orientation(folder: Path, asset: Asset) -> None:
+    facts = files.read_json(folder / "light.json")
+    assert facts["up"].startswith("+y")
+    assert facts["zero_azimuth"].startswith("-z")
     for name, tolerance in (("light.exr", 1e-5), ("light.hdr", 0.01)):
         back = Environment.read(folder / name).radiance
         assert ((back - asset.environment.radiance).abs() < tolerance * asset.environment.radiance.max()).all()
     # R takes the camera's view direction of the first frame to the map's centre, -z.
     forward_obj = asset.trajectory.T_cam_obj[0].rotation.matrix().T @ torch.tensor([0.0, 0, 1])
-    R = torch.tensor(about["R_light_object_of_first_frame"])
+    R = torch.tensor(facts["R_light_object_of_first_frame"])
     assert torch.allclose(R @ forward_obj, torch.tensor([0.0, 0, -1]), atol=1e-5)
 
 
@@ -217,7 +217,7 @@ def test_splats_alone_need_no_mesh(asset: Asset, tmp_path: Path) -> None:
     assert np.allclose(table(tmp_path / "asset.ply")["x"], asset.gaussians.means[:, 0])
 
 
-def test_a_turntable_turns_about_the_vertical_under_a_light_that_stands_still(asset: Asset) -> None:
+def test_a_turntable_rotates_about_the_vertical_under_a_fixed_light(asset: Asset) -> None:
     R_gl_obj, turning = relight.turntable(asset.trajectory, 8, math.radians(20))
     positions = turning.camera_positions
     distance = asset.trajectory.camera_positions.norm(dim=-1).median()
@@ -225,10 +225,10 @@ def test_a_turntable_turns_about_the_vertical_under_a_light_that_stands_still(as
     assert torch.allclose(positions[:, 1], (distance * math.sin(math.radians(20))).expand(8), atol=1e-4)
     assert torch.allclose(positions[0, [0]], torch.zeros(1), atol=1e-5)
     assert positions[0, 2] > 0, "first from +z"
-    # The object's axis stands upright in each picture; after a quarter turn +x has gone to where -z was.
+    # The object's axis is vertical in each image; after a quarter revolution +x points where -z did.
     up = turning.T_cam_obj @ torch.tensor([0.0, 1, 0]) - turning.T_cam_obj.xyz
     assert torch.allclose(up, up[:1].expand(8, 3), atol=1e-5)
-    assert up[0, 1] < -0.9, "OpenCV's y runs down"
+    assert up[0, 1] < -0.9, "OpenCV's y points down"
     R = turning.R_env_obj
     assert torch.allclose(R[0], R_gl_obj, atol=1e-6), "at first the light's frame is the object's"
     assert torch.allclose(R[2] @ torch.tensor([1.0, 0, 0]), R_gl_obj @ torch.tensor([0.0, 0, -1]), atol=1e-5)

@@ -1,4 +1,4 @@
-"""Textures against the material that the Gaussians were given."""
+"""Baked textures against the known material of the Gaussians."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from tests.surfaces import GAMMA, sphere
 from tumble.export import bake, depth_fusion, mesh
 from tumble.export.bake import Textures
-from tumble.export.mesh import Unwrapped
+from tumble.export.mesh import UnwrappedMesh
 from tumble.maths.images import linear_from_srgb
 from tumble.maths.se3 import SE3
 from tumble.scene.asset import Asset
@@ -24,23 +24,23 @@ RADIUS = 0.8
 
 
 def colour(x: torch.Tensor) -> torch.Tensor:
-    """Linear base colour by position: different along every axis and both ways."""
+    """Linear base colour by position, different along each axis and direction."""
     return (0.4 + torch.tensor([0.35, 0.25, -0.3]) * x / RADIUS).clamp(0.02, 0.98)
 
 
-def rough(x: torch.Tensor) -> torch.Tensor:
+def roughness(x: torch.Tensor) -> torch.Tensor:
     return 0.5 + 0.2 * x[..., 1] / RADIUS
 
 
 def painted(gaussians: Gaussians) -> Asset:
-    """An asset whose corners have the colour of their own positions, under an uneven light, seen three times."""
+    """An asset whose corners have the colour of their positions, under an uneven light, with three frames."""
     signs = torch.tensor([[-1.0, -1], [1, -1], [-1, 1], [1, 1]])
     # Corners of a Gaussian's plane lie sqrt(3) standard deviations out.
     plane = gaussians.R_obj_local[..., :2] * gaussians.scales[:, None, :2] * 3**0.5
     corners = gaussians.means[:, None] + torch.einsum("nij,cj->nci", plane, signs)
     material = Material(
         TEMPERATURE * torch.logit(colour(corners)),
-        TEMPERATURE * torch.logit(rough(corners)),
+        TEMPERATURE * torch.logit(roughness(corners)),
         torch.zeros_like(corners),
         torch.tensor(0.3),
     )
@@ -55,84 +55,86 @@ def asset() -> Asset:
 
 
 @pytest.fixture(scope="module")
-def ball() -> Unwrapped:
-    axis = np.linspace(-depth_fusion.REACH, depth_fusion.REACH, 33)
+def sphere_mesh() -> UnwrappedMesh:
+    axis = np.linspace(-depth_fusion.HALF_SIDE, depth_fusion.HALF_SIDE, 33)
     values = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - RADIUS
-    made = mesh.simplified(mesh.march(values, -depth_fusion.REACH, 2 * depth_fusion.REACH / 32), 1500)
-    return mesh.unwrapped(made, 192, 8)
+    simplified = mesh.simplify(
+        mesh.marching_tetrahedra(values, -depth_fusion.HALF_SIDE, 2 * depth_fusion.HALF_SIDE / 32), 1500
+    )
+    return mesh.unwrap(simplified, 192, 8)
 
 
-def baked(asset: Asset, ball: Unwrapped) -> Textures:
-    return bake.bake(asset, ball, resolution=192, views=24, pixels=160)
+def baked(asset: Asset, sphere_mesh: UnwrappedMesh) -> Textures:
+    return bake.bake(asset, sphere_mesh, resolution=192, views=24, pixels=160)
 
 
-def at(values: np.ndarray, spots: bake.Texels) -> torch.Tensor:
-    return torch.from_numpy(values[spots.rows.numpy(), spots.columns.numpy()]).float() / 255
+def at(values: np.ndarray, texels: bake.Texels) -> torch.Tensor:
+    return torch.from_numpy(values[texels.rows.numpy(), texels.columns.numpy()]).float() / 255
 
 
-def test_texels_lie_on_the_mesh_and_know_their_frame(ball: Unwrapped) -> None:
-    spots = bake.texels(ball, 192)
-    assert len(spots.rows) > 0.3 * 192**2
+def test_texels_lie_on_the_mesh_with_its_normals(sphere_mesh: UnwrappedMesh) -> None:
+    texels = bake.locate_texels(sphere_mesh, 192)
+    assert len(texels.rows) > 0.3 * 192**2
     # Chords of 1500 triangles lie up to 0.6 % below the sphere.
-    assert (spots.points.norm(dim=-1) - RADIUS).abs().quantile(0.99) < 0.01
-    assert (normalize(spots.points, dim=-1) * spots.normals).sum(-1).quantile(0.01) > 0.99
+    assert (texels.points.norm(dim=-1) - RADIUS).abs().quantile(0.99) < 0.01
+    assert (normalize(texels.points, dim=-1) * texels.normals).sum(-1).quantile(0.01) > 0.99
 
 
-def test_colours_and_roughness_are_those_of_the_place(asset: Asset, ball: Unwrapped) -> None:
-    """A flip of u, v or of an axis would be off by up to 0.6."""
-    spots, textures = bake.texels(ball, 192), baked(asset, ball)
-    error = (linear_from_srgb(at(textures.base_color, spots)) - colour(spots.points)).abs()
+def test_texels_have_the_colour_and_roughness_of_their_position(asset: Asset, sphere_mesh: UnwrappedMesh) -> None:
+    """A flip of u, v or an axis would give errors of up to 0.6."""
+    texels, textures = bake.locate_texels(sphere_mesh, 192), baked(asset, sphere_mesh)
+    error = (linear_from_srgb(at(textures.base_color, texels)) - colour(texels.points)).abs()
     # A Gaussian is 0.04 wide, over which the colour changes by 0.02; 8 bits are 0.008 of a bright linear value.
     assert error.mean() < 0.01
     assert error.max() < 0.06
-    assert (at(textures.roughness, spots) - rough(spots.points)).abs().max() < 0.05
+    assert (at(textures.roughness, texels) - roughness(texels.points)).abs().max() < 0.05
 
 
-def test_values_of_gaussians_lie_where_they_are(asset: Asset, ball: Unwrapped) -> None:
-    spots = bake.texels(ball, 96)
+def test_texels_have_the_value_of_the_nearest_gaussian(asset: Asset, sphere_mesh: UnwrappedMesh) -> None:
+    texels = bake.locate_texels(sphere_mesh, 96)
     height = 0.5 + 0.5 * asset.gaussians.means[:, 1] / RADIUS
-    found = at(bake.spread(height, asset, ball, resolution=96), spots)
+    values = at(bake.nearest_gaussian_texture(height, asset, sphere_mesh, resolution=96), texels)
     # 3000 Gaussians lie 0.05 apart.
-    assert (found - 0.5 - 0.5 * spots.points[:, 1] / RADIUS).abs().max() < 0.05
+    assert (values - 0.5 - 0.5 * texels.points[:, 1] / RADIUS).abs().max() < 0.05
 
 
-def test_a_smooth_sphere_has_a_flat_normal_map(asset: Asset, ball: Unwrapped) -> None:
-    spots, textures = bake.texels(ball, 192), baked(asset, ball)
-    z = 2 * at(textures.normal, spots)[:, 2] - 1
+def test_a_smooth_sphere_has_a_flat_normal_map(asset: Asset, sphere_mesh: UnwrappedMesh) -> None:
+    texels, textures = bake.locate_texels(sphere_mesh, 192), baked(asset, sphere_mesh)
+    z = 2 * at(textures.normal, texels)[:, 2] - 1
     assert z.quantile(0.01) > 0.98
 
 
-def test_normal_detail_comes_back_through_the_tangent_frame(asset: Asset, ball: Unwrapped) -> None:
+def test_normal_detail_is_recovered_through_the_tangent_frame(asset: Asset, sphere_mesh: UnwrappedMesh) -> None:
     """A tilt in a known object direction, decoded as a viewer does: n = x t + y b + z n, b = w cross(n, t)."""
     tilt = torch.tensor([0.3, -0.15, 0.25])
     material = asset.material
     assert material is not None
     offset = material.normal_offset + tilt
-    spots = bake.texels(ball, 192)
-    textures = baked(replace(asset, material=replace(material, normal_offset=offset)), ball)
-    x, y, z = (2 * at(textures.normal, spots) - 1).split(1, -1)
-    bitangents = torch.linalg.cross(spots.normals, spots.tangents) * spots.signs
-    shown = normalize(x * spots.tangents + y * bitangents + z * spots.normals, dim=-1)
-    expected = normalize(normalize(spots.points, dim=-1) + tilt, dim=-1)
-    # Facets, and tangents that are not quite at right angles between vertices: two degrees; a wrong sign is twenty.
-    assert (shown * expected).sum(-1).quantile(0.05) > 0.998
+    texels = bake.locate_texels(sphere_mesh, 192)
+    textures = baked(replace(asset, material=replace(material, normal_offset=offset)), sphere_mesh)
+    x, y, z = (2 * at(textures.normal, texels) - 1).split(1, -1)
+    bitangents = torch.linalg.cross(texels.normals, texels.tangents) * texels.signs
+    decoded = normalize(x * texels.tangents + y * bitangents + z * texels.normals, dim=-1)
+    expected = normalize(normalize(texels.points, dim=-1) + tilt, dim=-1)
+    # Facets and interpolated tangents, which are not exactly orthogonal: two degrees; a wrong sign is twenty.
+    assert (decoded * expected).sum(-1).quantile(0.05) > 0.998
 
 
 def test_padding_repeats_the_nearest_texel() -> None:
     covered = np.zeros((24, 24), bool)
     covered[3:8, 4:9] = covered[15:20, 12:20] = True
-    picture = np.random.default_rng(0).integers(1, 255, (24, 24, 3)).astype(np.uint8)
-    filled = bake.padded(picture * covered[..., None], covered)
-    assert (filled[covered] == picture[covered]).all()
+    image = np.random.default_rng(0).integers(1, 255, (24, 24, 3)).astype(np.uint8)
+    filled = bake.pad(image * covered[..., None], covered)
+    assert (filled[covered] == image[covered]).all()
     places = np.argwhere(covered)
     for row, column in np.argwhere(~covered):
         distance = np.hypot(*(places - (row, column)).T)
-        # The 5 x 5 mask measures distances to 2 %.
-        near = picture[tuple(places[distance <= 1.03 * distance.min()].T)]
+        # The 5 x 5 mask of the distance transform is accurate to 2 %.
+        near = image[tuple(places[distance <= 1.03 * distance.min()].T)]
         assert (near == filled[row, column]).all(1).any()
 
 
-def test_what_no_view_sees_takes_the_nearest_gaussian(asset: Asset) -> None:
+def test_hidden_texels_take_the_material_of_the_nearest_gaussian(asset: Asset) -> None:
     points = torch.tensor([[0.2, 0.1, 0.0], [-0.1, 0.0, 0.3]])
-    values = bake._beside(asset, points, normalize(points, dim=-1))
+    values = bake._nearest_material(asset, points, normalize(points, dim=-1))
     assert (values[:, :3] - colour(RADIUS * normalize(points, dim=-1))).abs().max() < 0.03

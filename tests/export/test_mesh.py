@@ -1,4 +1,4 @@
-"""Triangles from distances and from Gaussians, against shapes whose surface is known."""
+"""Meshes from distance grids and from Gaussians, against shapes with a known surface."""
 
 import math
 
@@ -13,11 +13,11 @@ from tumble.maths.directions import fibonacci_sphere
 from tumble.scene.gaussians import Gaussians
 
 CELLS = 48
-CELL = 2 * depth_fusion.REACH / CELLS
+CELL = 2 * depth_fusion.HALF_SIDE / CELLS
 
 
 def grid(n: int = CELLS) -> np.ndarray:
-    axis = np.linspace(-depth_fusion.REACH, depth_fusion.REACH, n + 1)
+    axis = np.linspace(-depth_fusion.HALF_SIDE, depth_fusion.HALF_SIDE, n + 1)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
@@ -26,32 +26,32 @@ def to_torus(x: np.ndarray) -> np.ndarray:
 
 
 def marched(distance: np.ndarray) -> Mesh:
-    return mesh.march(distance, -depth_fusion.REACH, CELL)
+    return mesh.marching_tetrahedra(distance, -depth_fusion.HALF_SIDE, CELL)
 
 
 def directed_edges(faces: np.ndarray) -> np.ndarray:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def assert_closed(made: Mesh) -> None:
-    """Each edge is there once each way: no hole, no branch, all faces turned alike."""
-    edges = directed_edges(made.faces)
+def assert_closed(shape: Mesh) -> None:
+    """Each edge occurs once in each direction: no holes, manifold, consistent orientation."""
+    edges = directed_edges(shape.faces)
     assert len(np.unique(edges, axis=0)) == len(edges)
     assert {tuple(e) for e in edges} == {tuple(e[::-1]) for e in edges}
 
 
-def euler(made: Mesh) -> int:
-    return len(made.vertices) - len(directed_edges(made.faces)) // 2 + len(made.faces)
+def euler_characteristic(shape: Mesh) -> int:
+    return len(shape.vertices) - len(directed_edges(shape.faces)) // 2 + len(shape.faces)
 
 
-def volume(made: Mesh) -> float:
-    """By the divergence theorem; positive when faces are counterclockwise from outside."""
-    a, b, c = np.moveaxis(made.vertices[made.faces], 1, 0)
+def volume(shape: Mesh) -> float:
+    """Volume by the divergence theorem; positive if faces are counterclockwise from outside."""
+    a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
     return float((a * np.cross(b, c)).sum() / 6)
 
 
-def area(made: Mesh) -> float:
-    a, b, c = np.moveaxis(made.vertices[made.faces], 1, 0)
+def area(shape: Mesh) -> float:
+    a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
@@ -63,66 +63,66 @@ def area(made: Mesh) -> float:
     ],
     ids=["sphere", "torus"],
 )
-def test_a_marched_surface_is_closed_and_lies_where_it_should(
+def test_marching_tetrahedra_give_a_closed_surface_in_the_right_place(
     distance: np.ndarray, genus: int, true_volume: float
 ) -> None:
-    made = marched(distance)
-    assert_closed(made)
-    assert euler(made) == 2 - 2 * genus
+    shape = marched(distance)
+    assert_closed(shape)
+    assert euler_characteristic(shape) == 2 - 2 * genus
     # A chord cuts off about cell^2 / (8 radius): 1 % of the volume at this resolution.
-    assert volume(made) == pytest.approx(true_volume, rel=0.012)
+    assert volume(shape) == pytest.approx(true_volume, rel=0.012)
 
 
-def test_marching_agrees_with_marching_cubes() -> None:
-    """An independent library on lopsided values: same area to 0.5 %, for both interpolate linearly along edges."""
+def test_marching_tetrahedra_agree_with_marching_cubes() -> None:
+    """Compared on an irregular shape: areas within 0.5 %, because both interpolate linearly along edges."""
     measure = pytest.importorskip("skimage.measure")
     x = grid()
     distance = np.linalg.norm(x * [1.0, 1.4, 2.0] - [0.2, 0, 0.1], axis=-1) - 0.6 + 0.05 * np.sin(5 * x[..., 0])
     vertices, faces, _, _ = measure.marching_cubes(distance, 0.0, spacing=(CELL,) * 3)
-    made = marched(distance)
-    other = Mesh(vertices.astype(np.float64) - depth_fusion.REACH, faces)
-    assert area(made) == pytest.approx(area(other), rel=5e-3)
-    assert volume(made) == pytest.approx(abs(volume(other)), rel=5e-3)
+    shape = marched(distance)
+    other = Mesh(vertices.astype(np.float64) - depth_fusion.HALF_SIDE, faces)
+    assert area(shape) == pytest.approx(area(other), rel=5e-3)
+    assert volume(shape) == pytest.approx(abs(volume(other)), rel=5e-3)
 
 
 def test_random_values_give_a_closed_surface() -> None:
-    """No sign pattern of a cell leaves a hole: nothing but noise, positive on the grid's faces."""
+    """No sign pattern of a cell leaves a hole: values are pure noise, positive on the grid's faces."""
     values = np.random.default_rng(0).normal(size=(12, 12, 12))
     for axis in range(3):
         np.moveaxis(values, axis, 0)[[0, -1]] = 1.0
-    assert_closed(mesh.march(values, 0.0, 1.0))
+    assert_closed(mesh.marching_tetrahedra(values, 0.0, 1.0))
 
 
 def fused(gaussians: Gaussians) -> Mesh:
-    values = depth_fusion.distances(gaussians, GAMMA, cells=CELLS, views=32, pixels=128)
-    return mesh.without_floaters(mesh.march(values, -depth_fusion.REACH, CELL))
+    values = depth_fusion.signed_distances(gaussians, GAMMA, cells=CELLS, views=32, pixels=128)
+    return mesh.remove_floaters(mesh.marching_tetrahedra(values, -depth_fusion.HALF_SIDE, CELL))
 
 
 def test_gaussians_on_a_torus_become_its_surface() -> None:
-    """A hole of radius 0.35 stays open. What is rendered lies within a Gaussian's thickness, 0.006, of its centre."""
-    made = fused(torus(3000))
-    assert_closed(made)
-    assert euler(made) == 0
-    error = np.abs(to_torus(made.vertices))
+    """The hole of radius 0.35 stays open; the surface is within a Gaussian's thickness, 0.006, of the centres."""
+    shape = fused(torus(3000))
+    assert_closed(shape)
+    assert euler_characteristic(shape) == 0
+    error = np.abs(to_torus(shape.vertices))
     assert error.mean() < 0.006
     assert error.max() < 0.3 * CELL
-    assert volume(made) == pytest.approx(2 * math.pi**2 * MAJOR * MINOR**2, rel=0.03)
+    assert volume(shape) == pytest.approx(2 * math.pi**2 * MAJOR * MINOR**2, rel=0.03)
 
 
-def test_a_side_that_no_frame_showed_leaves_no_hole() -> None:
-    """A turntable never shows the underside, so there are no Gaussians: views from below look at the inside's back."""
+def test_a_side_without_gaussians_is_closed() -> None:
+    """On a turntable the underside has no Gaussians, so views from below show backs of the upper side."""
     whole = sphere(3000, radius=0.8)
-    seen = whole.means[:, 1] > -0.5
-    made = fused(Gaussians(**{name: values[seen] for name, values in vars(whole).items()}))
-    assert_closed(made)
-    assert euler(made) == 2
-    # A plane over the hole at least, for level views see past it; the rest of the ball at most.
+    kept = whole.means[:, 1] > -0.5
+    shape = fused(Gaussians(**{name: values[kept] for name, values in vars(whole).items()}))
+    assert_closed(shape)
+    assert euler_characteristic(shape) == 2
+    # At least a plane closes the hole, because level views see free space below it; at most the rest of the sphere.
     height = 0.3
     cap = math.pi * height**2 * (3 * 0.8 - height) / 3
-    ball = 4 / 3 * math.pi * 0.8**3
-    assert 0.97 * (ball - cap) < volume(made) < 1.02 * ball
+    sphere_volume = 4 / 3 * math.pi * 0.8**3
+    assert 0.97 * (sphere_volume - cap) < volume(shape) < 1.02 * sphere_volume
     # The side with Gaussians is where it was.
-    radii = np.linalg.norm(made.vertices[made.vertices[:, 1] > -0.4], axis=1)
+    radii = np.linalg.norm(shape.vertices[shape.vertices[:, 1] > -0.4], axis=1)
     np.testing.assert_allclose(radii, 0.8, atol=CELL)
 
 
@@ -137,11 +137,11 @@ def test_a_thin_plate_keeps_both_sides() -> None:
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(disc)
     points = torch.cat([disc, disc * torch.tensor([1.0, 1.0, -1.0]), rim])
     normals = torch.cat([up, -up, torch.stack([turn.cos(), turn.sin(), 0 * turn], -1)])
-    made = fused(flat(points, normals, 2 * math.pi * 0.49))
-    assert_closed(made)
-    middle = np.linalg.norm(made.vertices[:, :2], axis=1) < 0.5
-    assert np.abs(np.abs(made.vertices[middle, 2]) - half).max() < 0.05 * CELL
-    assert volume(made) == pytest.approx(math.pi * 0.49 * 2 * half, rel=0.1)
+    shape = fused(flat(points, normals, 2 * math.pi * 0.49))
+    assert_closed(shape)
+    middle = np.linalg.norm(shape.vertices[:, :2], axis=1) < 0.5
+    assert np.abs(np.abs(shape.vertices[middle, 2]) - half).max() < 0.05 * CELL
+    assert volume(shape) == pytest.approx(math.pi * 0.49 * 2 * half, rel=0.1)
 
 
 def test_floaters_are_dropped_and_large_parts_kept() -> None:
@@ -150,21 +150,21 @@ def test_floaters_are_dropped_and_large_parts_kept() -> None:
         np.linalg.norm(x - centre, axis=-1) - radius
         for centre, radius in (([-0.4, 0, 0], 0.4), ([0.5, 0, 0], 0.3), ([0.5, 0.8, 0.5], 0.04))
     ]
-    made = mesh.without_floaters(marched(np.minimum.reduce(parts)))
-    assert euler(made) == 4, "two spheres"
-    assert made.vertices[:, 1].max() < 0.5
+    shape = mesh.remove_floaters(marched(np.minimum.reduce(parts)))
+    assert euler_characteristic(shape) == 4, "two spheres"
+    assert shape.vertices[:, 1].max() < 0.5
 
 
 def test_simplification_keeps_the_surface_closed_and_in_place() -> None:
-    made = mesh.simplified(marched(to_torus(grid())), 1500)
-    assert 1000 < len(made.faces) <= 1500
-    assert_closed(made)
-    assert np.abs(to_torus(made.vertices)).max() < 0.3 * CELL
+    shape = mesh.simplify(marched(to_torus(grid())), 1500)
+    assert 1000 < len(shape.faces) <= 1500
+    assert_closed(shape)
+    assert np.abs(to_torus(shape.vertices)).max() < 0.3 * CELL
 
 
 def test_normals_point_outwards() -> None:
-    made = marched(np.linalg.norm(grid(), axis=-1) - 0.8)
-    assert (mesh.vertex_normals(made) * made.vertices).sum(1).min() > 0.98 * 0.8
+    shape = marched(np.linalg.norm(grid(), axis=-1) - 0.8)
+    assert (mesh.vertex_normals(shape) * shape.vertices).sum(1).min() > 0.98 * 0.8
 
 
 def test_the_diameter_is_the_largest_distance() -> None:
@@ -172,30 +172,30 @@ def test_the_diameter_is_the_largest_distance() -> None:
     assert mesh.diameter(points) == pytest.approx(np.linalg.norm(points[:, None] - points, axis=-1).max(), rel=1e-9)
 
 
-def test_the_cameras_around_see_the_whole_unit_ball() -> None:
-    poses, camera = depth_fusion.around(20, 64)
+def test_the_surrounding_cameras_see_the_whole_unit_sphere() -> None:
+    poses, camera = depth_fusion.surrounding_cameras(20, 64)
     for i in range(20):
         x_cam = poses[i] @ fibonacci_sphere(500)
         assert x_cam[:, 2].min() > 1
         uv = camera.project(x_cam)
         assert uv.min() > 0
         assert uv.max() < 64
-        assert uv.max() > 58, "and waste little"
+        assert uv.max() > 58, "the sphere should fill the image"
 
 
 def test_an_atlas_has_no_overlaps_and_tangents_follow_u() -> None:
-    made = mesh.simplified(marched(to_torus(grid())), 2000)
-    flat_mesh = mesh.unwrapped(made, 256, 4)
+    shape = mesh.simplify(marched(to_torus(grid())), 2000)
+    flat_mesh = mesh.unwrap(shape, 256, 4)
     assert flat_mesh.uv.min() >= 0
     assert flat_mesh.uv.max() <= 1
-    places = flat_mesh.uv[flat_mesh.faces]
-    (u1, v1), (u2, v2) = ((places[:, i] - places[:, 0]).T for i in (1, 2))
-    # Counterclockwise from outside is counterclockwise on the texture, whose v runs down: no chart is mirrored.
+    corners = flat_mesh.uv[flat_mesh.faces]
+    (u1, v1), (u2, v2) = ((corners[:, i] - corners[:, 0]).T for i in (1, 2))
+    # Counterclockwise from outside is counterclockwise in the texture, whose v points down: no chart is mirrored.
     assert (u1 * v2 - u2 * v1 < 1e-12).all()
     assert (flat_mesh.tangents[:, 3] == 1).all()
     # Random points: each lies in at most one triangle.
     for x, y in np.random.default_rng(0).random((300, 2)):
-        a, b, c = ((x, y) - places[:, i] for i in range(3))
+        a, b, c = ((x, y) - corners[:, i] for i in range(3))
         turns = [p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((a, b), (b, c), (c, a))]
         assert (np.max(turns, 0) < -1e-9).sum() <= 1
     # Along an edge the position moves along the tangent when u grows.
@@ -206,8 +206,8 @@ def test_an_atlas_has_no_overlaps_and_tangents_follow_u() -> None:
     assert ((step * flat_mesh.tangents[corner, :3]).sum(1) * du)[clear].min() > 0
 
 
-def test_a_sphere_of_gaussians_comes_out_at_its_radius() -> None:
-    """Within the thickness of its Gaussians, and evenly so."""
+def test_a_sphere_of_gaussians_keeps_its_radius() -> None:
+    """Mean error below the thickness of the Gaussians, with a small spread."""
     error = np.linalg.norm(fused(sphere(2000, radius=0.8)).vertices, axis=1) - 0.8
     assert abs(error.mean()) < 0.006
     assert error.std() < 0.02 * CELL

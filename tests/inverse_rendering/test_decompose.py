@@ -1,4 +1,4 @@
-"""Stage 3: how the product of albedo and light is shared out. Whole runs are tested with the loop that drives them."""
+"""Stage 3: division of the product of albedo and light. Whole runs are tested in `test_pipeline`."""
 
 import math
 
@@ -12,33 +12,33 @@ from tumble.scene.environment import Environment
 from tumble.scene.material import DIELECTRIC, Material
 
 
-def params(log_tint: Tensor) -> decompose.Params:
+def params(log_specular_scale: Tensor) -> decompose.Params:
     gaussians = sphere(20)
     material = Material.constant(20, torch.tensor([0.6, 0.3, 0.05]), 0.5)
     light = Environment.from_radiance(torch.tensor([1.0, 2.0, 0.5]).expand(8, 16, 3))
-    return decompose.Params(gaussians, torch.tensor(30.0), material, light, torch.zeros(1, 6), log_tint)
+    return decompose.Params(gaussians, torch.tensor(30.0), material, light, torch.zeros(1, 6), log_specular_scale)
 
 
 def colours(p: decompose.Params) -> tuple[Tensor, Tensor]:
-    """What the diffuse lobe and what the highlight is made of."""
+    """Products of light with albedo and with F0, which determine the diffuse and the specular lobe."""
     light = p.environment.radiance[0, 0]
-    return p.material.albedo[0, 0] * light, p.material.f0 * p.log_tint.exp() * light
+    return p.material.albedo[0, 0] * light, p.material.f0 * p.log_specular_scale.exp() * light
 
 
-def test_the_colour_of_the_highlight_goes_to_the_light() -> None:
-    """A grey highlight asks for a light that is three times as bright in green and half as bright again in red."""
+def test_the_colour_of_the_specular_scale_moves_into_the_light() -> None:
+    """The specular lobe becomes grey under a light that is 3 times as bright in green and 1.5 times in red."""
     before = params(torch.tensor([1.5, 3.0, 0.5]).log())
-    after = decompose.shared_out(before)
+    after = decompose.absorb_specular_scale(before)
     for old, new in zip(colours(before), colours(after), strict=True):
         torch.testing.assert_close(new, old, rtol=1e-5, atol=0)
     assert after.material.f0.item() == pytest.approx(DIELECTRIC)
     torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.4, 0.1, 0.1]), rtol=1e-5, atol=0)
 
 
-def test_an_object_without_a_highlight_keeps_an_albedo_below_one() -> None:
+def test_an_object_without_a_specular_lobe_keeps_an_albedo_below_one() -> None:
     before = params(torch.full((3,), math.log(0.01)))
-    after = decompose.shared_out(before)
+    after = decompose.absorb_specular_scale(before)
     torch.testing.assert_close(colours(after)[0], colours(before)[0], rtol=1e-5, atol=0)
-    # The tint is too faint to say anything about colour: still 0.6, 0.3, 0.05, made as bright as may be.
+    # The lobe is too faint for its colour to be used: still 0.6, 0.3, 0.05, scaled to the largest allowed albedo.
     torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.9, 0.45, 0.075]), rtol=1e-5, atol=0)
     assert after.material.f0.item() < 0.1 * DIELECTRIC

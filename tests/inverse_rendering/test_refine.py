@@ -1,4 +1,4 @@
-"""Stage 2: what one step computes."""
+"""Stage 2: the parts of one step."""
 
 import math
 from dataclasses import replace
@@ -10,21 +10,21 @@ import torch
 from tumble.engine.loop import State
 from tumble.inverse_rendering import densify, losses, refine
 from tumble.inverse_rendering.refine import Config, Params, Points
-from tumble.inverse_rendering.sh_lighting import CoarseLight
+from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.maths.images import srgb_from_linear
 from tumble.maths.se3 import SE3, SO3, angle_between
 from tumble.recipes import SMOKE
 from tumble.rendering.rasterizer import Buffers
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture, TargetView
-from tumble.scene.gaussians import Gaussians, constant_sh, facing
+from tumble.scene.gaussians import Gaussians, constant_sh, quats_from_normals
 from tumble.scene.trajectory import Trajectory
 
 GAMMA = torch.tensor(30.0)
 
 
-def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkeypatch) -> None:
-    """A ball off the middle, rendered a little to the left of where it was photographed; mask and gradients too."""
+def test_the_crop_to_the_object_gives_the_losses_of_the_whole_image(monkeypatch) -> None:
+    """A disc off the centre, rendered a little to the left of its position in the input image; also gradients."""
     h, w, n = 60, 70, 12
     rng = torch.Generator().manual_seed(0)
     like = {"generator": rng, "dtype": torch.float64}
@@ -32,108 +32,108 @@ def test_a_window_around_the_object_gives_the_losses_of_the_whole_picture(monkey
     rendered, mask = (((row - 25) ** 2 + (column - x) ** 2 < 100).double() for x in (38, 40))
     images = [(rendered * torch.rand(h, w, **like)).requires_grad_() for _ in range(3)]
     normal, rgb = ((rendered[..., None] * torch.rand(h, w, 3, **like)).requires_grad_() for _ in range(2))
-    nothing = torch.zeros(n)
-    view = Buffers(*images, normal, rgb, {}, nothing + 1, nothing.int(), torch.zeros(h, w, dtype=torch.int32))
+    zero = torch.zeros(n)
+    view = Buffers(*images, normal, rgb, {}, zero + 1, zero.int(), torch.zeros(h, w, dtype=torch.int32))
     truth = TargetView(mask[..., None] * torch.rand(h, w, 3, **like), mask, torch.ones(h, w, 1, dtype=torch.float64))
     means = 0.1 * torch.randn(n, 3, **like)
     gaussians = Gaussians(means, torch.randn(n, 4, **like), means - 2, means[:, 0], means[:, None])
-    params = Params(Points(gaussians, means), torch.tensor(30.0), CoarseLight.constant(0.4, means), torch.zeros(1, 6))
+    params = Params(Points(gaussians, means), torch.tensor(30.0), SHLight.constant(0.4, means), torch.zeros(1, 6))
     T_cam_obj = SE3.from_rotation(SO3.exp(0.3 * means[0]), torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64))
     arguments = (Config(), params, view, truth, Camera.from_fov(math.radians(40), h, w), T_cam_obj, 0.5)
 
     def terms_and_gradients() -> list[torch.Tensor]:
         terms = refine._terms(*arguments)
         gradients = torch.autograd.grad(torch.stack(list(terms.values())).sum(), [*images, normal, rgb])
-        # The rasterizer has nothing to differentiate where nothing is.
+        # Only covered pixels have a gradient in the rasterizer.
         return [*terms.values(), *(x[rendered > 0] for x in gradients)]
 
-    cut, _, _, share = refine._window(view, truth, arguments[4])
-    assert cut.alpha.shape == (19 + 2 * losses.SSIM_MARGIN, 21 + 2 * losses.SSIM_MARGIN)
-    assert share == cut.alpha.numel() / (h * w)
-    found = terms_and_gradients()
-    monkeypatch.setattr(refine, "_window", lambda view, truth, camera: (view, truth, camera, 1.0))
-    torch.testing.assert_close(found, terms_and_gradients())
+    cropped, _, _, fraction = refine._crop_to_object(view, truth, arguments[4])
+    assert cropped.alpha.shape == (19 + 2 * losses.SSIM_MARGIN, 21 + 2 * losses.SSIM_MARGIN)
+    assert fraction == cropped.alpha.numel() / (h * w)
+    from_crop = terms_and_gradients()
+    monkeypatch.setattr(refine, "_crop_to_object", lambda view, truth, camera: (view, truth, camera, 1.0))
+    torch.testing.assert_close(from_crop, terms_and_gradients())
 
 
-def test_a_picture_with_nothing_in_it_has_losses_too() -> None:
+def test_a_black_image_is_not_cropped() -> None:
     black, none = torch.zeros(20, 20), torch.zeros(0)
     coloured = torch.zeros(20, 20, 3)
     view = Buffers(black, black, black, coloured, coloured, {}, none, none.int(), black.int())
     truth, camera = TargetView(coloured, black, torch.ones(20, 20, 1)), Camera.from_fov(1.0, 20, 20)
-    assert refine._window(view, truth, camera) == (view, truth, camera, 1.0)
+    assert refine._crop_to_object(view, truth, camera) == (view, truth, camera, 1.0)
 
 
-def ball() -> tuple[Points, SE3, Capture]:
-    """A ball with a pattern, four poses and what was photographed in them."""
+def textured_sphere() -> tuple[Points, SE3, Capture]:
+    """A textured sphere, four poses, and a capture rendered at these poses."""
     rng = torch.Generator().manual_seed(1)
     means = torch.nn.functional.normalize(torch.randn(600, 3, generator=rng), dim=-1)
     flat = torch.tensor([-2.4, -2.4, -4.6]).expand(600, 3)
-    gaussians = Gaussians(means, facing(means), flat, torch.zeros(600), constant_sh(means * 0))
+    gaussians = Gaussians(means, quats_from_normals(means), flat, torch.zeros(600), constant_sh(means * 0))
     points = Points(gaussians, 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]])))
     axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])
     true = SE3.from_rotation(SO3.exp(axes), torch.tensor([0.02, 0.05, 4.0]).expand(4, 3).contiguous())
-    light, camera = CoarseLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
+    light, camera = SHLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
     views = [refine.render(points, GAMMA, light, true[k], Trajectory(true, "camera"), camera) for k in range(4)]
     images = torch.stack([(srgb_from_linear(v.rgb).clamp(0, 1) * 255).round().to(torch.uint8) for v in views])
     masks = torch.stack([torch.where(v.alpha > 0.5, OBJECT, BACKGROUND) for v in views]).to(torch.uint8)
     return points, true, Capture(images, masks, camera, tuple("abcd"), "camera")
 
 
-def test_realignment_brings_turned_frames_back_and_leaves_the_rest() -> None:
-    """Two of four photographs were taken half a degree and two degrees from where the run believes."""
-    points, true, capture = ball()
-    turns = torch.tensor([[0.0, 0, 0], [0.0087, 0, 0], [0.0, 0, 0], [0.02, -0.02, 0.02]])
-    base = Trajectory(SE3.from_rotation(SO3.exp(turns) @ true.rotation, true.xyz), "camera")
-    params = Params(points, GAMMA, CoarseLight.constant(0.4, turns), torch.zeros(4, 6))
+def test_alignment_corrects_wrong_poses_and_keeps_correct_ones() -> None:
+    """Two of four initial poses have errors of half a degree and two degrees."""
+    points, true, capture = textured_sphere()
+    errors = torch.tensor([[0.0, 0, 0], [0.0087, 0, 0], [0.0, 0, 0], [0.02, -0.02, 0.02]])
+    base = Trajectory(SE3.from_rotation(SO3.exp(errors) @ true.rotation, true.xyz), "camera")
+    params = Params(points, GAMMA, SHLight.constant(0.4, errors), torch.zeros(4, 6))
     inputs = refine.Inputs(capture, base)
     for _ in range(4):
-        refine._realign(inputs, State(0, params, None, torch.Generator(), {}))
-    found = torch.stack([refine.pose(params, inputs, k).rotation.wxyz for k in range(4)])
-    errors = np.degrees(angle_between(SO3(found), true.rotation).numpy())
-    # A tenth of a pixel: the pictures are quantized, the masks hard.
-    assert errors.max() < 0.25, errors
+        refine._align_poses(inputs, State(0, params, None, torch.Generator(), {}))
+    aligned = torch.stack([refine.pose(params, inputs, k).rotation.wxyz for k in range(4)])
+    degrees = np.degrees(angle_between(SO3(aligned), true.rotation).numpy())
+    # A tenth of a pixel, since the images are quantized and the masks binary.
+    assert degrees.max() < 0.25, degrees
 
 
-def test_what_no_frame_has_shown_since_the_last_densification_is_dropped() -> None:
-    _, true, capture = ball()
+def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_pruned() -> None:
+    _, true, capture = textured_sphere()
     growth = densify.Config(max_gaussians=600, grow_score=math.inf, refine_every=1000)
     cfg = replace(SMOKE.refine, points=600, densification=growth)
     inputs = refine.Inputs(capture, Trajectory(true, "camera"))
     state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
-    shown = []
+    visible = []
     for state.step in range(1, 5):
         refine.step(cfg, inputs, state)
-        shown.append(state.memory["shown"] > growth.prune_weight)
-    # What any frame shows stays shown, and every frame hides the ball's other side.
-    assert all((before <= after).all() for before, after in pairwise(shown))
-    assert 0.2 < shown[0].float().mean() < 0.8 * shown[3].float().mean()
-    state.memory["shown"][::3] = 0.9 * growth.prune_weight
-    # One view is scored; what it hides stays all the same.
+        visible.append(state.memory["max_weight"] > growth.prune_weight)
+    # Gaussians that any frame has shown remain marked, and every frame hides the back side of the sphere.
+    assert all((before <= after).all() for before, after in pairwise(visible))
+    assert 0.2 < visible[0].float().mean() < 0.8 * visible[3].float().mean()
+    state.memory["max_weight"][::3] = 0.9 * growth.prune_weight
+    # Only one view is scored, but Gaussians that it hides are kept.
     refine._densify(replace(cfg, densification=replace(growth, score_views=1)), inputs, state)
-    left = len(state.params.points.albedo_logits)
-    assert left == (shown[3] & (torch.arange(600) % 3 > 0)).sum()
-    assert torch.equal(state.memory["shown"], torch.zeros(left))
+    n_left = len(state.params.points.albedo_logits)
+    assert n_left == (visible[3] & (torch.arange(600) % 3 > 0)).sum()
+    assert torch.equal(state.memory["max_weight"], torch.zeros(n_left))
 
 
-def test_colours_turn_normals_by_a_share_of_their_gradient(monkeypatch) -> None:
-    """A Gaussian seen face to face under a light from the side: only its colour tells its normal."""
+def test_normals_receive_a_fraction_of_the_gradient_from_shading(monkeypatch) -> None:
+    """A Gaussian facing the camera, under a light from the side: only its colour depends on the normal."""
     means = torch.zeros(1, 3)
     gaussians = Gaussians(
         means, torch.tensor([[1.0, 0.2, 0.1, 0.0]]), torch.full((1, 3), -1.5), torch.zeros(1), constant_sh(means)
     )
-    light = CoarseLight.constant(0.4, means)
+    light = SHLight.constant(0.4, means)
     light.coefficients[3] = -0.8
     T_cam_obj = SE3(torch.tensor([0.0, 1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
     trajectory = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), "camera")
     camera = Camera.from_fov(0.6, 24, 24)
 
-    def turned(share: float) -> torch.Tensor:
-        monkeypatch.setattr(refine, "HINT", share)
+    def gradient(fraction: float) -> torch.Tensor:
+        monkeypatch.setattr(refine, "NORMAL_GRADIENT", fraction)
         quats = gaussians.quats.clone().requires_grad_()
         points = Points(Gaussians(means, quats, gaussians.log_scales, gaussians.sdf, gaussians.sh), means)
         view = refine.render(points, GAMMA, light, T_cam_obj, trajectory, camera)
         return torch.autograd.grad(view.rgb.sum(), quats)[0]
 
-    none, some, all_of_it = (turned(share) for share in (0.0, 0.3, 1.0))
-    assert (all_of_it - none).norm() > 1e-3
-    torch.testing.assert_close(some, none + 0.3 * (all_of_it - none), atol=1e-5, rtol=1e-3)
+    none, part, full = (gradient(fraction) for fraction in (0.0, 0.3, 1.0))
+    assert (full - none).norm() > 1e-3
+    torch.testing.assert_close(part, none + 0.3 * (full - none), atol=1e-5, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""The rotation-aware colour: right for a Lambertian surface, and turning everything together changes nothing."""
+"""Spherical-harmonic lighting: closed forms, invariance to a common rotation, and gradients."""
 
 import math
 from dataclasses import replace
@@ -6,50 +6,50 @@ from dataclasses import replace
 import torch
 
 from tumble.inverse_rendering import sh_lighting
-from tumble.inverse_rendering.sh_lighting import CoarseLight
+from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.maths import spherical_harmonics
 from tumble.maths.directions import fibonacci_sphere, texel_directions, texel_solid_angles
 from tumble.maths.se3 import SO3
 from tumble.rendering import brdf
 
 
-def test_a_constant_light_is_seen_from_everywhere() -> None:
-    light = CoarseLight.constant(0.4, torch.zeros(1))
+def test_a_constant_light_has_the_same_radiance_in_all_directions() -> None:
+    light = SHLight.constant(0.4, torch.zeros(1))
     d = fibonacci_sphere(50)
     torch.testing.assert_close(light.diffuse(d), torch.full((50, 3), 0.4))
     torch.testing.assert_close(light.glossy(d), torch.full((50, 3), 0.4))
 
 
-def test_the_colour_is_albedo_times_light_plus_fresnel_times_mirrored_light() -> None:
-    light = CoarseLight.constant(0.5, torch.zeros(1))
+def test_the_radiance_is_albedo_times_light_plus_split_sum_times_reflected_light() -> None:
+    light = SHLight.constant(0.5, torch.zeros(1))
     n = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     view = torch.tensor([[0.0, 0.0, 1.0], [math.sin(1.2), 0.0, math.cos(1.2)]])
     albedo = torch.tensor([[0.8, 0.2, 0.1]] * 2)
-    found = sh_lighting.radiance(light, albedo, n, view, torch.eye(3))
+    radiance = sh_lighting.radiance(light, albedo, n, view, torch.eye(3))
     nov = torch.tensor([[1.0], [math.cos(1.2)]])
-    share = 0.04 * brdf.split_sum(brdf.split_sum_table(), nov, torch.full_like(nov, 0.5))
-    torch.testing.assert_close(found, 0.5 * albedo + 0.5 * share, atol=0.5 * 0.04 * 0.03, rtol=0)
-    doubled = replace(light, log_highlight=torch.tensor(math.log(2)))
-    found = sh_lighting.radiance(doubled, albedo, n, view, torch.eye(3))
-    torch.testing.assert_close(found, 0.5 * albedo + share, atol=0.04 * 0.03, rtol=0)
+    reflectance = 0.04 * brdf.split_sum(brdf.split_sum_table(), nov, torch.full_like(nov, 0.5))
+    torch.testing.assert_close(radiance, 0.5 * albedo + 0.5 * reflectance, atol=0.5 * 0.04 * 0.03, rtol=0)
+    doubled = replace(light, log_specular_scale=torch.tensor(math.log(2)))
+    radiance = sh_lighting.radiance(doubled, albedo, n, view, torch.eye(3))
+    torch.testing.assert_close(radiance, 0.5 * albedo + reflectance, atol=0.04 * 0.03, rtol=0)
 
 
-def test_turning_object_camera_and_light_together_changes_nothing() -> None:
+def test_a_common_rotation_of_object_camera_and_light_changes_nothing() -> None:
     torch.manual_seed(0)
-    light = CoarseLight(torch.randn(16, 3), torch.randn(()))
+    light = SHLight(torch.randn(16, 3), torch.randn(()))
     n, view = (torch.nn.functional.normalize(torch.randn(20, 3), dim=-1) for _ in range(2))
-    R_env_obj, turn = SO3.exp(torch.randn(3)).matrix(), SO3.exp(torch.randn(3)).matrix()
+    R_env_obj, rotation = SO3.exp(torch.randn(3)).matrix(), SO3.exp(torch.randn(3)).matrix()
     albedo = torch.rand(20, 3)
-    one = sh_lighting.radiance(light, albedo, n, view, R_env_obj)
-    other = sh_lighting.radiance(light, albedo, n @ turn.T, view @ turn.T, R_env_obj @ turn.T)
-    torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
+    before = sh_lighting.radiance(light, albedo, n, view, R_env_obj)
+    after = sh_lighting.radiance(light, albedo, n @ rotation.T, view @ rotation.T, R_env_obj @ rotation.T)
+    torch.testing.assert_close(before, after, atol=1e-5, rtol=0)
 
 
-def test_irradiance_and_highlight_come_from_one_light() -> None:
-    """A broad lamp at +x over an even floor of light, its irradiance / pi by quadrature."""
+def test_both_lobes_match_the_light_they_are_derived_from() -> None:
+    """A broad light at +x plus uniform light; irradiance / pi by quadrature."""
     fine = texel_directions(64, 128, dtype=torch.float64)
     radiance = (3.0 + 2 * fine[..., :1].clamp_min(0) ** 2).expand(-1, -1, 3)
-    light = CoarseLight(spherical_harmonics.project(radiance), torch.tensor(0.0))
+    light = SHLight(spherical_harmonics.project(radiance), torch.tensor(0.0))
     n = fibonacci_sphere(40).double()
     cosine = torch.einsum("hwd,nd->nhw", fine, n).clamp_min(0)
     area = texel_solid_angles(64, 128).double()
@@ -57,26 +57,26 @@ def test_irradiance_and_highlight_come_from_one_light() -> None:
     # Softplus adds up to 0.05 at these values of about 3, the cut-off of the series less than 0.01.
     torch.testing.assert_close(light.diffuse(n), irradiance, atol=0.06, rtol=0)
     x = torch.eye(3, dtype=torch.float64)[:1]
-    assert (light.glossy(x) - light.glossy(-x) > 0.7).all(), "the lamp is mirrored from where it is"
-    found = sh_lighting.environment(light, 16)
-    error = (found.lookup(fine) - radiance).abs()
+    assert (light.glossy(x) - light.glossy(-x) > 0.7).all(), "the glossy lobe is brighter in the direction of the light"
+    environment = sh_lighting.environment(light, 16)
+    error = (environment.lookup(fine) - radiance).abs()
     assert error.mean() < 0.15
-    torch.testing.assert_close(found.integral() / (4 * math.pi), light.glossy(n).mean(0), atol=0.02, rtol=0)
+    torch.testing.assert_close(environment.integral() / (4 * math.pi), light.glossy(n).mean(0), atol=0.02, rtol=0)
 
 
-def test_the_colour_and_its_gradients_are_those_of_the_formula() -> None:
+def test_the_radiance_and_its_gradients_match_the_formula() -> None:
     rng = torch.Generator().manual_seed(0)
     like = {"generator": rng, "dtype": torch.float64}
     n, view = (torch.nn.functional.normalize(torch.randn(8, 3, **like), dim=-1) for _ in range(2))
-    # Both sides of the horizon; and a matrix that is no rotation, for its nine numbers are taken as free.
+    # Cameras on both sides of the horizon; the matrix is no rotation, since its nine entries are independent inputs.
     n_v = (n * view).sum(-1, keepdim=True)
     assert 0 < (n_v > 0).sum() < 8
     coefficients, albedo, R = torch.randn(16, 3, **like), torch.rand(8, 3, **like), torch.randn(3, 3, **like)
-    log_highlight = torch.randn((), **like)
-    light = CoarseLight(coefficients, log_highlight)
-    share = 0.04 * sum(c * (1 - n_v.clamp(0, 1)) ** k for k, c in enumerate(sh_lighting.LOBE))
+    log_specular_scale = torch.randn((), **like)
+    light = SHLight(coefficients, log_specular_scale)
+    reflectance = 0.04 * sum(c * (1 - n_v.clamp(0, 1)) ** k for k, c in enumerate(sh_lighting.SPLIT_SUM_POLYNOMIAL))
     mirrored = light.glossy((2 * n_v * n - view) @ R.T)
-    expected = albedo * light.diffuse(n @ R.T) + log_highlight.exp() * share * mirrored
+    expected = albedo * light.diffuse(n @ R.T) + log_specular_scale.exp() * reflectance * mirrored
     torch.testing.assert_close(sh_lighting.radiance(light, albedo, n, view, R), expected)
-    inputs = [x.requires_grad_() for x in (coefficients, log_highlight, albedo, n, view, R)]
-    assert torch.autograd.gradcheck(lambda c, h, *rest: sh_lighting.radiance(CoarseLight(c, h), *rest), inputs)
+    inputs = [x.requires_grad_() for x in (coefficients, log_specular_scale, albedo, n, view, R)]
+    assert torch.autograd.gradcheck(lambda c, h, *rest: sh_lighting.radiance(SHLight(c, h), *rest), inputs)

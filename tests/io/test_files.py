@@ -1,4 +1,4 @@
-"""Pictures on disk: what is written comes back, and what is broken is refused with the file, the rule and the fix."""
+"""Image and JSON files: written values are read back, and invalid files raise an error with the file, rule and fix."""
 
 from pathlib import Path
 
@@ -35,13 +35,13 @@ def test_hdr_keeps_eight_bits_of_the_brightest_channel(tmp_path: Path) -> None:
     assert (np.abs(files.read_radiance(tmp_path / "x.hdr") - values) / brightest).max() < 1 / 128
 
 
-def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_no_file(tmp_path: Path) -> None:
     def fail(partial: Path) -> None:
-        partial.write_bytes(b"half of it")
+        partial.write_bytes(b"incomplete")
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        files.write_whole(tmp_path / "x.png", fail)
+        files.write_atomically(tmp_path / "x.png", fail)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -54,7 +54,7 @@ def test_json_has_no_nan_in_either_direction(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["x.exr", "x.hdr", "x.png", "x.json"])
-def test_junk_and_missing_files_are_named(tmp_path: Path, name: str) -> None:
+def test_errors_name_invalid_and_missing_files(tmp_path: Path, name: str) -> None:
     read = {".png": files.read_image, ".json": files.read_json}.get(Path(name).suffix, files.read_radiance)
     with pytest.raises(BadFile, match=f"{name}: is missing"):
         read(tmp_path / name)
@@ -64,7 +64,7 @@ def test_junk_and_missing_files_are_named(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["x.exr", "x.hdr", "x.png"])
-def test_a_file_cut_off_in_the_middle_is_refused(tmp_path: Path, name: str) -> None:
+def test_truncated_files_are_rejected(tmp_path: Path, name: str) -> None:
     values = RNG.random((64, 64, 3)).astype(np.float32)
     {".exr": files.write_exr, ".hdr": files.write_hdr}.get(
         Path(name).suffix, lambda path, v: files.write_png(path, (v * 255).astype(np.uint8))
@@ -76,19 +76,19 @@ def test_a_file_cut_off_in_the_middle_is_refused(tmp_path: Path, name: str) -> N
         read(tmp_path / name)
 
 
-def test_pictures_too_large_are_refused_before_they_are_decoded(tmp_path: Path) -> None:
+def test_too_large_images_are_rejected_before_decoding(tmp_path: Path) -> None:
     (tmp_path / "x.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 200000\n")
     with pytest.raises(BadFile, match="over the limit"):
         files.read_radiance(tmp_path / "x.hdr")
 
 
-def test_non_finite_pixels_are_refused(tmp_path: Path) -> None:
+def test_non_finite_pixels_are_rejected(tmp_path: Path) -> None:
     files.write_exr(tmp_path / "x.exr", np.full((2, 2, 1), np.nan, np.float32))
     with pytest.raises(BadFile, match="NaN"):
         files.read_radiance(tmp_path / "x.exr")
 
 
-def test_sixteen_bit_pictures_are_refused_with_the_fix(tmp_path: Path) -> None:
+def test_sixteen_bit_images_are_rejected_with_the_fix(tmp_path: Path) -> None:
     from PIL import Image
 
     Image.fromarray(np.zeros((2, 2), np.uint16)).save(tmp_path / "x.png")
@@ -97,13 +97,13 @@ def test_sixteen_bit_pictures_are_refused_with_the_fix(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x"])
-def test_no_path_leaves_the_folder(tmp_path: Path, name: str) -> None:
+def test_paths_outside_the_folder_are_rejected(tmp_path: Path, name: str) -> None:
     with pytest.raises(BadFile, match="leaves the folder"):
-        files.inside(tmp_path, name)
+        files.path_inside(tmp_path, name)
 
 
-def test_no_link_leaves_the_folder(tmp_path: Path) -> None:
+def test_links_outside_the_folder_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "link").symlink_to(tmp_path)
     with pytest.raises(BadFile, match="leaves the folder"):
-        files.inside(tmp_path / "in", "link/x.png")
+        files.path_inside(tmp_path / "in", "link/x.png")

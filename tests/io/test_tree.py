@@ -1,4 +1,4 @@
-"""Trees of tensors: names, maps, and the way to disk and back."""
+"""Trees of tensors: names, maps, saving and loading; and plugins."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from tumble.scene.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
-class Leafy:
+class SmallTree:
     x: Tensor
     more: dict[str, Tensor]
     word: str
@@ -26,7 +26,7 @@ class Leafy:
     nothing: Tensor | None
 
 
-def an_asset() -> Asset:
+def make_asset() -> Asset:
     torch.manual_seed(0)
     gaussians = Gaussians(torch.randn(5, 3), torch.randn(5, 4), torch.randn(5, 3), torch.randn(5), torch.randn(5, 4, 3))
     return Asset(
@@ -39,8 +39,8 @@ def an_asset() -> Asset:
     )
 
 
-def test_an_asset_comes_back_from_disk_bit_for_bit(tmp_path: Path) -> None:
-    asset = an_asset()
+def test_a_loaded_asset_equals_the_saved_one_bit_for_bit(tmp_path: Path) -> None:
+    asset = make_asset()
     tree.save(asset, tmp_path / "asset.safetensors")
     again = tree.load(Asset, tmp_path / "asset.safetensors")
     before, after = tree.named_tensors(asset), tree.named_tensors(again)
@@ -51,36 +51,36 @@ def test_an_asset_comes_back_from_disk_bit_for_bit(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["asset.safetensors"]
 
 
-def test_facts_dicts_and_absent_parts_survive_the_disk(tmp_path: Path) -> None:
-    leafy = Leafy(torch.arange(3), {"a": torch.ones(2), "b": torch.zeros(1)}, "word", (1, 2), None)
-    tree.save(leafy, tmp_path / "leafy")
-    again = tree.load(Leafy, tmp_path / "leafy")
+def test_plain_values_dicts_and_none_are_saved_and_loaded(tmp_path: Path) -> None:
+    small = SmallTree(torch.arange(3), {"a": torch.ones(2), "b": torch.zeros(1)}, "word", (1, 2), None)
+    tree.save(small, tmp_path / "small")
+    again = tree.load(SmallTree, tmp_path / "small")
     assert (again.word, again.sizes, again.nothing) == ("word", (1, 2), None)
     assert list(again.more) == ["a", "b"]
-    assert torch.equal(again.x, leafy.x)
+    assert torch.equal(again.x, small.x)
 
 
 def test_views_of_one_storage_can_be_saved(tmp_path: Path) -> None:
     whole = torch.arange(6.0)
-    tree.save(Leafy(whole[:3], {"tail": whole[3:]}, "", (), None), tmp_path / "views")
-    assert tree.load(Leafy, tmp_path / "views").more["tail"].tolist() == [3, 4, 5]
+    tree.save(SmallTree(whole[:3], {"tail": whole[3:]}, "", (), None), tmp_path / "views")
+    assert tree.load(SmallTree, tmp_path / "views").more["tail"].tolist() == [3, 4, 5]
 
 
-def test_a_file_of_another_class_is_refused_by_name(tmp_path: Path) -> None:
+def test_loading_another_class_is_rejected(tmp_path: Path) -> None:
     tree.save(Camera.from_fov(0.5, 2, 2), tmp_path / "camera")
     with pytest.raises(ValueError, match="holds a Camera, not a Asset"):
         tree.load(Asset, tmp_path / "camera")
 
 
-def test_map_reaches_every_tensor_and_leaves_facts_alone() -> None:
-    doubled = tree.map(lambda x: 2 * x, an_asset())
-    assert torch.equal(doubled.gaussians.means, 2 * an_asset().gaussians.means)
+def test_map_changes_every_tensor_and_no_plain_value() -> None:
+    doubled = tree.map(lambda x: 2 * x, make_asset())
+    assert torch.equal(doubled.gaussians.means, 2 * make_asset().gaussians.means)
     assert doubled.trajectory.light == "camera"
     assert tree.named_tensors(doubled)["trajectory.T_cam_obj.xyz"].shape == (3, 3)
-    assert not tree.detach(tree.map(lambda x: x.requires_grad_(), an_asset())).gamma.requires_grad
+    assert not tree.detach(tree.map(lambda x: x.requires_grad_(), make_asset())).gamma.requires_grad
 
 
-def test_a_plugin_is_found_by_its_file_name_and_an_unknown_one_lists_the_known() -> None:
-    assert hasattr(plugins.named("datasets", "folder"), "load")
-    with pytest.raises(ValueError, match=r"no 'nope' in tumble/datasets; there are: .*folder"):
-        plugins.named("datasets", "nope")
+def test_plugins_load_by_file_name_and_an_unknown_name_lists_the_available() -> None:
+    assert hasattr(plugins.load_plugin("datasets", "folder"), "load")
+    with pytest.raises(ValueError, match=r"no 'nope' in tumble/datasets; available: .*folder"):
+        plugins.load_plugin("datasets", "nope")

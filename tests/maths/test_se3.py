@@ -1,4 +1,4 @@
-"""Group axioms, also near the identity and the half turn; SciPy and the matrix exponential as oracles."""
+"""Group axioms, also near the identity and the angle pi; SciPy and the matrix exponential as oracles."""
 
 import math
 from collections.abc import Callable
@@ -96,14 +96,14 @@ def test_log_undoes_exp_up_to_the_half_turn(tangent: Tensor) -> None:
 
 @settings(deadline=None)
 @given(rotation_vectors())
-def test_matrices_give_back_their_quaternions(omega: Tensor) -> None:
+def test_rotations_convert_to_matrices_and_back(omega: Tensor) -> None:
     R = SO3.exp(omega)
     same(SO3.from_matrix(R.matrix()).matrix(), R.matrix())
     T = SE3(R.wxyz, omega + 1)
     same(SE3.from_matrix(T.matrix()).matrix(), T.matrix())
 
 
-def test_a_rotation_longer_than_half_a_turn_comes_back_the_short_way() -> None:
+def test_the_log_of_a_rotation_beyond_pi_is_the_shortest_rotation() -> None:
     omega = torch.tensor([0.0, 0.0, 1.5 * math.pi], dtype=torch.float64)
     same(SO3.exp(omega).log(), torch.tensor([0.0, 0.0, -0.5 * math.pi], dtype=torch.float64))
     assert SO3.exp(omega).angle().item() == pytest.approx(0.5 * math.pi)
@@ -159,7 +159,7 @@ def test_float32_keeps_its_digits(angle: float) -> None:
     torch.testing.assert_close(SO3.exp(omega).log(), omega, rtol=1e-6, atol=0)
 
 
-def test_slerp_turns_at_constant_speed() -> None:
+def test_slerp_has_constant_angular_speed() -> None:
     a, b = SO3.exp(random_tangents(5, seed=1)[:, 3:]), SO3.exp(random_tangents(5, seed=2)[:, 3:])
     whole = angle_between(a, b)
     for t in (0.0, 0.25, 1.0):
@@ -200,7 +200,7 @@ def test_umeyama_finds_a_known_similarity(n: int) -> None:
     same(offset, t, 1e-11)
 
 
-def test_umeyama_maps_the_second_set_on_the_first_and_not_the_other_way() -> None:
+def test_umeyama_maps_from_b_to_a() -> None:
     x_b = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]], dtype=torch.float64)
     y_a = torch.tensor([[0, 2.0, 0], [-2, 0, 0], [0, 0, 2], [0, 0, 0]], dtype=torch.float64)
     scale, rotation, _ = umeyama(x_b, y_a)
@@ -209,7 +209,7 @@ def test_umeyama_maps_the_second_set_on_the_first_and_not_the_other_way() -> Non
 
 
 def test_umeyama_never_returns_a_reflection() -> None:
-    """The mirror image of a set is best met by a rotation with a smaller scale, here found by brute force."""
+    """A mirrored set is best approximated by a rotation with a smaller scale, here found by brute force."""
     x_b = random_tangents(12)[:, :3]
     x_b = x_b - x_b.mean(0)
     y_a = x_b * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
@@ -222,14 +222,14 @@ def test_umeyama_never_returns_a_reflection() -> None:
     ours = residual(rotation.matrix(), scale)
     assert offset.norm() < EXACT
     R = torch.from_numpy(Rotation.from_quat(np.random.default_rng(0).normal(size=(20000, 4))).as_matrix())
-    # The best scale of each rotation; a negative one would be a reflection in disguise.
+    # The best scale of each rotation; a negative scale would be a reflection.
     s = ((y_a * (x_b @ R.mT)).sum((-2, -1)) / x_b.square().sum()).clamp_min(0)
     assert ours <= residual(R, s).min() + EXACT
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-4])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_umeyama_refuses_points_on_a_line(width: float, dtype: torch.dtype) -> None:
+def test_umeyama_rejects_collinear_points(width: float, dtype: torch.dtype) -> None:
     along = torch.linspace(-1, 1, 9, dtype=dtype)
     x_b = torch.stack([along, width * (along * 7).sin(), width * (along * 5).cos()], -1)
     with pytest.raises(ValueError, match="line"):

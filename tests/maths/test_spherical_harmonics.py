@@ -1,4 +1,4 @@
-"""Against SciPy's complex harmonics, and irradiance against brute-force integrals."""
+"""Spherical harmonics against SciPy, and irradiance against brute-force integrals."""
 
 import math
 import warnings
@@ -77,7 +77,7 @@ def irradiance(radiance: Tensor, n: Tensor) -> Tensor:
 def test_irradiance_of_uniform_light_is_pi() -> None:
     uniform = torch.ones(16, 32, 1, dtype=DOUBLE)
     E = basis(fibonacci_sphere(20, dtype=DOUBLE), 3) @ irradiance_coefficients(project(uniform))
-    # Texels stand for their centres: (pi / 16)^2 / 12 of the constant leaks into degree 2.
+    # The light is evaluated at texel centres: (pi / 16)^2 / 12 of the constant leaks into degree 2.
     torch.testing.assert_close(E, torch.full_like(E, math.pi), rtol=0, atol=0.01)
 
 
@@ -86,22 +86,22 @@ def test_irradiance_of_smooth_light_is_the_cosine_integral() -> None:
     coefficients = torch.randn(16, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
     radiance = basis(texel_directions(128, 256, dtype=DOUBLE), 3) @ coefficients
     n = fibonacci_sphere(30, dtype=DOUBLE)
-    found = basis(n, 3) @ irradiance_coefficients(coefficients)
+    approximated = basis(n, 3) @ irradiance_coefficients(coefficients)
     # Midpoint quadrature over 128 rows: (pi / 128)^2 = 6e-4, times a sum of coefficients of order one.
-    torch.testing.assert_close(found, irradiance(radiance, n), rtol=0, atol=2e-3)
+    torch.testing.assert_close(approximated, irradiance(radiance, n), rtol=0, atol=2e-3)
 
 
-def test_irradiance_of_a_window_is_met_within_a_tenth() -> None:
-    """What degree 4 and above, left out, may hold of the irradiance of a small light."""
+def test_irradiance_of_a_small_light_is_accurate_to_a_tenth() -> None:
+    """The error is the omitted part of the irradiance of degree 4 and above."""
     radiance = torch.zeros(32, 64, 3, dtype=DOUBLE)
     radiance[8:14, 20:30] = torch.tensor([5.0, 4.0, 3.0], dtype=DOUBLE)
     n = fibonacci_sphere(50, dtype=DOUBLE)
     exact = irradiance(radiance, n)
-    found = basis(n, 3) @ irradiance_coefficients(project(radiance))
-    assert (found - exact).abs().max() < 0.1 * exact.max()
+    approximated = basis(n, 3) @ irradiance_coefficients(project(radiance))
+    assert (approximated - exact).abs().max() < 0.1 * exact.max()
 
 
-def test_irradiance_takes_fewer_degrees() -> None:
+def test_irradiance_accepts_fewer_degrees() -> None:
     c = torch.ones(4, 3)
     torch.testing.assert_close(irradiance_coefficients(c)[:, 0], torch.tensor([3.0, 2.0, 2.0, 2.0]) * math.pi / 3)
 

@@ -1,1 +1,1 @@
-"""Slow or second ways to compute what the package computes, to hold it against."""
+"""Slow or independent implementations of parts of the package, with which tests compare it."""

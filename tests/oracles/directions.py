@@ -1,4 +1,4 @@
-"""Directions by polar angles, and evenly over a hemisphere."""
+"""Directions from polar angles, and a Fibonacci lattice on the hemisphere."""
 
 import math
 
@@ -18,11 +18,11 @@ def spherical(theta: float | Float[Tensor, "*b"], phi: float | Float[Tensor, "*b
 
 
 def fibonacci_hemisphere(n: int, *, dtype: torch.dtype = torch.float32) -> tuple[Float[Tensor, "n 3"], float]:
-    """`n` directions spread evenly around +z, and the solid angle 2 pi / n [steradian] each stands for.
+    """`n` directions of a Fibonacci lattice around +z, and the solid angle 2 pi / n [steradian] of each.
 
-    Unbiased: midpoints of equal slices down to the horizon, none of them lifted away from it.
+    They lie at the midpoints of equal slices down to the horizon, which makes integrals unbiased.
     """
     i = torch.arange(n, dtype=torch.float64)
     z = (i + 0.5) / n
-    radius, turn = (1 - z * z).sqrt(), GOLDEN_ANGLE * i
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1).to(dtype), 2 * math.pi / n
+    radius, phi = (1 - z * z).sqrt(), GOLDEN_ANGLE * i
+    return torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1).to(dtype), 2 * math.pi / n

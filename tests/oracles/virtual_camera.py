@@ -1,4 +1,4 @@
-"""Photographs and masks of the virtual camera, and how far two trajectories are apart."""
+"""Images and masks of the virtual camera, and the difference of two trajectories."""
 
 import math
 
@@ -8,16 +8,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from tumble.maths.images import linear_from_srgb, to_srgb8
-from tumble.poses.progressive.virtual_camera import Aim, out_of_aim
+from tumble.poses.progressive.virtual_camera import Aim, aim_to_camera
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND
 from tumble.scene.trajectory import Trajectory
 
 
 def warp_images(images: UInt8[Tensor, "t h w 3"], camera: Camera, aim: Aim) -> UInt8[Tensor, "t size size 3"]:
-    """The virtual camera's photographs, sRGB code values over black; black where the camera did not look.
+    """Images of the virtual camera, sRGB code values; black outside the true camera's frame.
 
-    Light is averaged, not code values: bilinear, over as many points per pixel as the virtual frame is coarser.
+    Linear light is averaged: bilinearly, over as many points per pixel as the virtual frame is coarser.
     """
     steps = max(1, math.ceil(float(camera.fx_fy_cx_cy[0] / aim.camera.fx_fy_cx_cy[0]) - 0.01))
     fine = aim.camera.resized(steps * aim.camera.height, steps * aim.camera.width)
@@ -31,7 +31,7 @@ def warp_images(images: UInt8[Tensor, "t h w 3"], camera: Camera, aim: Aim) -> U
 
 
 def warp_masks(masks: UInt8[Tensor, "t h w"], camera: Camera, aim: Aim) -> UInt8[Tensor, "t size size"]:
-    """The virtual camera's masks by the nearest pixel, so of the same three values; BACKGROUND off the frame."""
+    """Masks of the virtual camera by nearest-neighbour sampling; BACKGROUND outside the true camera's frame."""
     warped = []
     for frame, mask in enumerate(masks):
         at, within = _grid(aim, camera, frame, masks.device)
@@ -43,8 +43,8 @@ def warp_masks(masks: UInt8[Tensor, "t h w"], camera: Camera, aim: Aim) -> UInt8
 
 
 def _grid(aim: Aim, camera: Camera, frame: int, device: torch.device) -> tuple[Float[Tensor, "1 h w 2"], Tensor]:
-    """Where the centres of the virtual pixels lie in the frame, in grid_sample's units, and whether they do."""
-    uv = out_of_aim(aim, camera, frame, aim.camera.pixel_centers())
+    """Positions of the virtual pixels' centres in the frame, in units of grid_sample, and which are inside."""
+    uv = aim_to_camera(aim, camera, frame, aim.camera.pixel_centers())
     at = (2 * uv / uv.new_tensor([camera.width, camera.height]) - 1).to(device)
     return at[None], (at.abs() <= 1).all(-1)
 

@@ -1,4 +1,4 @@
-"""Sparse models of COLMAP: what the test's own writer wrote, both layouts, is what is read; damage is told of."""
+"""Sparse COLMAP models, binary and text, are read as written by the tests; damaged ones are refused."""
 
 import struct
 from collections.abc import Callable
@@ -16,18 +16,18 @@ CAMERAS: dict[int, tuple[int, str, int, int, list[float]]] = {
     7: (4, "OPENCV", 128, 96, [150.0, 155.0, 60.5, 50.25, 0.08, -0.03, 0.002, -0.001]),
     2: (2, "SIMPLE_RADIAL", 160, 120, [140.0, 80.0, 60.0, 0.05]),
 }
-"""By number: kind, name, width, height, parameters."""
+"""By number: model number, model name, width, height, parameters."""
 IMAGES: dict[str, tuple[int, list[float], int, int]] = {
     "b/zwei drei.jpg": (11, [*Rotation.from_rotvec([0.3, -1.2, 0.5]).as_quat(scalar_first=True), 0.1, -0.2, 3.0], 7, 3),
     "a.png": (4, [*Rotation.from_rotvec([0.0, 0.4, 2.0]).as_quat(scalar_first=True), -0.3, 0.0, 2.5], 2, 0),
 }
-"""By name: number, quaternion (wxyz) and translation of the world seen by the camera, camera, keypoints."""
+"""By name: number, pose (quaternion wxyz and translation, world to camera), camera, number of keypoints."""
 POINTS = [(3, (0.1, -0.5, 2.0), (255, 0, 9), 0.75, 2), (9, (1.0, 0.25, -1.0), (1, 2, 3), 1.25, 0)]
 """Number, position, colour, error, length of the track."""
 
 
 def write_binary(folder: Path, cameras=CAMERAS, images=IMAGES, points=POINTS) -> Path:
-    """By the layout that COLMAP documents."""
+    """Write the binary files by COLMAP's documentation of the format."""
     folder.mkdir(parents=True, exist_ok=True)
     content = struct.pack("<Q", len(cameras))
     for number, (kind, _, width, height, parameters) in cameras.items():
@@ -39,8 +39,11 @@ def write_binary(folder: Path, cameras=CAMERAS, images=IMAGES, points=POINTS) ->
         content += struct.pack("<Q", keypoints) + struct.pack("<ddq", 1.5, 2.5, -1) * keypoints
     (folder / "images.bin").write_bytes(content)
     content = struct.pack("<Q", len(points))
-    for number, position, colour, error, seen in points:
-        content += struct.pack("<Q3d3BdQ", number, *position, *colour, error, seen) + struct.pack("<II", 4, 0) * seen
+    for number, position, colour, error, track_length in points:
+        content += (
+            struct.pack("<Q3d3BdQ", number, *position, *colour, error, track_length)
+            + struct.pack("<II", 4, 0) * track_length
+        )
     (folder / "points3D.bin").write_bytes(content)
     return folder
 
@@ -55,19 +58,19 @@ def write_text(folder: Path, cameras=CAMERAS, images=IMAGES, points=POINTS) -> P
         lines += [f"{number} {' '.join(repr(float(x)) for x in pose)} {camera} {name}", "1.5 2.5 -1 " * keypoints]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     lines = ["# 3D point list"]
-    for number, position, colour, error, seen in points:
+    for number, position, colour, error, track_length in points:
         lines.append(
             f"{number} {' '.join(repr(float(x)) for x in position)} {' '.join(map(str, colour))} {error} "
-            + "4 0 " * seen
+            + "4 0 " * track_length
         )
     (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
     return folder
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+@pytest.mark.parametrize("subfolder", ["sparse/0", "sparse", "colmap/sparse/0", "."])
 @pytest.mark.parametrize("write", [write_binary, write_text])
-def test_a_model_is_read_as_it_was_written(write: Callable[..., Path], place: str, tmp_path: Path) -> None:
-    write(tmp_path / place)
+def test_a_model_is_read_as_written(write: Callable[..., Path], subfolder: str, tmp_path: Path) -> None:
+    write(tmp_path / subfolder)
     assert colmap.recognises(tmp_path)
     model = colmap.read(tmp_path)
     assert [view.name for view in model.views] == ["a.png", "b/zwei drei.jpg"]
@@ -85,7 +88,7 @@ def test_a_model_is_read_as_it_was_written(write: Callable[..., Path], place: st
     assert model.errors.tolist() == [0.75, 1.25]
 
 
-def test_of_several_models_the_largest_is_taken_and_points_may_be_missing(tmp_path: Path) -> None:
+def test_the_largest_of_several_models_is_read_and_points_are_optional(tmp_path: Path) -> None:
     one = {"a.png": IMAGES["a.png"]}
     (write_binary(tmp_path / "sparse" / "0", images=one) / "points3D.bin").unlink()
     (write_text(tmp_path / "sparse" / "1") / "points3D.txt").unlink()
@@ -111,9 +114,9 @@ PARAMETERS: dict[str, list[float]] = {
 
 
 def imaged(model: str, p: list[float], xy: np.ndarray) -> np.ndarray:
-    """Where COLMAP's formulas (its documentation of camera models) put points of the plane at depth 1 [pixels]."""
-    two = model in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
-    (fx, fy, cx, cy), k = (p[:4], p[4:]) if two else ([p[0], p[0], p[1], p[2]], p[3:])
+    """Pixel positions of points on the plane at depth 1, by COLMAP's documentation of its camera models."""
+    two_focals = model in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+    (fx, fy, cx, cy), k = (p[:4], p[4:]) if two_focals else ([p[0], p[0], p[1], p[2]], p[3:])
     x, y = xy.T
     if "FISHEYE" in model:
         radius = np.hypot(x, y)
@@ -131,24 +134,24 @@ def imaged(model: str, p: list[float], xy: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", PARAMETERS)
-def test_lenses_are_undone_by_the_documented_formulas(model: str, tmp_path: Path) -> None:
-    number = next(n for n, (name, _) in colmap.MODELS.items() if name == model)
+def test_undistortion_inverts_the_documented_formulas(model: str, tmp_path: Path) -> None:
+    number = next(n for n, (name, _) in colmap.CAMERA_MODELS.items() if name == model)
     cameras: Any = {2: (number, model, 120, 90, PARAMETERS[model])}
     for write in (write_binary, write_text):
         write(tmp_path / write.__name__, cameras=cameras, images={"a.png": IMAGES["a.png"]})
         optics = colmap.read(tmp_path / write.__name__).views[0].optics
         xy = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
-        # COLMAP counts from the corner of the first pixel, OpenCV from its centre.
-        found = optics.normalised(imaged(model, PARAMETERS[model], xy) - 0.5)
-        # OpenCV iterates a few times: 1e-3 is a tenth of a pixel.
-        np.testing.assert_allclose(found, xy, atol=1e-3)
+        # COLMAP measures pixel positions from the corner of the first pixel, OpenCV from its centre.
+        undistorted = optics.normalised(imaged(model, PARAMETERS[model], xy) - 0.5)
+        # OpenCV inverts the distortion by a few iterations; 1e-3 is a tenth of a pixel.
+        np.testing.assert_allclose(undistorted, xy, atol=1e-3)
 
 
 # Damage ---------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_binary_file_that_ends_early_is_refused_wherever_it_ends(name: str, tmp_path: Path) -> None:
+def test_a_truncated_binary_file_is_refused(name: str, tmp_path: Path) -> None:
     file = write_binary(tmp_path / "sparse" / "0") / name
     content = file.read_bytes()
     for end in range(0, len(content), 3):
@@ -158,10 +161,10 @@ def test_a_binary_file_that_ends_early_is_refused_wherever_it_ends(name: str, tm
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_counts_that_a_file_cannot_hold_are_refused(name: str, tmp_path: Path) -> None:
+def test_counts_that_exceed_the_file_are_refused(name: str, tmp_path: Path) -> None:
     file = write_binary(tmp_path / "sparse" / "0") / name
     file.write_bytes(b"\xff" * 8 + file.read_bytes()[8:])
-    with pytest.raises(BadFile, match=rf"{name}: is damaged: it ends at byte|{name}: has the camera model"):
+    with pytest.raises(BadFile, match=rf"{name}: is damaged: it has|{name}: has the unknown camera model"):
         colmap.read(tmp_path)
     keypoints = write_binary(tmp_path / "sparse" / "0") / "images.bin"
     keypoints.write_bytes(keypoints.read_bytes()[:-8] + b"\xff" * 7 + b"\x7f")
@@ -182,14 +185,17 @@ def image(pose: list[float], number: int = 2) -> dict[str, tuple]:
 BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "an unknown lens": (
         {"cameras": camera(2, kind=7, name="FOV")},
-        r"cameras\.\w+: has the camera model .*known: SIMPLE_P",
+        r"cameras\.\w+: has the unknown camera model .*known models: SIMPLE_P",
     ),
     "no focal length": ({"cameras": camera(2, parameters=[0.0, 80.0, 60.0, 0.0])}, "with the parameters"),
-    "a giant": ({"cameras": camera(2, width=1 << 40)}, r"1099511627776 x 120 pixels"),
-    "no such camera": ({"images": image(IMAGES["a.png"][1], number=5)}, r"a\.png was taken by camera 5"),
-    "no rotation": ({"images": image([0.5, 0, 0, 0, 0, 0, 1])}, r"a\.png has no rotation"),
-    "not a number": ({"images": image([1, 0, 0, 0, 0, float("nan"), 1])}, r"a\.png has no rotation|place of numbers"),
-    "no pictures": ({"images": {}}, "holds no picture"),
+    "a camera that is too large": ({"cameras": camera(2, width=1 << 40)}, r"1099511627776 x 120 pixels"),
+    "a missing camera": ({"images": image(IMAGES["a.png"][1], number=5)}, r"a\.png refers to camera 5"),
+    "no rotation": ({"images": image([0.5, 0, 0, 0, 0, 0, 1])}, r"a\.png has no valid rotation"),
+    "not a number": (
+        {"images": image([1, 0, 0, 0, 0, float("nan"), 1])},
+        r"a\.png has no valid rotation|where numbers are expected",
+    ),
+    "no images": ({"images": {}}, "lists no image"),
 }
 
 
@@ -205,10 +211,10 @@ def test_models_that_break_a_rule_are_refused(name: str, write: Callable[..., Pa
 @pytest.mark.parametrize(
     ("name", "line", "message"),
     [
-        ("cameras.txt", "1 PINHOLE 64 64 50 50 32", "PINHOLE with 3 parameters, it has 4"),
-        ("cameras.txt", "one PINHOLE 64 64 50 50 32 32", "in the place of numbers"),
-        ("images.txt", "5 1 0 0 0 0 0", "in the place of a picture"),
-        ("points3D.txt", "1 2 3", "in the place of a point"),
+        ("cameras.txt", "1 PINHOLE 64 64 50 50 32", "PINHOLE camera with 3 parameters instead of 4"),
+        ("cameras.txt", "one PINHOLE 64 64 50 50 32 32", "where numbers are expected"),
+        ("images.txt", "5 1 0 0 0 0 0", "where an image is expected"),
+        ("points3D.txt", "1 2 3", "where a point is expected"),
     ],
 )
 def test_a_text_file_with_a_broken_line_is_refused(name: str, line: str, message: str, tmp_path: Path) -> None:
@@ -218,7 +224,7 @@ def test_a_text_file_with_a_broken_line_is_refused(name: str, line: str, message
         colmap.read(tmp_path)
 
 
-def test_a_file_over_the_limit_is_refused_unread(tmp_path: Path) -> None:
+def test_a_file_over_the_size_limit_is_refused(tmp_path: Path) -> None:
     file = write_binary(tmp_path / "sparse" / "0") / "points3D.bin"
     with file.open("r+b") as handle:
         handle.truncate(colmap.MAX_BYTES + 1)

@@ -1,4 +1,4 @@
-"""The adapters of SAM 2 and SAM 3, against stand-ins that follow their public interface."""
+"""The adapters of SAM 2 and SAM 3, tested with mock predictors that follow their public interfaces."""
 
 import sys
 from pathlib import Path
@@ -12,12 +12,12 @@ from tumble.io.files import BadFile
 from tumble.preprocess import sam
 from tumble.preprocess.segmentation import Seed
 
-PICTURES = np.zeros((4, 20, 30, 3), np.uint8)
+IMAGES = np.zeros((4, 20, 30, 3), np.uint8)
 CALLS: list = []
 
 
 class Sam2:
-    """Answers with the box it was asked for, moved by one column per frame."""
+    """Returns the given box, shifted by one column per frame."""
 
     def init_state(self, video_path: str, offload_video_to_cpu: bool) -> SimpleNamespace:
         assert len(list(Path(video_path).glob("*.jpg"))) == 4
@@ -64,8 +64,8 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_sam2_gets_corners_and_answers_for_every_frame(weights: Path) -> None:
-    masks = sam.sam2(PICTURES, Seed(1, box=(4, 6, 10, 8)), weights)
+def test_sam2_receives_corners_and_returns_masks_of_all_frames(weights: Path) -> None:
+    masks = sam.sam2(IMAGES, Seed(1, box=(4, 6, 10, 8)), weights)
     assert CALLS[0] == "configs/sam2.1/sam2.1_hiera_s.yaml"
     for i in range(4):
         rows, columns = np.nonzero(masks[i])
@@ -73,15 +73,15 @@ def test_sam2_gets_corners_and_answers_for_every_frame(weights: Path) -> None:
         assert (columns.min(), columns.max()) == (4 + i - 1, 13 + i - 1)
 
 
-def test_sam2_gets_a_click_as_a_positive_point(weights: Path) -> None:
-    sam.sam2(PICTURES, Seed(0, click=(3, 5)), weights)
+def test_sam2_receives_a_click_as_a_positive_point(weights: Path) -> None:
+    sam.sam2(IMAGES, Seed(0, click=(3, 5)), weights)
     points, labels = CALLS[-1]
     assert points.tolist() == [[3, 5]]
     assert labels.tolist() == [1]
 
 
-def test_sam3_gets_shares_of_the_picture_and_its_likeliest_answer_counts(weights: Path) -> None:
-    masks = sam.sam3(PICTURES, Seed(2, box=(3, 5, 15, 10)), weights)
+def test_sam3_receives_relative_coordinates_and_its_most_probable_mask_is_used(weights: Path) -> None:
+    masks = sam.sam3(IMAGES, Seed(2, box=(3, 5, 15, 10)), weights)
     (prompt,) = [call for call in CALLS if call["type"] == "add_prompt"]
     assert prompt["bounding_boxes"] == [[0.1, 0.25, 0.5, 0.5]]
     assert prompt["frame_index"] == 2
@@ -92,13 +92,15 @@ def test_sam3_gets_shares_of_the_picture_and_its_likeliest_answer_counts(weights
 
 
 @pytest.mark.parametrize("name", ["sam2", "sam3"])
-def test_what_is_missing_is_said_with_the_fix(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BadFile, match=r"is missing: the weights of SAM .*\.pt"):
-        sam.SEGMENTERS[name](PICTURES, Seed(0, box=(1, 1, 5, 5)), tmp_path / "large.pt")
+def test_missing_weights_and_packages_are_reported_with_the_fix(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(BadFile, match=r"is missing; it should hold the weights of SAM .*\.pt"):
+        sam.SEGMENTERS[name](IMAGES, Seed(0, box=(1, 1, 5, 5)), tmp_path / "large.pt")
     (tmp_path / "large.pt").write_bytes(b"x")
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ModuleNotFoundError, match=r"is not installed .*install"):
-        sam.SEGMENTERS[name](PICTURES, Seed(0, box=(1, 1, 5, 5)), tmp_path / "large.pt")
+        sam.SEGMENTERS[name](IMAGES, Seed(0, box=(1, 1, 5, 5)), tmp_path / "large.pt")
     (tmp_path / "mine.pt").write_bytes(b"x")
-    with pytest.raises(BadFile, match="does not name its size"):
-        sam.sam2(PICTURES, Seed(0, box=(1, 1, 5, 5)), tmp_path / "mine.pt")
+    with pytest.raises(BadFile, match="has a name without the size of the model"):
+        sam.sam2(IMAGES, Seed(0, box=(1, 1, 5, 5)), tmp_path / "mine.pt")

@@ -1,4 +1,4 @@
-"""The BRDF of the method, written a second time for Mitsuba, so that its path tracer can be the judge of ours."""
+"""The BRDF of the method as a Mitsuba plugin, to compare renderings with Mitsuba's path tracer."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ from tumble.synthetic.pathtracer import Part, mitsuba
 
 
 def scene(part: Part, light: Any, *, albedo: float, roughness: float, f0: float, depth: int) -> Any:
-    """A mesh of one material under a light, as `pathtracer.lit_scene` makes them."""
+    """A mesh of one material under a light, as a scene of `pathtracer.lit_scene`."""
     from tumble.synthetic import pathtracer
 
     mi = mitsuba()
@@ -35,7 +35,7 @@ def _register() -> None:
     import drjit as dr
 
     class Brdf(mi.BSDF):  # type: ignore[misc, name-defined]
-        """Lambert and GGX as in paper section 4.3, Fresnel's equations for glass; half of the samples by GGX."""
+        """Lambert and GGX as in paper section 4.3 with Fresnel's equations for glass; half of the samples from GGX."""
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
@@ -55,7 +55,7 @@ def _register() -> None:
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             nol, nov, noh, voh = self._cosines(si, wo)
             fresnel = self.f0 / 0.04 * mi.fresnel(voh, 1.5)[0]
-            # Smith's: 2 x / G1(x) for either direction.
+            # Smith's G: 2 x / G1(x) for either direction.
             a2 = self.roughness**4
             geometry = (nol + dr.sqrt(a2 + (1 - a2) * nol * nol)) * (nov + dr.sqrt(a2 + (1 - a2) * nov * nov))
             value = self.albedo / math.pi + self._ndf(noh) * fresnel / geometry

@@ -1,4 +1,4 @@
-"""Energy, reciprocity and sampling of both lobes; oracles are the printed formulas, quadrature and histograms."""
+"""Energy, reciprocity and sampling of both lobes, against the printed formulas, quadrature and histograms."""
 
 import math
 
@@ -56,17 +56,17 @@ def test_ggx_is_the_printed_formula(roughness: float) -> None:
     expected = [printed_ggx(*rows, roughness, 0.04) for rows in zip(wi.tolist(), wo.tolist(), n.tolist(), strict=True)]
     assert sum(value > 0 for value in expected) > 10
     found = brdf.ggx(wi, wo, n, roughness=roughness, f0=0.04)[:, 0]
-    # Of Fresnel's equations ours is a fit.
+    # `fresnel` is a fit to Fresnel's equations.
     torch.testing.assert_close(found, torch.tensor(expected, dtype=DOUBLE), rtol=4e-3, atol=0)
 
 
-def test_roughness_below_its_floor_is_lifted_to_it() -> None:
+def test_roughness_below_its_lower_limit_is_raised_to_it() -> None:
     wi, wo = unit_vectors(20, 0), unit_vectors(20, 1)
     at_floor = brdf.ggx(wi, wo, UP.double(), roughness=brdf.MIN_ROUGHNESS, f0=0.04)
     assert torch.equal(brdf.ggx(wi, wo, UP.double(), roughness=0.0, f0=0.04), at_floor)
 
 
-def test_the_fit_of_fresnel_is_that_of_glass() -> None:
+def test_the_fresnel_fit_matches_the_equations_for_glass() -> None:
     voh = torch.linspace(0, 1, 1001, dtype=DOUBLE)
     exact = torch.tensor([glass(x) / 0.04 for x in voh.tolist()], dtype=DOUBLE)
     torch.testing.assert_close(brdf.fresnel(voh), exact, rtol=4e-3, atol=0)
@@ -74,7 +74,7 @@ def test_the_fit_of_fresnel_is_that_of_glass() -> None:
 
 
 def test_the_peak_of_a_smooth_lobe_keeps_its_digits_in_float32() -> None:
-    """Two milliradians from the mirror direction, nine tenths of alpha; noh^2 alone would be off by 2 percent."""
+    """Two milliradians from the mirror direction, nine tenths of alpha; computed from noh^2 the error would be 2 %."""
     theta = torch.linspace(0, 0.01, 50, dtype=DOUBLE)
     wi, wo = spherical(theta, 0.0), UP.double()
     exact = brdf.ggx(wi, wo, UP.double(), roughness=0.05, f0=0.04)
@@ -87,14 +87,14 @@ def test_the_peak_of_a_smooth_lobe_keeps_its_digits_in_float32() -> None:
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("theta", [0.1, 0.6, 1.2])
 def test_ggx_never_creates_energy(roughness: float, theta: float) -> None:
-    """Under uniform light glass sends back some light, and no more than a perfect mirror of the same microfacets."""
+    """Reflected fraction of uniform light for glass: above 0, and below that of perfect mirrors as microfacets."""
     wi, area = fibonacci_hemisphere(1 << 16)
     wo = spherical(theta, phi=0.0)
     reflected = (brdf.ggx(wi, wo, UP, roughness=roughness, f0=0.04) * wi[:, 2:] * area).sum(0)
     assert 0.01 < reflected.item() <= 0.3
 
 
-def test_lambert_sends_back_exactly_its_albedo() -> None:
+def test_lambert_reflects_exactly_its_albedo() -> None:
     albedo = torch.tensor([0.2, 0.5, 1.0], dtype=DOUBLE)
     wi, area = fibonacci_hemisphere(64, dtype=DOUBLE)
     reflected = (brdf.lambert(albedo) * wi[:, 2:] * area).sum(0)
@@ -103,16 +103,16 @@ def test_lambert_sends_back_exactly_its_albedo() -> None:
 
 
 @pytest.mark.parametrize(("roughness", "excess"), [(0.1, 1.454), (0.2, 1.400), (0.3, 1.294)])
-def test_a_white_surface_returns_more_than_it_gets(roughness: float, excess: float) -> None:
-    """Known and kept: the paper adds the lobes without taking the specular share from the diffuse one."""
+def test_a_white_surface_reflects_more_than_it_receives(roughness: float, excess: float) -> None:
+    """As in the paper, whose diffuse lobe is not reduced by the specular reflectance."""
     wi, area = fibonacci_hemisphere(1 << 17, dtype=DOUBLE)
-    returned = []
+    reflected = []
     for theta in torch.linspace(1.34, 1.43, 7).tolist():
         wo = spherical(torch.tensor(theta, dtype=DOUBLE), phi=0.0)
         f = brdf.evaluate(wi, wo, UP.double(), albedo=WHITE, roughness=roughness, f0=0.04)
-        returned.append((f * wi[:, 2:] * area).sum(0)[0].item())
-    # The largest over theta, recorded to three digits.
-    assert max(returned) == pytest.approx(excess, abs=1e-3)
+        reflected.append((f * wi[:, 2:] * area).sum(0)[0].item())
+    # The maximum over theta, to three digits.
+    assert max(reflected) == pytest.approx(excess, abs=1e-3)
 
 
 def test_the_sum_of_lobes_is_reciprocal() -> None:
@@ -124,7 +124,7 @@ def test_the_sum_of_lobes_is_reciprocal() -> None:
     torch.testing.assert_close(forth, back, rtol=1e-11, atol=0)
 
 
-def test_nothing_shines_from_or_to_below_the_horizon() -> None:
+def test_the_specular_lobe_is_zero_below_the_horizon() -> None:
     above, below = torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.6, 0.0, -0.8])
     for wi, wo in [(above, below), (below, above), (below, below)]:
         assert brdf.ggx(wi, wo, UP, roughness=0.5, f0=0.04).item() == 0
@@ -151,7 +151,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(lobe, tuple(x.clone().requires_grad_() for x in inputs))
 
 
-def test_gradients_stay_finite_at_the_mirror_the_horizon_and_against_the_eye() -> None:
+def test_gradients_are_finite_at_the_mirror_direction_the_horizon_and_opposite_to_the_eye() -> None:
     horizon = torch.tensor([1.0, 0.0, 0.0])
     wi = torch.stack([UP, horizon, horizon, -UP, -horizon]).requires_grad_()
     wo = torch.stack([UP, UP, horizon, UP, horizon]).requires_grad_()
@@ -166,17 +166,17 @@ def test_gradients_stay_finite_at_the_mirror_the_horizon_and_against_the_eye() -
 @pytest.mark.parametrize("theta", [0.0, 0.8, 1.4])
 @pytest.mark.parametrize("roughness", [0.3, 1.0])
 def test_the_density_of_samples_integrates_to_one(roughness: float, theta: float) -> None:
-    """Over the whole sphere: GGX samples that fall below the horizon are part of it, with value 0."""
+    """Over the whole sphere, since GGX samples can be below the horizon."""
     wi = directions.fibonacci_sphere(1 << 18, dtype=DOUBLE)
     wo = spherical(torch.tensor(theta, dtype=DOUBLE), 0.3)
     density = brdf.pdf(wi, wo, UP.double(), roughness=roughness)
-    # The lattice's error for a lobe of 0.1 radian, and the integrable pole opposite to the eye.
+    # The lattice's error for a lobe of 0.1 radians, and the integrable pole opposite to the eye.
     assert (density.mean() * 4 * math.pi).item() == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("theta", [0.3, 1.3])
 @pytest.mark.parametrize("roughness", [0.35, 0.8])
-def test_samples_are_distributed_as_their_density_says(roughness: float, theta: float) -> None:
+def test_samples_are_distributed_with_their_density(roughness: float, theta: float) -> None:
     """Pearson's chi-square over the cells of a map of the sphere."""
     n = torch.tensor([0.48, -0.64, 0.6], dtype=DOUBLE)
     wo = directions.local_frame(n) @ spherical(torch.tensor(theta, dtype=DOUBLE), 1.0)
@@ -201,23 +201,23 @@ def test_samples_are_distributed_as_their_density_says(roughness: float, theta: 
     assert freedom > 60
 
 
-def test_half_vectors_of_the_smoothest_lobe_follow_their_law_in_float32() -> None:
+def test_half_vectors_of_the_smoothest_lobe_have_their_distribution_in_float32() -> None:
     """Kolmogorov-Smirnov against the closed form u = t / (a^2 + t), t the squared tangent."""
     u = uniform(20_000, dtype=torch.float32)
     u[:, 0] = 0.75
     wi = brdf.sample(u, UP, UP, roughness=0.05).double()
     half = 0.5 * torch.atan2(wi[:, :2].norm(dim=-1), wi[:, 2])
     tangent2 = half.tan().square()
-    law = (tangent2 / (0.05**4 + tangent2)).sort().values
-    distance = (law - (torch.arange(20_000) + 0.5) / 20_000).abs().max()
+    distribution = (tangent2 / (0.05**4 + tangent2)).sort().values
+    distance = (distribution - (torch.arange(20_000) + 0.5) / 20_000).abs().max()
     # The 99.9 % quantile is 1.95 / sqrt(n).
     assert distance < 1.95 / math.sqrt(20_000)
 
 
 @pytest.mark.parametrize("theta", [0.2, 1.2])
 @pytest.mark.parametrize("roughness", [0.1, 0.4, 0.9])
-def test_importance_sampling_finds_what_quadrature_finds(roughness: float, theta: float) -> None:
-    """Under light that is brighter to one side; both lobes, a coloured albedo."""
+def test_importance_sampling_matches_quadrature(roughness: float, theta: float) -> None:
+    """Both lobes with a coloured albedo, under a light with a gradient."""
     albedo = torch.tensor([0.8, 0.4, 0.1], dtype=DOUBLE)
     n, wo = UP.double(), spherical(torch.tensor(theta, dtype=DOUBLE), 0.0)
 
@@ -231,11 +231,11 @@ def test_importance_sampling_finds_what_quadrature_finds(roughness: float, theta
     terms = integrand(draws) / brdf.pdf(draws, wo, n, roughness=roughness)
     error = terms.std(0) / math.sqrt(terms.shape[0])
     assert ((terms.mean(0) - quadrature).abs() < 4 * error + 1e-4).all()
-    # The weights are bounded: no sample counts for more than a few.
+    # The weights of the samples are bounded.
     assert terms.max() < 8
 
 
-def test_samples_stand_around_a_tilted_normal() -> None:
+def test_samples_are_symmetric_about_a_tilted_normal() -> None:
     n = torch.tensor([0.0, 0.6, -0.8])
     wi = brdf.sample(uniform(4096, dtype=torch.float32), n, n, roughness=0.2)
     # Cosine lobe: mean of the cosine 2/3; GGX at normal incidence: close to 1.
@@ -252,29 +252,31 @@ def table() -> Tensor:
 @pytest.mark.parametrize("f0", [0.0, 0.04])
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("theta", [0.0, 0.6, 1.2, 1.5])
-def test_split_sum_is_the_albedo_found_by_brute_force(table: Tensor, roughness: float, theta: float, f0: float) -> None:
+def test_split_sum_matches_the_directional_albedo_by_quadrature(
+    table: Tensor, roughness: float, theta: float, f0: float
+) -> None:
     wi, area = fibonacci_hemisphere(1 << 16, dtype=DOUBLE)
     wo = spherical(torch.tensor(theta, dtype=DOUBLE), 0.0)
     exact = (brdf.ggx(wi, wo, UP.double(), roughness=roughness, f0=f0) * wi[:, 2:] * area).sum()
-    share = brdf.split_sum(table, wo[2:].float(), roughness)
+    directional_albedo = brdf.split_sum(table, wo[2:].float(), roughness)
     # The error of 4096 half vectors, and linear interpolation between 64 entries where grazing Fresnel is steep.
-    assert (f0 * share).item() == pytest.approx(exact.item(), abs=4e-3)
+    assert (f0 * directional_albedo).item() == pytest.approx(exact.item(), abs=4e-3)
 
 
-def test_split_sum_looks_up_entries_and_clamps_at_the_borders(table: Tensor) -> None:
+def test_split_sum_interpolates_entries_and_clamps_at_the_borders(table: Tensor) -> None:
     nov = torch.tensor([[0.0], [1.0], [2.0], [10 / 63]])
     rough = brdf.MIN_ROUGHNESS + (1 - brdf.MIN_ROUGHNESS) * torch.tensor([[0.0], [1.0], [3.0], [20 / 63]])
     found = brdf.split_sum(table, nov, rough)
     expected = torch.stack([table[0, 0], table[-1, -1], table[-1, -1], table[10, 20]])[:, None]
-    # A coordinate of 63 entries is rounded by 4e-6 of a step.
+    # Coordinates over 63 intervals are rounded by 4e-6 of an interval.
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-4)
     assert torch.equal(brdf.split_sum(table, nov, 0.0)[0], found[0])
     assert brdf.split_sum(table, nov.reshape(2, 2, 1), 0.5).shape == (2, 2, 1)
 
 
-def test_split_sum_tables_are_the_same_each_time_and_share_out_no_more_than_all(table: Tensor) -> None:
+def test_split_sum_tables_are_deterministic_and_conserve_energy(table: Tensor) -> None:
     assert torch.equal(table, brdf.split_sum_table())
     assert brdf.split_sum_table(16).shape == (16, 16)
     assert table.min() >= 0
-    # 4096 half vectors miss the integral by up to 1e-4 where the eye is near the horizon.
+    # 4096 half vectors have an error of up to 1e-4 where the eye is near the horizon.
     assert 0.04 * table.max() <= 1 + 2e-4

@@ -1,4 +1,4 @@
-"""The estimator of final pictures: its samples against their density, its sums against quadrature."""
+"""Importance sampling: samples against their density, and shading against quadrature."""
 
 import math
 
@@ -6,18 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.rendering.test_shading import CAMERA, F0, ball, grey, lamp, rms, seen_by_all, uniform
+from tests.rendering.test_shading import CAMERA, F0, grey, lamp, rms, transfer_vectors, uniform, visible_sphere
 from tests.surfaces import GAMMA, look_at, sphere, torus
 from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_solid_angles
 from tumble.rendering import importance_sampling, shading
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import rasterize
 from tumble.rendering.shading import Bounce
-from tumble.rendering.trace import build, unoccluded
+from tumble.rendering.trace import build_tracer, unoccluded
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
 
-NOBODY = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
+EMPTY = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
 
 
 def one_texel() -> Environment:
@@ -26,29 +26,29 @@ def one_texel() -> Environment:
     return Environment.from_radiance(radiance)
 
 
-def quadrature(seen: shading.Surface, roughness: float, environment: Environment, R_env_obj: Tensor) -> Tensor:
-    """Both lobes over 2^17 even directions, nothing in the way."""
-    total, n = torch.zeros_like(seen.points), 1 << 17
+def quadrature(surface: shading.Surface, roughness: float, environment: Environment, R_env_obj: Tensor) -> Tensor:
+    """Both lobes, integrated over 2^17 evenly distributed directions, without occlusion."""
+    total, n = torch.zeros_like(surface.points), 1 << 17
     for directions in fibonacci_sphere(n).split(1 << 14):
-        sky = unoccluded(directions, len(seen.pixels))
-        part = shading.shade(seen, *grey(seen, 0.5, roughness), environment, R_env_obj, sky, f0=F0)
+        unshadowed = unoccluded(directions, len(surface.pixels))
+        part = shading.shade(surface, *grey(surface, 0.5, roughness), environment, R_env_obj, unshadowed, f0=F0)
         total += len(directions) / n * part
     return total
 
 
 def relit(
-    seen: shading.Surface, roughness: float, environment: Environment, R: Tensor, n: int, seed: int = 0
+    surface: shading.Surface, roughness: float, environment: Environment, R: Tensor, n: int, seed: int = 0
 ) -> Tensor:
     light, generator = importance_sampling.light_sampler(environment), torch.Generator().manual_seed(seed)
     counts = {"n_brdf": n, "n_light": n}
-    material = grey(seen, 0.5, roughness)
+    material = grey(surface, 0.5, roughness)
     return importance_sampling.relight_surface(
-        seen, *material, light, R, build(NOBODY, GAMMA), f0=F0, generator=generator, **counts
+        surface, *material, light, R, build_tracer(EMPTY, GAMMA), f0=F0, generator=generator, **counts
     )
 
 
 @pytest.mark.parametrize("environment", [one_texel(), lamp([0.1, 0.9, -0.3]), uniform()])
-def test_the_density_is_one_in_all_and_that_of_the_samples(environment: Environment) -> None:
+def test_the_density_integrates_to_one_and_is_that_of_the_samples(environment: Environment) -> None:
     sampler = importance_sampling.light_sampler(environment)
     area = texel_solid_angles(*sampler.density.shape)
     assert math.isclose((sampler.density * area).sum().item(), 1, rel_tol=1e-4)
@@ -61,8 +61,8 @@ def test_the_density_is_one_in_all_and_that_of_the_samples(environment: Environm
         assert abs(d[:, axis].mean() - expected) < 0.012
 
 
-def test_a_fine_map_is_sampled_by_means_of_its_texels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One bright texel of a map four times as fine as cells may be: where it shines, they see it."""
+def test_a_fine_map_is_sampled_by_averages_of_its_texels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cells cover a bright texel of a map that is four times as fine as the cells may be."""
     monkeypatch.setattr(importance_sampling, "CELL_ROWS", 32)
     radiance = torch.zeros(128, 256, 3)
     radiance[41, 55] = 1e6
@@ -70,15 +70,15 @@ def test_a_fine_map_is_sampled_by_means_of_its_texels(monkeypatch: pytest.Monkey
     assert sampler.density.shape == (64, 128)
     d = sampler.sample(torch.rand(1 << 14, 2, generator=torch.Generator().manual_seed(0)))
     integral = sampler.environment.integral()
-    # It fills a thirtieth of the cells that can see it: 16384 samples leave 5 %.
+    # The texel covers a thirtieth of the sampled cells: 16384 samples leave an error of 5 %.
     torch.testing.assert_close((sampler.environment.lookup(d) / sampler.pdf(d)).mean(0), integral, rtol=0.1, atol=0)
 
 
-def test_samples_of_a_light_measure_its_integral() -> None:
+def test_samples_of_a_light_estimate_its_integral() -> None:
     environment = lamp([0.1, 0.9, -0.3])
     sampler = importance_sampling.light_sampler(environment)
     d = sampler.sample(torch.rand(1 << 14, 2, generator=torch.Generator().manual_seed(0)))
-    # Radiance over density varies by 5 % within cells, so the mean of 16384 is good to 0.1 %.
+    # Radiance over density varies by 5 % within cells, so the mean of 16384 samples has an error of 0.1 %.
     torch.testing.assert_close(
         (environment.lookup(d) / sampler.pdf(d)).mean(0), environment.integral(), rtol=2e-3, atol=0
     )
@@ -88,43 +88,43 @@ def test_samples_of_a_light_measure_its_integral() -> None:
 @pytest.mark.parametrize("name", ["one texel", "lamp", "uniform"])
 def test_the_estimator_converges_to_quadrature(name: str, roughness: float) -> None:
     environment = {"one texel": one_texel(), "lamp": lamp([0.3, 0.5, 0.8]), "uniform": uniform()}[name]
-    seen, R = ball(128), random_rotation(torch.Generator().manual_seed(5))
-    truth = quadrature(seen, roughness, environment, R)
-    few, many = (relit(seen, roughness, environment, R, n) for n in (64, 512))
+    surface, R = visible_sphere(128), random_rotation(torch.Generator().manual_seed(5))
+    truth = quadrature(surface, roughness, environment, R)
+    few, many = (relit(surface, roughness, environment, R, n) for n in (64, 512))
     assert rms(many - truth) < 0.02 * rms(truth)
-    # Eight times the samples: an even pattern gains more than the root of 8, noise of the quadrature aside.
+    # With eight times the samples, a low-discrepancy pattern gains more than sqrt(8), apart from quadrature noise.
     assert rms(many - truth) < 0.6 * rms(few - truth) + 0.004 * rms(truth)
-    # Unbiased: the mean over points, each with its own shift of the pattern, is closer than any of them.
+    # Unbiased: the mean over points, each with its own shift of the pattern, has a smaller error than single points.
     assert abs((many - truth).mean()) < 0.005 * truth.mean()
 
 
 def test_a_single_bright_texel_needs_few_samples() -> None:
-    """A sun that one shared direction in a hundred meets."""
-    seen, R = ball(128), torch.eye(3)
-    truth = quadrature(seen, 0.5, one_texel(), R)
-    assert rms(relit(seen, 0.5, one_texel(), R, 32) - truth) < 0.05 * rms(truth)
+    """A small light that one of a hundred shared directions hits."""
+    surface, R = visible_sphere(128), torch.eye(3)
+    truth = quadrature(surface, 0.5, one_texel(), R)
+    assert rms(relit(surface, 0.5, one_texel(), R, 32) - truth) < 0.05 * rms(truth)
 
 
-def test_shading_in_chunks_is_shading_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, R = ball(128), torch.eye(3)
-    whole = relit(seen, 0.5, one_texel(), R, 32)
-    monkeypatch.setattr(importance_sampling, "RAYS", 640)
-    torch.testing.assert_close(relit(seen, 0.5, one_texel(), R, 32), whole)
+def test_shading_in_chunks_equals_shading_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    surface, R = visible_sphere(128), torch.eye(3)
+    whole = relit(surface, 0.5, one_texel(), R, 32)
+    monkeypatch.setattr(importance_sampling, "MAX_RAYS", 640)
+    torch.testing.assert_close(relit(surface, 0.5, one_texel(), R, 32), whole)
 
 
-def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_back() -> None:
-    """A white torus in a white furnace: one bounce, lit from everywhere, is as bright as the light it hides."""
+def test_indirect_light_compensates_self_shadowing_under_uniform_light() -> None:
+    """A white torus in a white furnace: its radiance is that of the light it occludes."""
     gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
-    seen = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
-    light, tracer = importance_sampling.light_sampler(uniform()), build(gaussians, GAMMA)
-    # Specular light on top of white would be more than the furnace holds: no f0.
+    surface = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
+    light, tracer = importance_sampling.light_sampler(uniform()), build_tracer(gaussians, GAMMA)
+    # A specular lobe in addition to a white albedo would violate energy conservation, so f0 is 0.
     rough = torch.ones(1000, 1)
-    diffuse = Bounce(torch.ones(1000, 3), seen_by_all(gaussians))
+    diffuse = Bounce(torch.ones(1000, 3), transfer_vectors(gaussians))
     bounce = importance_sampling.GlossyBounce(diffuse, rough, prefilter(uniform()))
     found = [
         importance_sampling.relight_surface(
-            seen,
-            *grey(seen, 1.0, 1.0),
+            surface,
+            *grey(surface, 1.0, 1.0),
             light,
             torch.eye(3),
             tracer,
@@ -138,13 +138,13 @@ def test_a_torus_under_a_uniform_light_loses_in_its_shade_what_a_bounce_gives_ba
     ]
     assert found[0].min() < 0.7
     assert found[0].mean() < 0.97
-    # 128 samples leave 3 %.
+    # 128 samples leave an error of 3 %.
     assert (found[1] - 1).abs().mean() < 0.04
 
 
-def test_a_pattern_is_even_in_all_three_numbers() -> None:
+def test_the_sample_pattern_is_even_along_all_axes() -> None:
     pattern = importance_sampling._lattice(512)
     for axis in range(3):
         counts = torch.histc(pattern[:, axis], 16, 0, 1)
-        # Random numbers would leave 32 +- 5.6, and so some bin of 16 beyond 42.
+        # Random numbers would give 32 +- 5.6, so one of the 16 bins would probably exceed 42.
         assert (counts - 32).abs().max() <= 8

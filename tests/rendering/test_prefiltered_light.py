@@ -1,4 +1,4 @@
-"""Light convolved for rough mirrors, against sums over the sphere."""
+"""Prefiltered environment maps against integrals over the sphere."""
 
 import math
 
@@ -12,14 +12,14 @@ from tumble.scene.environment import Environment
 
 
 def smooth(h: int, dtype: torch.dtype = torch.float64) -> Environment:
-    """A lobe of light 30 degrees wide, off every axis."""
+    """A light 30 degrees wide, off all axes, plus uniform light."""
     towards = normalize(torch.tensor([0.5, 0.3, -0.8], dtype=dtype), dim=-1)
     bright = (8 * (texel_directions(h, 2 * h, dtype=dtype) @ towards - 1)).exp()[..., None]
     return Environment.from_radiance(0.2 + bright * torch.tensor([1.0, 2.0, 3.0], dtype=dtype))
 
 
 @pytest.mark.parametrize("roughness", [0.25, 0.5, 0.75, 1.0])
-def test_a_level_is_the_light_weighted_by_the_lobe_of_a_mirror_seen_head_on(roughness: float) -> None:
+def test_a_level_is_the_light_weighted_by_the_lobe_at_normal_incidence(roughness: float) -> None:
     environment = smooth(16)
     mirrored = normalize(torch.tensor([[0.1, 0.2, -1.0], [-0.7, 0.7, 0.1], [0.05, -1, 0.02]]).double(), dim=-1)
     wi = fibonacci_sphere(1 << 16, dtype=torch.float64)
@@ -29,7 +29,7 @@ def test_a_level_is_the_light_weighted_by_the_lobe_of_a_mirror_seen_head_on(roug
     weight = cosine.clamp(min=0) * a2 / (math.pi * (noh.square() * (a2 - 1) + 1).square())
     expected = weight @ environment.lookup(wi) / weight.sum(-1, keepdim=True)
     found = filtering.prefilter(environment).lookup(mirrored, torch.full((3, 1), roughness).double())
-    # A map of 16 rows, bilinear: its texels are 0.2 radians, and the lobe of light is 0.5 wide.
+    # The bilinear map of 16 rows has texels of 0.2 radians, and the light is 0.5 radians wide.
     torch.testing.assert_close(found, expected, rtol=0.04, atol=0.0)
 
 
@@ -42,7 +42,7 @@ def test_the_roughest_level_is_the_irradiance() -> None:
     torch.testing.assert_close(math.pi * found, irradiance, rtol=0.01, atol=0)
 
 
-def test_without_roughness_the_light_is_seen_as_it_is() -> None:
+def test_without_roughness_the_light_is_unfiltered() -> None:
     torch.manual_seed(0)
     environment = Environment.from_radiance(torch.rand(8, 16, 3, dtype=torch.float64))
     d = torch.cat([fibonacci_sphere(200, dtype=torch.float64), torch.tensor([[0, 1e6, 1], [1e-9, 0, 1]]).double()])
@@ -51,15 +51,15 @@ def test_without_roughness_the_light_is_seen_as_it_is() -> None:
     torch.testing.assert_close(found, environment.lookup(d))
 
 
-def test_a_uniform_light_is_uniform_in_every_mirror() -> None:
+def test_a_uniform_light_is_uniform_at_all_levels() -> None:
     prefiltered = filtering.prefilter(Environment.from_radiance(torch.full((8, 16, 3), 0.7)))
     torch.testing.assert_close(prefiltered.stack, torch.full((filtering.LEVELS, 8, 16, 3), 0.7))
 
 
-def test_a_turn_of_the_light_about_the_vertical_turns_all_levels() -> None:
+def test_a_rotation_of_the_light_about_the_vertical_rotates_all_levels() -> None:
     environment = smooth(8)
-    turned = filtering.prefilter(Environment(environment.log_radiance.roll(3, 1))).stack
-    torch.testing.assert_close(turned, filtering.prefilter(environment).stack.roll(3, 2))
+    rotated = filtering.prefilter(Environment(environment.log_radiance.roll(3, 1))).stack
+    torch.testing.assert_close(rotated, filtering.prefilter(environment).stack.roll(3, 2))
 
 
 def test_a_fine_map_is_averaged_down_and_keeps_its_light() -> None:
@@ -67,7 +67,7 @@ def test_a_fine_map_is_averaged_down_and_keeps_its_light() -> None:
     torch.testing.assert_close(filtering.prefilter(fine).stack, filtering.prefilter(coarse).stack, rtol=5e-3, atol=1e-3)
 
 
-def test_a_sharp_mirror_sees_the_finest_texels_and_a_rough_one_their_mean() -> None:
+def test_smooth_lobes_use_the_finest_texels_and_rough_ones_their_mean() -> None:
     torch.manual_seed(0)
     environment = Environment.from_radiance(torch.rand(4 * filtering.ROWS, 8 * filtering.ROWS, 3))
     light, d = filtering.prefilter(environment), fibonacci_sphere(300)
@@ -92,14 +92,14 @@ def test_gradients_reach_texels_direction_and_roughness() -> None:
     assert torch.autograd.gradcheck(glossy, inputs, fast_mode=True)
 
 
-def test_cells_of_the_sphere_miss_no_lamp() -> None:
-    """A lamp of one texel between directions: points of the map miss it, the cells that they stand for hold it."""
+def test_cell_radiance_does_not_miss_a_small_light() -> None:
+    """Point lookups in 256 directions may miss a light of one texel, cells do not."""
     radiance = torch.full((32, 64, 3), 0.1)
     radiance[11, 40] = 300.0
     light = filtering.prefilter(Environment.from_radiance(radiance))
     mean = light.environment.integral() / (4 * math.pi)
-    turned = [fibonacci_sphere(256) @ random_rotation(torch.Generator().manual_seed(k)).T for k in range(20)]
-    cells = torch.stack([light.cells(d).mean(0) for d in turned])
-    points = torch.stack([light.environment.lookup(d).mean(0) for d in turned])
-    assert (cells / mean - 1).abs().mean() < 0.1, "lobes overlap unevenly; wider ones would blur more"
+    sets = [fibonacci_sphere(256) @ random_rotation(torch.Generator().manual_seed(k)).T for k in range(20)]
+    cells = torch.stack([light.cell_radiance(d).mean(0) for d in sets])
+    points = torch.stack([light.environment.lookup(d).mean(0) for d in sets])
+    assert (cells / mean - 1).abs().mean() < 0.1, "the mean over cells is not exact, since the lobes overlap unevenly"
     assert (points / mean - 1).abs().mean() > 3 * (cells / mean - 1).abs().mean()

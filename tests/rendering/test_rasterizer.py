@@ -1,4 +1,4 @@
-"""One view of the Gaussians through the nouns: frames, names, and gradients that reach every noun, the pose too."""
+"""Rasterization of one view: frames, names of features, and gradients to Gaussians, features and pose."""
 
 import math
 
@@ -15,9 +15,9 @@ from tumble.scene.gaussians import Gaussians, constant_sh
 CAMERA = Camera.from_fov(0.6, 48, 64)
 
 
-def one(mean: list[float], normal_turn: list[float], sigma: float = 0.06) -> Gaussians:
-    """A disc at a place, its normal +z turned by a rotation vector."""
-    quats = SO3.exp(torch.tensor([normal_turn])).wxyz
+def disc(mean: list[float], rotation: list[float], sigma: float = 0.06) -> Gaussians:
+    """A disc at `mean`, whose normal is +z rotated by the rotation vector `rotation`."""
+    quats = SO3.exp(torch.tensor([rotation])).wxyz
     log_scales = torch.tensor([[sigma, sigma, 0.1 * sigma]]).log()
     return Gaussians(torch.tensor([mean]), quats, log_scales, torch.zeros(1), constant_sh(torch.ones(1, 3)))
 
@@ -28,29 +28,29 @@ def centroid(alpha: Tensor) -> Tensor:
     return (uv * weights[..., None]).sum((0, 1))
 
 
-def test_up_and_right_in_the_object_frame_is_up_and_right_in_the_picture() -> None:
-    """The camera at -y, +z up in its picture, sees +x to the right; the disc's normal, +z, is turned to -y."""
-    view = rasterize(one([0.4, 0, 0.3], [math.pi / 2, 0, 0]), GAMMA, look_at([0, -3, 0]), CAMERA, {})
+def test_up_and_right_in_the_object_frame_is_up_and_right_in_the_image() -> None:
+    """For a camera at -y with +z up, +x is to the right; the disc's normal is rotated from +z to -y."""
+    view = rasterize(disc([0.4, 0, 0.3], [math.pi / 2, 0, 0]), GAMMA, look_at([0, -3, 0]), CAMERA, {})
     u, v = centroid(view.alpha).tolist()
     assert u > CAMERA.width / 2
     assert v < CAMERA.height / 2
 
 
-def test_a_small_disc_lies_where_the_camera_projects_its_centre() -> None:
+def test_a_small_disc_is_rendered_at_the_projection_of_its_centre() -> None:
     T_cam_obj = look_at([0.4, -3, 0.5])
-    gaussians = one([0.3, 0, 0.2], [math.pi / 2, 0, 0])
+    gaussians = disc([0.3, 0, 0.2], [math.pi / 2, 0, 0])
     view = rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {})
     x_cam = (T_cam_obj @ gaussians.means)[0]
-    # Perspective moves the centroid of a disc two pixels wide by a few hundredths of one.
+    # Perspective moves the centroid of a disc that is two pixels wide by a few hundredths of a pixel.
     torch.testing.assert_close(centroid(view.alpha), CAMERA.project(x_cam), atol=0.05, rtol=0)
     row, column = int(CAMERA.project(x_cam)[1]), int(CAMERA.project(x_cam)[0])
     assert view.dominant[row, column] == 0
-    # Half a pixel beside the centre of a disc that faces the camera almost squarely.
+    # The pixel is half a pixel off the centre of the disc, which nearly faces the camera.
     torch.testing.assert_close(view.depth[row, column], x_cam[2], atol=5e-3, rtol=0)
     torch.testing.assert_close(view.normal[row, column], torch.tensor([0.0, -1.0, 0.0]), atol=1e-5, rtol=0)
 
 
-def test_features_come_back_under_their_names() -> None:
+def test_features_are_returned_under_their_names() -> None:
     n = 400
     features = {
         "albedo": torch.tensor([0.2, 0.5, 0.7]).expand(n, 4, 3),
@@ -66,11 +66,11 @@ def test_features_come_back_under_their_names() -> None:
         assert not view.features[name][view.alpha == 0].any()
 
 
-def test_without_features_there_are_none() -> None:
+def test_no_features_give_no_images() -> None:
     assert rasterize(sphere(50), GAMMA, look_at([0, -4, 0]), CAMERA, {}).features == {}
 
 
-def test_constant_harmonics_are_the_colour_given_from_everywhere() -> None:
+def test_constant_harmonics_have_the_given_colour_from_all_sides() -> None:
     gaussians = sphere(400)
     colour = torch.tensor([0.1, 0.9, 2.0])
     gaussians = Gaussians(
@@ -90,29 +90,29 @@ def test_only_pixels_under_the_mask_are_counted() -> None:
     assert torch.equal(left.touched + right.touched, whole.touched)
     assert right.touched.sum() > 0
     torch.testing.assert_close(right.weight, whole.weight)
-    # The camera looks along +y with +x to the right: what lies on the left is not touched on the right.
+    # The camera looks along +y with +x to the right: Gaussians on the left do not contribute to pixels on the right.
     assert not right.touched[gaussians.means[:, 0] < -0.5].any()
 
 
-def test_no_gaussians_give_an_empty_picture() -> None:
-    nobody = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
-    view = rasterize(nobody, GAMMA, look_at([0, -4, 0]), CAMERA, {"albedo": torch.zeros(0, 4, 3)})
+def test_no_gaussians_give_an_empty_image() -> None:
+    empty = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
+    view = rasterize(empty, GAMMA, look_at([0, -4, 0]), CAMERA, {"albedo": torch.zeros(0, 4, 3)})
     assert view.alpha.shape == (48, 64)
     assert not view.alpha.any()
     assert view.features["albedo"].shape == (48, 64, 3)
 
 
-def test_both_precisions_draw_the_same_picture() -> None:
+def test_both_precisions_render_the_same_image() -> None:
     single = rasterize(sphere(300), GAMMA, look_at([1, -4, 2]), CAMERA, {})
     double = rasterize(sphere(300, torch.float64), GAMMA.double(), look_at([1, -4, 2], torch.float64), CAMERA, {})
     for name in ("alpha", "rgb", "normal", "depth"):
-        one, two = getattr(single, name), getattr(double, name)
-        # A Gaussian may fall on either side of the smallest alpha, 1/255, in some pixel.
-        assert (one - two).abs().mean() < 1e-4, name
+        x, y = getattr(single, name), getattr(double, name)
+        # In some pixels rounding moves a Gaussian across the threshold of the smallest alpha, 1/255.
+        assert (x - y).abs().mean() < 1e-4, name
 
 
 def wide(n: int = 5) -> list[Tensor]:
-    """Translucent Gaussians wider than the picture: no pixel is near a threshold, where derivatives do not exist."""
+    """Translucent Gaussians wider than the image: no pixel is near a threshold, where derivatives do not exist."""
     torch.manual_seed(0)
     means = 0.3 * torch.randn(n, 3, dtype=torch.float64)
     quats = SO3.exp(torch.tensor([math.pi / 2, 0, 0]) + 0.2 * torch.randn(n, 3, dtype=torch.float64)).wxyz * 1.5
@@ -124,11 +124,11 @@ def wide(n: int = 5) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("base", [look_at([0.2, -4, 0.3], torch.float64), look_at([1.0, -3.8, -0.6], torch.float64)])
-def test_gradients_reach_every_noun_and_the_pose(base: SE3) -> None:
-    """Finite differences, the pose moved through `SE3.exp` as an optimizer does."""
+def test_gradients_of_all_inputs_match_finite_differences(base: SE3) -> None:
+    """The pose is parametrised by `SE3.exp`, as in an optimizer."""
     camera = Camera.from_fov(0.15, 4, 5)
 
-    def picture(tangent: Tensor, *raw: Tensor) -> tuple[Tensor, ...]:
+    def buffers(tangent: Tensor, *raw: Tensor) -> tuple[Tensor, ...]:
         *geometry, gamma, corners = raw
         T_cam_obj = SE3.exp(tangent) @ base
         view: Buffers = rasterize(Gaussians(*geometry), gamma, T_cam_obj, camera, {"f": corners})
@@ -136,12 +136,12 @@ def test_gradients_reach_every_noun_and_the_pose(base: SE3) -> None:
         return view.alpha, view.depth, view.depth_var, view.normal, view.rgb, view.features["f"]
 
     inputs = [torch.zeros(6, dtype=torch.float64), *wide()]
-    assert torch.autograd.gradcheck(picture, [x.requires_grad_() for x in inputs], fast_mode=True)
+    assert torch.autograd.gradcheck(buffers, [x.requires_grad_() for x in inputs], fast_mode=True)
 
 
-def test_gradients_reach_every_noun_through_the_fast_kernels_too() -> None:
-    """Against the same call in double precision, which the reference draws."""
-    found = []
+def test_gradients_of_the_native_kernels_match_the_reference() -> None:
+    """Single precision against double precision, which only the reference backend computes."""
+    gradients = []
     for dtype in (torch.float32, torch.float64):
         base = look_at([1.0, -3.5, 2.0], dtype)
         raw = [x.detach().to(dtype).clone().requires_grad_() for x in vars(sphere(200, torch.float64)).values()]
@@ -150,7 +150,7 @@ def test_gradients_reach_every_noun_through_the_fast_kernels_too() -> None:
         view = rasterize(Gaussians(*raw), gamma, SE3.exp(tangent) @ base, CAMERA, {"f": corners})
         ramp = torch.linspace(0, 1, 64, dtype=dtype)
         loss = (view.rgb.sum(-1) * ramp).sum() + (view.depth * ramp).sum() + (view.features["f"][..., 0] * ramp).sum()
-        found.append(torch.autograd.grad(loss + view.normal[..., 2].sum(), [tangent, *raw, corners]))
-    for one, two in zip(*found, strict=True):
-        # Thresholds that a rounding error crosses count among 200 Gaussians.
-        assert (one.double() - two).norm() <= 5e-3 * two.norm() + 1e-6
+        gradients.append(torch.autograd.grad(loss + view.normal[..., 2].sum(), [tangent, *raw, corners]))
+    for single, double in zip(*gradients, strict=True):
+        # With 200 Gaussians, thresholds crossed by rounding have a visible effect.
+        assert (single.double() - double).norm() <= 5e-3 * double.norm() + 1e-6

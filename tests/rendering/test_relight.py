@@ -1,4 +1,4 @@
-"""The preview of relit pictures: a sphere under one small lamp, in closed form."""
+"""The preview of relighting: a sphere under one small light, in closed form."""
 
 import math
 
@@ -21,8 +21,8 @@ ALBEDO = torch.tensor([0.7, 0.4, 0.2])
 
 @pytest.mark.parametrize(("row", "column"), [(20, 40), (33, 90), (45, 61)])
 @pytest.mark.parametrize("rows", [64, 256])
-def test_a_small_lamp_is_not_lost_between_the_directions(rows: int, row: int, column: int) -> None:
-    """One texel's lamp, or its four by four of a finer map: the diffuse light is albedo / pi times its irradiance."""
+def test_a_small_light_between_the_directions_is_not_missed(rows: int, row: int, column: int) -> None:
+    """A light of one texel, or of 4 x 4 texels of a finer map: the radiance is albedo / pi times irradiance."""
     fine = rows // 64
     radiance = torch.full((rows, 2 * rows, 3), 1e-6)
     radiance[fine * row : fine * (row + 1), fine * column : fine * (column + 1)] = 500.0
@@ -30,25 +30,25 @@ def test_a_small_lamp_is_not_lost_between_the_directions(rows: int, row: int, co
     strength = 500.0 * texel_solid_angles(64, 128)[row, column]
     gaussians = sphere(4000)
     material = Material.constant(4000, ALBEDO, 0.9)
-    # No highlight: f0 of nothing.
+    # No specular lobe: f0 is about 0.
     material = Material(material.albedo_logits, material.roughness_logits, material.normal_offset, torch.tensor(-20.0))
-    # The camera stands on the lamp's side, a little to the left.
+    # The camera is close to the direction of the light.
     T_cam_obj = look_at((4 * lamp + torch.tensor([0.5, 0.5, 0.7])).tolist())
     poses = SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None])
     environment = Environment.from_radiance(radiance)
     asset = Asset(gaussians, GAMMA, material, environment, Trajectory(poses, "object"), CAMERA)
-    (picture,) = relight.preview(relight.Config(), asset, environment, asset.trajectory, CAMERA)
+    (image,) = relight.preview(relight.Config(), asset, environment, asset.trajectory, CAMERA)
     normals = sphere_normals(T_cam_obj)
     inside = normals.norm(dim=-1) > 0.5
     expected = ALBEDO / math.pi * strength * (normals @ lamp).clamp(min=0)[..., None]
-    off = (picture - expected)[inside].square().mean(0).sqrt() / expected.amax((0, 1))
-    # Cells of the directions are about as wide as these lie apart, so the sum still knows where they lie: 5 % of the
-    # brightest on average, 14 % at worst over sixty lamps. Points of the map lose whole lamps, or triple them.
-    assert off.max() < 0.15
+    error = (image - expected)[inside].square().mean(0).sqrt() / expected.amax((0, 1))
+    # Cells are about as wide as the distance between directions, which causes errors of 5 % of the brightest value on
+    # average, at most 14 % for sixty positions of the light. Point lookups would miss the light or triple it.
+    assert error.max() < 0.15
 
 
 def sphere_normals(T_cam_obj: SE3) -> torch.Tensor:
-    """Of the unit sphere behind every pixel, a little inside its silhouette; zero elsewhere."""
+    """Normals of the unit sphere behind every pixel, a little inside its silhouette; zero elsewhere."""
     eye = T_cam_obj.inverse().xyz
     rays = T_cam_obj.inverse().rotation @ CAMERA.directions()
     along = rays @ eye

@@ -1,4 +1,4 @@
-"""Deferred shading against closed forms, the physics of the thesis, and Mitsuba as the judge (slow)."""
+"""Deferred shading against closed forms, the claims of the paper, and Mitsuba (slow)."""
 
 import math
 from typing import Any
@@ -15,7 +15,7 @@ from tumble.rendering import brdf, importance_sampling, shading
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import rasterize
 from tumble.rendering.shading import Bounce, Surface
-from tumble.rendering.trace import Visibility, build, transfer, unoccluded, visibility
+from tumble.rendering.trace import Visibility, build_tracer, transfer, unoccluded, visibility
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
@@ -30,14 +30,14 @@ def uniform(value: float = 1.0, dtype: torch.dtype = torch.float32) -> Environme
 
 
 def lamp(towards: list[float], width: float = 0.15, power: float = 60.0, rows: int = 64) -> Environment:
-    """One round lamp in a dim room; `towards` in the env frame, width in radians."""
+    """One round light in front of dim uniform light; `towards` in the env frame, width in radians."""
     centre = torch.nn.functional.normalize(torch.tensor(towards), dim=-1)
     bright = ((texel_directions(rows, 2 * rows) @ centre - 1) / width**2).exp()
     return Environment.from_radiance((1e-3 + power * bright)[..., None].expand(-1, -1, 3))
 
 
-def ball(n: int, dtype: torch.dtype = torch.float32) -> Surface:
-    """The part of a unit sphere that a camera at +z, three radii away, sees without grazing."""
+def visible_sphere(n: int, dtype: torch.dtype = torch.float32) -> Surface:
+    """The part of a unit sphere that faces a camera at +z, three radii away, without grazing angles."""
     normals = fibonacci_sphere(2 * n, dtype=dtype)[: n // 2]
     views = torch.nn.functional.normalize(torch.tensor([0.0, 0, 3]).to(normals) - normals, dim=-1)
     return Surface(torch.arange(len(normals)), normals, normals, views)
@@ -48,11 +48,11 @@ def grey(surface: Surface, albedo: float = 0.5, roughness: float = 0.5) -> tuple
     return surface.points.new_full((p, 3), albedo), surface.points.new_full((p, 1), roughness)
 
 
-def seen_by_all(gaussians: Gaussians) -> Tensor:
-    """What every Gaussian of a clean surface sees of the light."""
-    tracer = build(gaussians, GAMMA)
-    sky = visibility(tracer, gaussians.means, gaussians.normals, fibonacci_sphere(512))
-    return transfer([sky], gaussians.normals)
+def transfer_vectors(gaussians: Gaussians) -> Tensor:
+    """Transfer vectors of Gaussians whose centres are on the surface."""
+    tracer = build_tracer(gaussians, GAMMA)
+    traced = visibility(tracer, gaussians.means, gaussians.normals, fibonacci_sphere(512))
+    return transfer([traced], gaussians.normals)
 
 
 def rms(x: Tensor) -> float:
@@ -62,113 +62,120 @@ def rms(x: Tensor) -> float:
 # The surface ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_surface_of_a_sphere_lies_on_it_and_looks_back_at_the_camera() -> None:
+def test_the_surface_points_of_a_sphere_have_its_positions_normals_and_views() -> None:
     T_cam_obj = look_at([1, -4, 2])
-    seen = shading.surface(rasterize(sphere(4000), GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
+    surface = shading.surface(rasterize(sphere(4000), GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
     eye = T_cam_obj.inverse().xyz
-    # Flat overlapping discs stand a little above their sphere, and the nearer of them win (2 degrees at 4000).
-    assert (seen.points.norm(dim=-1) - 1).abs().max() < 0.01
-    assert (seen.points * seen.normals).sum(-1).mean() > math.cos(math.radians(3))
-    torch.testing.assert_close(seen.views, torch.nn.functional.normalize(eye - seen.points, dim=-1), atol=1e-5, rtol=0)
-    assert torch.equal(seen.sample(seen.paint(seen.points, 48, 48)), seen.points)
+    # Overlapping flat discs are slightly above the sphere, and the nearest one dominates (2 degrees at 4000 discs).
+    assert (surface.points.norm(dim=-1) - 1).abs().max() < 0.01
+    assert (surface.points * surface.normals).sum(-1).mean() > math.cos(math.radians(3))
+    torch.testing.assert_close(
+        surface.views, torch.nn.functional.normalize(eye - surface.points, dim=-1), atol=1e-5, rtol=0
+    )
+    assert torch.equal(surface.sample(surface.paint(surface.points, 48, 48)), surface.points)
 
 
-def test_chosen_pixels_are_those_of_the_whole() -> None:
+def test_the_points_of_chosen_pixels_are_those_of_the_whole_view() -> None:
     T_cam_obj = look_at([1, -4, 2])
     view = rasterize(sphere(400), GAMMA, T_cam_obj, CAMERA, {})
     whole = shading.surface(view, T_cam_obj, CAMERA)
-    some = shading.surface(view, T_cam_obj, CAMERA, pixels=whole.pixels[10:20])
-    for one, two in zip(vars(some).values(), vars(whole).values(), strict=True):
-        # Where the vectors of a product end depends on how many there are: the last digit is not the same everywhere.
-        torch.testing.assert_close(one, two[10:20], atol=1e-6, rtol=0)
+    part = shading.surface(view, T_cam_obj, CAMERA, pixels=whole.pixels[10:20])
+    for ours, expected in zip(vars(part).values(), vars(whole).values(), strict=True):
+        # The last digit of vectorised products depends on the number of points.
+        torch.testing.assert_close(ours, expected[10:20], atol=1e-6, rtol=0)
 
 
 # Closed forms ---------------------------------------------------------------------------------------------------------
 
 
-def test_chalk_in_a_uniform_light_sends_back_its_albedo() -> None:
-    seen = ball(400)
-    found = shading.diffuse(seen, grey(seen)[0], uniform(2.0), torch.eye(3), unoccluded(fibonacci_sphere(2048), 200))
+def test_a_lambertian_surface_reflects_its_albedo_under_uniform_light() -> None:
+    surface = visible_sphere(400)
+    found = shading.diffuse(
+        surface, grey(surface)[0], uniform(2.0), torch.eye(3), unoccluded(fibonacci_sphere(2048), 200)
+    )
     # 2048 directions resolve a cosine to a few parts in ten thousand.
     torch.testing.assert_close(found, torch.full((200, 3), 1.0), rtol=2e-3, atol=0)
 
 
-def test_an_eye_behind_the_surface_sees_the_diffuse_lobe_alone() -> None:
-    """`diffuse` borrows the kernel of both lobes."""
+def test_diffuse_is_the_diffuse_lobe_alone() -> None:
+    """`diffuse` uses the kernel of both lobes with a camera behind the surface."""
     torch.manual_seed(0)
-    seen, directions = ball(400, torch.float64), fibonacci_sphere(256, dtype=torch.float64)
+    surface, directions = visible_sphere(400, torch.float64), fibonacci_sphere(256, dtype=torch.float64)
     environment = Environment(torch.randn(8, 16, 3, dtype=torch.float64))
-    found = shading.diffuse(seen, grey(seen)[0], environment, torch.eye(3).double(), unoccluded(directions, 200))
-    cosine = (seen.normals @ directions.T).clamp(min=0)
+    found = shading.diffuse(surface, grey(surface)[0], environment, torch.eye(3).double(), unoccluded(directions, 200))
+    cosine = (surface.normals @ directions.T).clamp(min=0)
     expected = 0.5 / math.pi * 4 * math.pi / 256 * cosine @ environment.lookup(directions)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
-def test_both_estimators_know_the_reflectance_of_a_uniform_light(roughness: float) -> None:
-    seen = ball(400)
-    albedo, rough = grey(seen, 0.0, roughness)
-    nov = (seen.normals * seen.views).sum(-1, keepdim=True)
+def test_both_estimators_give_the_reflectance_under_uniform_light(roughness: float) -> None:
+    surface = visible_sphere(400)
+    albedo, rough = grey(surface, 0.0, roughness)
+    nov = (surface.normals * surface.views).sum(-1, keepdim=True)
     expected = F0 * brdf.split_sum(brdf.split_sum_table(), nov, rough)
-    sky, R = unoccluded(fibonacci_sphere(1 << 14), 200), torch.eye(3)
-    summed = shading.shade(seen, albedo, rough, uniform(), R, sky, f0=F0)
-    split = shading.shade_split(seen, albedo, rough, prefilter(uniform()), R, sky, f0=F0)
+    unshadowed, R = unoccluded(fibonacci_sphere(1 << 14), 200), torch.eye(3)
+    summed = shading.shade(surface, albedo, rough, uniform(), R, unshadowed, f0=F0)
+    split = shading.shade_split(surface, albedo, rough, prefilter(uniform()), R, unshadowed, f0=F0)
     # The table is bilinear on 64 entries; 16384 directions resolve a lobe of roughness 0.3 to a percent.
     torch.testing.assert_close(summed, expected.expand(-1, 3), rtol=0.02, atol=0)
     torch.testing.assert_close(split, expected.expand(-1, 3), rtol=1e-3, atol=1e-5)
 
 
-def test_the_split_sum_shows_a_smooth_mirror_the_light_itself() -> None:
-    seen = ball(100)
+def test_the_split_sum_of_a_smooth_mirror_is_the_light_itself() -> None:
+    surface = visible_sphere(100)
     environment = lamp([0.3, 0.5, 0.8], 0.5)
-    _, rough = grey(seen, 0.0, 0.05)
+    _, rough = grey(surface, 0.0, 0.05)
     R = random_rotation(torch.Generator().manual_seed(0))
-    sky = unoccluded(fibonacci_sphere(64), 50)
+    unshadowed = unoccluded(fibonacci_sphere(64), 50)
     albedo = torch.zeros(50, 3)
-    found = shading.shade_split(seen, albedo, rough, prefilter(environment), R, sky, f0=0.04)
-    mirrored = 2 * (seen.normals * seen.views).sum(-1, keepdim=True) * seen.normals - seen.views
-    nov = (seen.normals * seen.views).sum(-1, keepdim=True)
-    share = brdf.split_sum(brdf.split_sum_table(), nov, rough)
-    # Two fifths of level 1, which blurs a little, on a map whose texels are a tenth of the lamp.
-    torch.testing.assert_close(found, 0.04 * share * environment.lookup(mirrored @ R.mT), rtol=0.02, atol=0.0008)
+    found = shading.shade_split(surface, albedo, rough, prefilter(environment), R, unshadowed, f0=0.04)
+    mirrored = 2 * (surface.normals * surface.views).sum(-1, keepdim=True) * surface.normals - surface.views
+    nov = (surface.normals * surface.views).sum(-1, keepdim=True)
+    directional_albedo = brdf.split_sum(brdf.split_sum_table(), nov, rough)
+    # Level 1 has a weight of 2/5 and blurs a little; the texels are a tenth of the light's width.
+    expected = 0.04 * directional_albedo * environment.lookup(mirrored @ R.mT)
+    torch.testing.assert_close(found, expected, rtol=0.02, atol=0.0008)
 
 
-def test_a_white_torus_that_bounces_light_vanishes_in_a_white_furnace() -> None:
-    """What is not seen of the light is seen of the torus, which under this light is as bright."""
+def test_a_white_torus_with_indirect_light_vanishes_in_a_white_furnace() -> None:
+    """Occluded directions show the torus, which is as bright as this light."""
     gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
-    seen = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
-    sees = visibility(build(gaussians, GAMMA), seen.points, seen.normals, fibonacci_sphere(256), blockers=True)
-    white = grey(seen, 1.0)[0]
-    bounce = Bounce(torch.ones(1000, 3), seen_by_all(gaussians))
-    found = shading.diffuse(seen, white, uniform(), torch.eye(3), sees, bounce=bounce)
-    black = shading.diffuse(seen, white, uniform(), torch.eye(3), sees)
-    assert black.min() < 0.7, "some of the torus must be in its own shade for this to say anything"
+    surface = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
+    traced = visibility(
+        build_tracer(gaussians, GAMMA), surface.points, surface.normals, fibonacci_sphere(256), blockers=True
+    )
+    white = grey(surface, 1.0)[0]
+    bounce = Bounce(torch.ones(1000, 3), transfer_vectors(gaussians))
+    found = shading.diffuse(surface, white, uniform(), torch.eye(3), traced, bounce=bounce)
+    black = shading.diffuse(surface, white, uniform(), torch.eye(3), traced)
+    assert black.min() < 0.7, "the test needs self-shadowing"
     torch.testing.assert_close(found, torch.ones_like(found), atol=0.03, rtol=0)
 
 
-def test_a_shadow_dims_the_mirror_that_shows_it() -> None:
-    """Half of the sky is closed: mirrors that look into the one half keep their light, the others lose it."""
-    seen, directions = ball(800), fibonacci_sphere(256)
+def test_occluded_directions_dim_the_specular_lobe() -> None:
+    """Half of all directions are occluded: lobes in this half lose their light, the others keep it."""
+    surface, directions = visible_sphere(800), fibonacci_sphere(256)
     bits = unoccluded(directions, 400).bits.clone()
-    closed = directions[:, 0] < 0
-    for j in torch.where(closed)[0].tolist():
+    occluded = directions[:, 0] < 0
+    for j in torch.where(occluded)[0].tolist():
         bits[:, j // 32] &= ~(1 << (j % 32)) if j % 32 < 31 else 0x7FFFFFFF
     half = Visibility(directions, bits, None)
-    assert torch.equal(half.unpacked()[0], ~closed)
-    mirrored = 2 * (seen.normals * seen.views).sum(-1, keepdim=True) * seen.normals - seen.views
-    share = shading.lobe_visibility(seen, torch.full((400, 1), 0.2), half)[:, 0]
-    # Neighbouring directions lie 0.22 apart.
-    assert share[mirrored[:, 0] > 0.5].min() > 0.95
-    assert share[mirrored[:, 0] < -0.5].max() < 0.05
+    assert torch.equal(half.unpacked()[0], ~occluded)
+    mirrored = 2 * (surface.normals * surface.views).sum(-1, keepdim=True) * surface.normals - surface.views
+    fraction = shading.lobe_visibility(surface, torch.full((400, 1), 0.2), half)[:, 0]
+    # Neighbouring directions are 0.22 apart.
+    assert fraction[mirrored[:, 0] > 0.5].min() > 0.95
+    assert fraction[mirrored[:, 0] < -0.5].max() < 0.05
 
 
-def test_the_horizon_casts_no_shadow_on_a_mirror() -> None:
-    """Bits are clear below the horizon, where a lobe seen at a grazing angle has half of its weight."""
-    seen = ball(800)
-    sees = visibility(build(sphere(500), GAMMA), 1.02 * seen.points, seen.normals, fibonacci_sphere(256))
+def test_the_horizon_does_not_dim_the_specular_lobe() -> None:
+    """Bits are 0 below the horizon, where a lobe at a grazing angle has half of its weight."""
+    surface = visible_sphere(800)
+    traced = visibility(build_tracer(sphere(500), GAMMA), 1.02 * surface.points, surface.normals, fibonacci_sphere(256))
     for roughness in (0.1, 0.5, 1.0):
-        share = shading.lobe_visibility(seen, torch.full((400, 1), roughness), sees)
-        torch.testing.assert_close(share, torch.ones_like(share))
+        fraction = shading.lobe_visibility(surface, torch.full((400, 1), roughness), traced)
+        torch.testing.assert_close(fraction, torch.ones_like(fraction))
 
 
 # Gradients ------------------------------------------------------------------------------------------------------------
@@ -176,15 +183,15 @@ def test_the_horizon_casts_no_shadow_on_a_mirror() -> None:
 
 def test_gradients_reach_surface_material_light_and_rotation() -> None:
     torch.manual_seed(0)
-    seen = ball(16, torch.float64)
-    # None of them along a normal, where the eye behind the surface, which finite differences move, is on a pole.
+    surface = visible_sphere(16, torch.float64)
+    # No direction along a normal: there the camera behind the surface, which finite differences move, is at a pole.
     directions = fibonacci_sphere(33, dtype=torch.float64) @ SO3.exp(torch.tensor([0.3, 0.4, 0.5]).double()).matrix()
     bits = torch.randint(-(1 << 31), (1 << 31) - 1, (8, 2)).int()
-    sees = Visibility(directions, bits, torch.randint(0, 3, (8, 33)).int())
-    turned = SO3.exp(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
+    traced = Visibility(directions, bits, torch.randint(0, 3, (8, 33)).int())
+    base = SO3.exp(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
     inputs = [
-        seen.normals,
-        seen.views,
+        surface.normals,
+        surface.views,
         torch.rand(8, 3).double(),
         0.3 + 0.5 * torch.rand(8, 1).double(),
         torch.randn(4, 8, 3).double(),
@@ -193,52 +200,53 @@ def test_gradients_reach_surface_material_light_and_rotation() -> None:
     ]
 
     def summed(*x: Tensor) -> Tensor:
-        surface = Surface(seen.pixels, seen.points, x[0], x[1])
-        bounce = Bounce(x[6], transfer([sees], seen.normals)[:3])
-        R_env_obj = (SO3.exp(x[5]) @ turned).matrix()
-        return shading.shade(surface, x[2], x[3], Environment(x[4]), R_env_obj, sees, f0=F0, bounce=bounce)
+        points = Surface(surface.pixels, surface.points, x[0], x[1])
+        bounce = Bounce(x[6], transfer([traced], surface.normals)[:3])
+        R_env_obj = (SO3.exp(x[5]) @ base).matrix()
+        return shading.shade(points, x[2], x[3], Environment(x[4]), R_env_obj, traced, f0=F0, bounce=bounce)
 
     def split(*x: Tensor) -> Tensor:
-        surface = Surface(seen.pixels, seen.points, x[0], x[1])
-        R_env_obj, sky = (SO3.exp(x[5]) @ turned).matrix(), unoccluded(directions, 8)
-        return shading.shade_split(surface, x[2], x[3], prefilter(Environment(x[4])), R_env_obj, sky, f0=F0)
+        points = Surface(surface.pixels, surface.points, x[0], x[1])
+        R_env_obj, unshadowed = (SO3.exp(x[5]) @ base).matrix(), unoccluded(directions, 8)
+        return shading.shade_split(points, x[2], x[3], prefilter(Environment(x[4])), R_env_obj, unshadowed, f0=F0)
 
     inputs = [x.clone().requires_grad_() for x in inputs]
     assert torch.autograd.gradcheck(summed, inputs, fast_mode=True)
-    # `diffuse` holds its eye still where it turns with the normal: 1e-4 of the light.
+    # `diffuse` treats its camera, which depends on the normal, as constant: an error of 1e-4 of the light.
     assert torch.autograd.gradcheck(split, inputs[:6], fast_mode=True, rtol=5e-3, atol=1e-3)
 
 
-def test_shading_in_parts_is_shading_at_once() -> None:
-    seen, sky = ball(800), unoccluded(fibonacci_sphere(128), 400)
-    albedo, rough = grey(seen)
+def test_shading_in_parts_equals_shading_at_once() -> None:
+    surface, unshadowed = visible_sphere(800), unoccluded(fibonacci_sphere(128), 400)
+    albedo, rough = grey(surface)
     environment, R = lamp([0.3, 0.5, 0.8]), torch.eye(3)
-    whole = shading.shade(seen, albedo, rough, environment, R, sky, f0=F0)
+    whole = shading.shade(surface, albedo, rough, environment, R, unshadowed, f0=F0)
     parts = []
     for index in torch.arange(400).split(77):
-        part = Surface(*(x[index] for x in vars(seen).values()))
-        parts.append(shading.shade(part, albedo[index], rough[index], environment, R, sky.gather(index), f0=F0))
+        part = Surface(*(x[index] for x in vars(surface).values()))
+        part_unshadowed = unshadowed.gather(index)
+        parts.append(shading.shade(part, albedo[index], rough[index], environment, R, part_unshadowed, f0=F0))
     torch.testing.assert_close(torch.cat(parts), whole)
 
 
-# The physics of the thesis --------------------------------------------------------------------------------------------
+# The claims of the paper ----------------------------------------------------------------------------------------------
 
 
 def albedo_gradient(environment: Environment, trajectory: Trajectory) -> Tensor:
-    """Gradient of a squared error to the albedo, summed over frames in which all points are shaded."""
-    seen = ball(200)
-    albedo = grey(seen)[0].requires_grad_()
-    truth = grey(seen, 0.3)[0]
-    sky = unoccluded(fibonacci_sphere(512), 100)
+    """Gradient of a squared error with respect to the albedo, summed over frames that show all points."""
+    surface = visible_sphere(200)
+    albedo = grey(surface)[0].requires_grad_()
+    truth = grey(surface, 0.3)[0]
+    unshadowed = unoccluded(fibonacci_sphere(512), 100)
     loss = torch.zeros(())
     for R_env_obj in trajectory.R_env_obj:
-        found, wanted = (shading.diffuse(seen, x, environment, R_env_obj, sky) for x in (albedo, truth))
-        loss = loss + (found - wanted).square().sum()
+        ours, expected = (shading.diffuse(surface, x, environment, R_env_obj, unshadowed) for x in (albedo, truth))
+        loss = loss + (ours - expected).square().sum()
     return torch.autograd.grad(loss, albedo)[0]
 
 
-def test_only_a_light_with_direction_tells_a_hand_from_a_dome() -> None:
-    """The thesis: motion under a light that stands still adds information, and none if the light is uniform."""
+def test_only_a_directional_light_distinguishes_handheld_from_dome() -> None:
+    """The paper: motion under a fixed light adds information about the albedo, except if the light is uniform."""
     generator = torch.Generator().manual_seed(0)
     R = torch.stack([random_rotation(generator) for _ in range(4)])
     poses = SE3(SO3.from_matrix(R).wxyz, torch.tensor([0.0, 0, 4]).expand(4, 3))
@@ -247,16 +255,16 @@ def test_only_a_light_with_direction_tells_a_hand_from_a_dome() -> None:
     point = lamp([1.0, 0.2, -0.3])
     by_hand, by_dome = albedo_gradient(point, hand), albedo_gradient(point, dome)
     assert rms(by_hand - by_dome) > 0.5 * rms(by_dome)
-    # Under the dome some points are never lit and nothing is learnt of them; by hand all have their turn.
+    # In a dome some points are never lit and have no gradient; in a hand-held capture all points are lit in some frame.
     dark = by_dome.norm(dim=-1) < 1e-3 * by_dome.norm(dim=-1).max()
     assert dark.sum() > 10
     assert (by_hand.norm(dim=-1)[dark] > 1e-2 * by_hand.norm(dim=-1).max()).float().mean() > 0.9
 
 
-def test_turning_object_camera_and_light_together_changes_nothing() -> None:
+def test_a_common_rotation_of_object_camera_and_light_changes_nothing() -> None:
     gaussians, T_cam_obj, R_env_obj = torus(1000), look_at([2, 1, 3]), SO3.exp(torch.tensor([0.2, -0.4, 0.9]))
     Q_new_old = SO3.exp(torch.tensor([1.0, 0.5, -0.7]))
-    turned = Gaussians(
+    rotated = Gaussians(
         Q_new_old @ gaussians.means,
         (Q_new_old @ SO3(gaussians.quats)).wxyz,
         gaussians.log_scales,
@@ -266,30 +274,32 @@ def test_turning_object_camera_and_light_together_changes_nothing() -> None:
     environment, directions = lamp([0.3, 0.5, 0.8], 0.5), fibonacci_sphere(128)
     identity = SO3.identity()
     found = []
-    for shape, Q in ((gaussians, identity), (turned, Q_new_old)):
+    for shape, Q in ((gaussians, identity), (rotated, Q_new_old)):
         T = T_cam_obj @ SE3.from_rotation(Q.inverse(), torch.zeros(3))
-        seen = shading.surface(rasterize(shape, GAMMA, T, CAMERA, {}), T, CAMERA)
-        sees = visibility(build(shape, GAMMA), seen.points, seen.normals, Q @ directions, blockers=True)
-        bounce = Bounce(torch.full((1000, 3), 0.5), seen_by_all(shape))
+        surface = shading.surface(rasterize(shape, GAMMA, T, CAMERA, {}), T, CAMERA)
+        traced = visibility(build_tracer(shape, GAMMA), surface.points, surface.normals, Q @ directions, blockers=True)
+        bounce = Bounce(torch.full((1000, 3), 0.5), transfer_vectors(shape))
         R = (R_env_obj @ Q.inverse()).matrix()
-        found.append(seen.paint(shading.shade(seen, *grey(seen), environment, R, sees, f0=F0, bounce=bounce), 48, 48))
-    # A ray in a hundred thousand meets a threshold from the other side.
+        found.append(
+            surface.paint(shading.shade(surface, *grey(surface), environment, R, traced, f0=F0, bounce=bounce), 48, 48)
+        )
+    # One ray in a hundred thousand crosses a threshold by rounding.
     assert (found[0] - found[1]).abs().mean() < 1e-3 * found[0].mean()
     assert found[0].max() > 0.1
 
 
-# The judge ------------------------------------------------------------------------------------------------------------
+# Mitsuba --------------------------------------------------------------------------------------------------------------
 
 
 def real_light(shared_data: Any) -> Environment:
     return Environment.read(shared_data / "hdri" / "venice_sunset_1k.hdr").resampled(64, 128)
 
 
-def compared(
-    shape: str, environment: Environment, albedo: float = 0.6, depth: int = 2
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Our picture, Mitsuba's of the same mesh and BRDF, and where the geometry of both agrees; with all light between
-    parts of the object, or with direct light alone at depth 2."""
+def compare(shape: str, environment: Environment, albedo: float = 0.6, depth: int = 2) -> tuple[Tensor, Tensor, Tensor]:
+    """Our image, Mitsuba's image of the same shape and BRDF, and the mask of pixels where both geometries are equal.
+
+    With direct light only at depth 2, otherwise with indirect light.
+    """
     from tests.rendering import mitsuba_brdf
     from tumble.synthetic import pathtracer
 
@@ -298,14 +308,14 @@ def compared(
     camera, T_cam_obj = Camera.from_fov(0.6, size, size), look_at([2.5, 1, 2.5])
     R_env_obj = SO3.exp(torch.tensor([-1.2, 0.3, 0.2])).matrix()
     view = rasterize(gaussians, GAMMA, T_cam_obj, camera, {})
-    seen = shading.surface(view, T_cam_obj, camera, alpha_min=0.9)
-    light, tracer = importance_sampling.light_sampler(environment), build(gaussians, GAMMA)
+    surface = shading.surface(view, T_cam_obj, camera, alpha_min=0.9)
+    light, tracer = importance_sampling.light_sampler(environment), build_tracer(gaussians, GAMMA)
     generator = torch.Generator().manual_seed(0)
-    diffuse = Bounce(torch.full((n, 3), albedo), seen_by_all(gaussians))
+    diffuse = Bounce(torch.full((n, 3), albedo), transfer_vectors(gaussians))
     bounce = importance_sampling.GlossyBounce(diffuse, torch.full((n, 1), roughness), prefilter(environment))
     ours = importance_sampling.relight_surface(
-        seen,
-        *grey(seen, albedo, roughness),
+        surface,
+        *grey(surface, albedo, roughness),
         light,
         R_env_obj,
         tracer,
@@ -324,37 +334,37 @@ def compared(
     agree = (torch.from_numpy(coverage) > 0.999) & (view.alpha > 0.95)
     agree &= (normals - torch.from_numpy(maps.normal)).norm(dim=-1) < math.radians(1.5)
     agree &= (view.depth - torch.from_numpy(maps.depth[..., 0])).abs() < 0.01
-    return seen.paint(ours, size, size), torch.from_numpy(truth), agree
+    return surface.paint(ours, size, size), torch.from_numpy(truth), agree
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["sphere", "torus"])
 @pytest.mark.parametrize("light", ["constant", "lamp", "real"])
-def test_a_path_tracer_agrees_to_three_percent(shape: str, light: str, shared_data: Any) -> None:
-    """Direct light with shadows, the same BRDF written a second time for Mitsuba."""
-    # In the object frame the lamp stands low at +x: one side of the torus lies in the shade of the other.
+def test_direct_light_matches_the_path_tracer_to_three_percent(shape: str, light: str, shared_data: Any) -> None:
+    """Direct light with shadows; the same BRDF is implemented a second time for Mitsuba."""
+    # In the object frame the light is low at +x: one side of the torus is in the shadow of the other.
     lights = {"constant": uniform, "lamp": lambda: lamp([0.87, 0.28, -0.41]), "real": lambda: real_light(shared_data)}
-    ours, truth, agree = compared(shape, lights[light]())
+    ours, truth, agree = compare(shape, lights[light]())
     assert agree.sum() > 1000
     assert rms((ours - truth)[agree]) < 0.03 * rms(truth[agree])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("albedo", [0.3, 0.8])
-def test_light_between_parts_is_that_of_a_path_tracer(albedo: float, shared_data: Any) -> None:
-    """All bounces. Lit from everywhere, what stands in the way would send on 1.13 times as much at albedo 0.3."""
+def test_indirect_light_matches_the_path_tracer(albedo: float, shared_data: Any) -> None:
+    """All bounces. Without shadows on the occluding surface it would be 1.13 times as bright at albedo 0.3."""
     light = real_light(shared_data)
-    (ours, truth, agree), (direct, lit, _) = compared("torus", light, albedo, 12), compared("torus", light, albedo)
+    (ours, truth, agree), (direct, lit, _) = compare("torus", light, albedo, 12), compare("torus", light, albedo)
     found, between = (ours - direct)[agree], (truth - lit)[agree]
     assert found.mean().item() == pytest.approx(between.mean().item(), rel=0.07)
     assert rms(found - between) < 0.2 * rms(between)
 
 
 @pytest.mark.parametrize("theta", [0.1, 0.8, 1.2])
-def test_a_wide_lobe_is_that_of_the_path_tracer(theta: float) -> None:
-    """A black dielectric under a sky that is bright above the horizon, against Mitsuba's own BRDF.
+def test_a_wide_lobe_matches_the_path_tracer(theta: float) -> None:
+    """A black dielectric under a light with a gradient, against Mitsuba's own BRDF.
 
-    Schlick's Fresnel term would be 7 to 18 percent too dark; the split sum alone is 1.4 times too bright at 1.2.
+    Schlick's Fresnel term would be 7 to 18 % too dark; the split sum alone is 1.4 times too bright at 1.2.
     """
     pytest.importorskip("mitsuba")
     from tumble.synthetic import pathtracer
@@ -365,15 +375,15 @@ def test_a_wide_lobe_is_that_of_the_path_tracer(theta: float) -> None:
     si = mi.SurfaceInteraction3f()
     si.wi = mi.Vector3f(math.sin(theta), 0.0, math.cos(theta))
     w = fibonacci_sphere(800).double()
-    # The sky is bright towards +x, where the mirror image of the eye is not, and behind it where it is.
-    sky = 1 + 0.9 * -w[:, 0]
+    # The light is brightest at -x, where the reflection of the camera is.
+    light = 1 + 0.9 * -w[:, 0]
     above = w[:, 2] > 0
-    compared = [np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*d))).ravel()[0] for d in w[above].tolist()]
-    truth = float((torch.tensor(compared) * sky[above]).sum() * 4 * math.pi / len(w))
+    values = [np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*d))).ravel()[0] for d in w[above].tolist()]
+    truth = float((torch.tensor(values) * light[above]).sum() * 4 * math.pi / len(w))
 
     environment = Environment.from_radiance((1 - 0.9 * texel_directions(32, 64)[..., :1]).expand(32, 64, 3))
     eye = torch.tensor([[math.sin(theta), 0.0, math.cos(theta)]])
     point = Surface(torch.zeros(1, dtype=torch.long), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), eye)
-    black, rough, sky_of = torch.zeros(1, 3), torch.full((1, 1), 0.5), prefilter(environment)
-    ours = shading.shade_split(point, black, rough, sky_of, torch.eye(3), unoccluded(w.float(), 1), f0=F0)
+    black, rough, prefiltered = torch.zeros(1, 3), torch.full((1, 1), 0.5), prefilter(environment)
+    ours = shading.shade_split(point, black, rough, prefiltered, torch.eye(3), unoccluded(w.float(), 1), f0=F0)
     assert ours[0, 0].item() == pytest.approx(truth, rel=0.02)

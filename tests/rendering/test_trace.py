@@ -1,4 +1,4 @@
-"""What rays meet, and what the visible surface can see: against shapes whose shadows are known in closed form."""
+"""Ray tracing and visibility against shapes with known shadows."""
 
 import math
 
@@ -21,31 +21,33 @@ EYES = [[0, -4, 0.1], [0, 4, 0.1], [4, 0, 0.1], [-4, 0, 0.1], [0.1, 0, 4], [0.1,
 DIRECTIONS = fibonacci_sphere(128)
 
 
-def torus_sees(points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-    """Which directions are open, by marching along them in steps of the distance to the true torus."""
+def torus_visibility(points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
+    """Which directions are not occluded, by sphere tracing of the true torus."""
     x = (points + 1e-3 * normals)[:, None].expand(-1, len(directions), -1)
-    open_ = normals @ directions.T > 0
+    visible = normals @ directions.T > 0
     travelled = torch.zeros(x.shape[:2], dtype=points.dtype)
     for _ in range(50):
         y = x + travelled[..., None] * directions
         distance = torch.stack([y[..., :2].norm(dim=-1) - MAJOR, y[..., 2]], -1).norm(dim=-1) - MINOR
-        open_ &= distance > 5e-4
+        visible &= distance > 5e-4
         travelled = travelled + distance.clamp(min=1e-3)
-    return open_
+    return visible
 
 
-def test_a_convex_object_casts_no_shadow_on_itself() -> None:
-    """From the surface that a camera sees. From centres under it, a prototype saw 0.92 on average."""
+def test_a_convex_object_does_not_shadow_itself() -> None:
+    """Rays start from the rendered surface; from the Gaussians' centres the mean fraction would be 0.92."""
     gaussians = sphere(2000)
-    seen = surface(rasterize(gaussians, GAMMA, look_at([2, 1, 3]), CAMERA, {}), look_at([2, 1, 3]), CAMERA)
-    tracer = tracing.build(gaussians, GAMMA)
-    fraction = tracing.visibility(tracer, seen.points, seen.normals, DIRECTIONS).fraction(seen.normals)
+    visible_surface = surface(rasterize(gaussians, GAMMA, look_at([2, 1, 3]), CAMERA, {}), look_at([2, 1, 3]), CAMERA)
+    tracer = tracing.build_tracer(gaussians, GAMMA)
+    fraction = tracing.visibility(tracer, visible_surface.points, visible_surface.normals, DIRECTIONS).fraction(
+        visible_surface.normals
+    )
     assert fraction.mean() > 0.985
     assert fraction.quantile(0.02) > 0.95
 
 
-def test_a_rough_convex_object_casts_no_shadow_either() -> None:
-    """Centres half a standard deviation in and out, normals 9 degrees off, sizes and opacities mixed."""
+def test_a_noisy_convex_object_does_not_shadow_itself_either() -> None:
+    """Noise of half a standard deviation on centres and 9 degrees on normals; varying sizes and opacities."""
     torch.manual_seed(0)
     clean = sphere(2000)
     sigma = clean.scales[0, 0]
@@ -56,24 +58,31 @@ def test_a_rough_convex_object_casts_no_shadow_either() -> None:
         0.1 * torch.rand(2000),
         clean.sh,
     )
-    seen = surface(rasterize(gaussians, GAMMA, look_at([2, 1, 3]), CAMERA, {}), look_at([2, 1, 3]), CAMERA)
-    tracer = tracing.build(gaussians, GAMMA)
-    assert tracing.visibility(tracer, seen.points, seen.normals, DIRECTIONS).fraction(seen.normals).mean() > 0.985
+    visible_surface = surface(rasterize(gaussians, GAMMA, look_at([2, 1, 3]), CAMERA, {}), look_at([2, 1, 3]), CAMERA)
+    tracer = tracing.build_tracer(gaussians, GAMMA)
+    assert (
+        tracing.visibility(tracer, visible_surface.points, visible_surface.normals, DIRECTIONS)
+        .fraction(visible_surface.normals)
+        .mean()
+        > 0.985
+    )
 
 
-def test_a_torus_shades_itself_where_its_true_surface_does() -> None:
+def test_a_torus_shadows_itself_like_the_true_surface() -> None:
     gaussians = torus(4000)
     T_cam_obj = look_at([2, 1, 3])
-    seen = surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
-    ring = MAJOR * torch.nn.functional.normalize(seen.points * torch.tensor([1.0, 1.0, 0.0]), dim=-1)
-    normals = torch.nn.functional.normalize(seen.points - ring, dim=-1)
-    truth = torus_sees(ring + MINOR * normals, normals, DIRECTIONS)
-    found = tracing.visibility(tracing.build(gaussians, GAMMA), seen.points, normals, DIRECTIONS).unpacked()
+    visible_surface = surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA)
+    ring = MAJOR * torch.nn.functional.normalize(visible_surface.points * torch.tensor([1.0, 1.0, 0.0]), dim=-1)
+    normals = torch.nn.functional.normalize(visible_surface.points - ring, dim=-1)
+    truth = torus_visibility(ring + MINOR * normals, normals, DIRECTIONS)
+    found = tracing.visibility(
+        tracing.build_tracer(gaussians, GAMMA), visible_surface.points, normals, DIRECTIONS
+    ).unpacked()
     above = normals @ DIRECTIONS.T > 0
-    shaded = (above & ~truth).sum() / above.sum()
-    assert 0.05 < shaded < 0.1, "a torus that hides little of its sky from itself would prove little"
-    # Discs overhang the tube by some 0.015 and rays start 0.05 above it, so an edge half a unit away moves by 0.1
-    # radians. Errors stand at such edges: among the neighbours of a direction, which lie 0.31 apart.
+    shadowed = (above & ~truth).sum() / above.sum()
+    assert 0.05 < shadowed < 0.1, "the test needs self-shadowing"
+    # Discs extend beyond the tube by about 0.015 and rays start 0.05 above it, which moves an edge half a unit away by
+    # 0.1 radians. Errors are at such edges: between neighbouring directions, which are 0.31 apart.
     wrong = found != truth
     assert wrong.sum() / above.sum() < 0.02
     near = (math.cos(0.35) < DIRECTIONS @ DIRECTIONS.T).float()
@@ -81,11 +90,11 @@ def test_a_torus_shades_itself_where_its_true_surface_does() -> None:
     assert (wrong & at_edge).sum() > 0.95 * wrong.sum()
 
 
-def test_bits_lie_where_the_contract_says() -> None:
-    """Points on a large sphere see exactly the directions above their horizon."""
+def test_the_layout_of_the_bits() -> None:
+    """From points just above a sphere exactly the directions above the horizon are visible."""
     gaussians = sphere(500)
     normals = fibonacci_sphere(7)
-    found = tracing.visibility(tracing.build(gaussians, GAMMA), 1.02 * normals, normals, DIRECTIONS)
+    found = tracing.visibility(tracing.build_tracer(gaussians, GAMMA), 1.02 * normals, normals, DIRECTIONS)
     above = normals @ DIRECTIONS.T > 0
     assert found.bits.shape == (7, 4)
     for i in range(7):
@@ -97,94 +106,94 @@ def test_bits_lie_where_the_contract_says() -> None:
     assert torch.equal(again.unpacked(), above[[3, 3, 0]])
 
 
-def test_an_open_sky_hides_nothing() -> None:
-    sky = tracing.unoccluded(fibonacci_sphere(70), 3)
-    assert sky.bits.shape == (3, 3)
-    assert sky.unpacked().shape == (3, 70)
-    assert sky.unpacked().all()
+def test_unoccluded_has_all_directions_visible() -> None:
+    unshadowed = tracing.unoccluded(fibonacci_sphere(70), 3)
+    assert unshadowed.bits.shape == (3, 3)
+    assert unshadowed.unpacked().shape == (3, 70)
+    assert unshadowed.unpacked().all()
 
 
-def test_the_blocker_stands_in_the_blocked_direction() -> None:
+def test_the_blocker_is_in_the_occluded_direction() -> None:
     gaussians = torus(2000)
     index = torch.arange(0, 2000, 50)
     points, normals = gaussians.means[index], gaussians.normals[index]
-    tracer = tracing.build(gaussians, GAMMA)
+    tracer = tracing.build_tracer(gaussians, GAMMA)
     found = tracing.visibility(tracer, points, normals, DIRECTIONS, blockers=True)
     assert found.blocker is not None
-    standing = found.blocker >= 0
-    assert torch.equal(standing, (normals @ DIRECTIONS.T > 0) & ~found.unpacked())
-    assert standing.any()
-    i, j = torch.where(standing)
-    towards = gaussians.means[found.blocker[i, j].long()] - tracer.lifted(points, normals)[i]
+    occluded = found.blocker >= 0
+    assert torch.equal(occluded, (normals @ DIRECTIONS.T > 0) & ~found.unpacked())
+    assert occluded.any()
+    i, j = torch.where(occluded)
+    towards = gaussians.means[found.blocker[i, j].long()] - tracer.ray_origins(points, normals)[i]
     along = (towards * DIRECTIONS[j]).sum(-1)
     beside = (towards - along[:, None] * DIRECTIONS[j]).norm(dim=-1)
-    # The tracer cuts a Gaussian at three standard deviations.
+    # The tracer truncates a Gaussian at three standard deviations.
     assert (along > 0).all()
     assert (beside < 3 * gaussians.scales[0, 0]).all()
 
 
-def test_a_ray_brings_back_the_radiance_of_what_it_hits() -> None:
+def test_a_ray_returns_the_radiance_of_the_gaussian_that_it_hits() -> None:
     gaussians = sphere(500)
     radiance = (gaussians.means[:, :1] > 0).float() * torch.tensor([1.0, 2.0, 3.0])
     origins = torch.tensor([[3.0, 0, 0], [-3.0, 0, 0], [3.0, 3.0, 3.0]])
     directions = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])
-    hits = tracing.trace(tracing.build(gaussians, GAMMA), origins, directions, radiance)
-    # A blocked ray keeps no light, and its radiance is that of the opaque surface.
+    hits = tracing.trace(tracing.build_tracer(gaussians, GAMMA), origins, directions, radiance)
+    # An occluded ray has a transmittance of 0 and the radiance of the opaque surface.
     torch.testing.assert_close(hits.transmittance, torch.tensor([0.0, 0.0, 1.0]))
     torch.testing.assert_close(hits.radiance, torch.tensor([[1.0, 2, 3], [0, 0, 0], [0, 0, 0]]))
     assert hits.hit[2] == -1
 
 
-def test_rebuilding_is_due_when_the_middle_gaussian_has_moved() -> None:
+def test_displacement_is_the_median_shift() -> None:
     gaussians = sphere(100)
-    tracer = tracing.build(gaussians, GAMMA)
-    assert tracer.moved(gaussians) == 0
+    tracer = tracing.build_tracer(gaussians, GAMMA)
+    assert tracer.displacement(gaussians) == 0
     shift = 0.5 * gaussians.scales[0, 0]
     parts = vars(gaussians)
     moved = Gaussians(**{**parts, "means": gaussians.means + torch.tensor([shift, 0, 0])})
-    assert math.isclose(tracer.moved(moved), 0.5, rel_tol=1e-5)
-    assert tracer.moved(Gaussians(*(x[:99] for x in parts.values()))) == math.inf
-    # In place, as an optimizer does: the tracer remembers where they were.
+    assert math.isclose(tracer.displacement(moved), 0.5, rel_tol=1e-5)
+    assert tracer.displacement(Gaussians(*(x[:99] for x in parts.values()))) == math.inf
+    # The tracer has a copy, so that changes in place, as by an optimizer, are measured.
     gaussians.means.add_(torch.tensor([shift, 0, 0]))
-    assert math.isclose(tracer.moved(gaussians), 0.5, rel_tol=1e-5)
+    assert math.isclose(tracer.displacement(gaussians), 0.5, rel_tol=1e-5)
 
 
-@pytest.mark.parametrize("buried", [0.03, 0.1])
-def test_surface_points_lie_on_the_surface_that_is_seen(buried: float) -> None:
-    """A second shell under the sphere dominates no pixel; its points come up to the seen surface."""
-    outer, inner = sphere(1000), sphere(300, radius=1 - buried)
+@pytest.mark.parametrize("depth", [0.03, 0.1])
+def test_surface_points_are_on_the_rendered_surface(depth: float) -> None:
+    """A second shell below the sphere dominates no pixel; its points are moved up to the rendered surface."""
+    outer, inner = sphere(1000), sphere(300, radius=1 - depth)
     gaussians = Gaussians(*(torch.cat(pair) for pair in zip(vars(outer).values(), vars(inner).values(), strict=True)))
     points = tracing.surface_points(gaussians, GAMMA, map(look_at, EYES), CAMERA)
-    # The mean depth stands 0.01 above the sphere where discs overlap, a tangent plane another 0.01 beside its point.
+    # Overlapping discs put the mean depth 0.01 above the sphere, a tangent plane another 0.01.
     assert (points.norm(dim=-1) - 1).abs().max() < 0.025
-    # The point is the Gaussian's own, no further along the surface than its width.
+    # A point is no further along the surface from its Gaussian than the Gaussian's width.
     assert (points - gaussians.normals).norm(dim=-1).quantile(0.99) < 3 * outer.scales[0, 0]
-    tracer = tracing.build(gaussians, GAMMA)
+    tracer = tracing.build_tracer(gaussians, GAMMA)
     fraction = tracing.visibility(tracer, points, gaussians.normals, DIRECTIONS).fraction(gaussians.normals)
     assert fraction.mean() > 0.985
 
 
-def test_transfer_is_the_irradiance_of_what_is_seen() -> None:
-    """Under a light of degree 2, with all of the sky and with the half that is brighter."""
+def test_transfer_gives_the_irradiance_of_the_visible_light() -> None:
+    """Under a light of degree 2, without occlusion and with some directions occluded."""
     normals, directions = fibonacci_sphere(9), fibonacci_sphere(4096)
     coefficients = torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
     light = spherical_harmonics.basis(directions, 2) @ coefficients
     cosine = (normals @ directions.T).clamp(min=0)
-    bright = directions[:, 0] > 0.2
-    closed = torch.tensor(
-        [sum((1 << j) - (1 << 32) * (j == 31) for j in range(32) if word[j]) for word in bright.unflatten(0, (-1, 32))]
+    visible = directions[:, 0] > 0.2
+    bits = torch.tensor(
+        [sum((1 << j) - (1 << 32) * (j == 31) for j in range(32) if word[j]) for word in visible.unflatten(0, (-1, 32))]
     )
-    half = tracing.Visibility(directions, closed.int().expand(9, -1), None)
-    for sky, seen in ((tracing.unoccluded(directions, 9), torch.ones(4096)), (half, bright.float())):
-        truth = 4 * math.pi / 4096 * (cosine * seen) @ light
-        torch.testing.assert_close(tracing.transfer([sky], normals) @ coefficients, truth, atol=1e-3, rtol=0)
-    opened = tracing.transfer([tracing.unoccluded(directions, 9)], normals) @ coefficients
+    half = tracing.Visibility(directions, bits.int().expand(9, -1), None)
+    for traced, fraction in ((tracing.unoccluded(directions, 9), torch.ones(4096)), (half, visible.float())):
+        truth = 4 * math.pi / 4096 * (cosine * fraction) @ light
+        torch.testing.assert_close(tracing.transfer([traced], normals) @ coefficients, truth, atol=1e-3, rtol=0)
+    unshadowed = tracing.transfer([tracing.unoccluded(directions, 9)], normals) @ coefficients
     series = spherical_harmonics.series(irradiance_coefficients(coefficients), normals)
-    torch.testing.assert_close(opened, series, atol=0.01, rtol=0)
+    torch.testing.assert_close(unshadowed, series, atol=0.01, rtol=0)
 
 
-def test_no_gaussians_block_nothing() -> None:
-    nobody = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
+def test_no_gaussians_occlude_nothing() -> None:
+    empty = Gaussians(*(x[:0] for x in vars(sphere(1)).values()))
     normals = fibonacci_sphere(5)
-    found = tracing.visibility(tracing.build(nobody, GAMMA), normals, normals, DIRECTIONS)
+    found = tracing.visibility(tracing.build_tracer(empty, GAMMA), normals, normals, DIRECTIONS)
     assert torch.equal(found.unpacked(), normals @ DIRECTIONS.T > 0)

@@ -1,4 +1,4 @@
-"""The report is complete in itself, tells what was measured, and its live view works in a browser without a network."""
+"""The report is self-contained, its health card reports known defects, and its live view works in a browser offline."""
 
 import base64
 import dataclasses
@@ -44,17 +44,17 @@ RECORDS = [
 ]
 RECIPE = {"refine": {"steps": 200, "weights": {"mask": 0.125}}, "decompose": {"bounce": "none"}, "seed": 7}
 FOCAL = float(Camera.from_fov(math.radians(30), SIDE, SIDE).fx_fy_cx_cy[0])
-STORY = report.Story("a <mug> & more", RECORDS, RECIPE, FOCAL)
+SUMMARY = report.RunSummary("a <mug> & more", RECORDS, RECIPE, FOCAL)
 
 
 @pytest.fixture(scope="module")
 def asset() -> Asset:
-    """A painted ball seen from all around, under a sky brighter to one side."""
-    ball = painted(sphere(1500, radius=RADIUS))
+    """A painted sphere visible from all around, under light that is brighter on one side."""
+    shape = painted(sphere(1500, radius=RADIUS))
     T = trajectories.handheld(N, trajectories.distance_for(math.radians(30)), seed=1)
     radiance = 0.4 + torch.linspace(0, 2, 16)[None, :, None].expand(8, 16, 3)
     return dataclasses.replace(
-        ball,
+        shape,
         environment=Environment.from_radiance(radiance),
         trajectory=Trajectory(SE3(T.wxyz.float(), T.xyz.float()), "camera"),
         camera=Camera.from_fov(math.radians(30), SIDE, SIDE),
@@ -63,8 +63,8 @@ def asset() -> Asset:
 
 @pytest.fixture(scope="module")
 def capture(asset: Asset) -> Capture:
-    """Photographs that are the asset's own renders."""
-    scene = training_views.scene(asset)
+    """A capture whose photos are the asset's own renders."""
+    scene = training_views.prepare(asset)
     images, masks = [], []
     for number in range(N):
         linear, view = training_views.render(scene, number, asset.camera)
@@ -78,7 +78,7 @@ def capture(asset: Asset) -> Capture:
 def page(asset: Asset, capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     export.write_textured_mesh(asset, export.extract_mesh(asset, SMALL), SMALL, 1.0, folder / "asset.glb")
-    report.build(asset, capture, folder / "asset.glb", STORY, None, folder / "report.html")
+    report.build(asset, capture, folder / "asset.glb", SUMMARY, None, folder / "report.html")
     return folder / "report.html"
 
 
@@ -89,13 +89,13 @@ def embedded(page: Path, name: str) -> bytes:
 
 
 def text(page: Path) -> str:
-    """What a reader sees, without marks."""
+    """Visible text of the page, without markup."""
     body = re.sub(r"<(script|style|title)\b.*?</\1>", "", page.read_text("utf-8"), flags=re.S)
     return html.unescape(re.sub(r"<[^>]+>", " ", body))
 
 
 def test_the_page_loads_nothing(page: Path) -> None:
-    """Every address is embedded or in the page; what remains of the web is the name of an XML namespace."""
+    """Every address is a data URL or an anchor; the only web address is the name of an XML namespace."""
     source = page.read_text("utf-8")
     markup = re.sub(r"<script\b.*?</script>", "", source, flags=re.S)
     addresses = re.findall(r'(?:src|href)="([^"]*)"', markup)
@@ -107,13 +107,13 @@ def test_the_page_loads_nothing(page: Path) -> None:
     assert "{{" not in markup
 
 
-def test_a_guessed_focal_length_is_called_one(page: Path, asset: Asset, capture: Capture) -> None:
+def test_an_assumed_focal_length_is_marked_as_such(page: Path, asset: Asset, capture: Capture) -> None:
     """Half the width over the tangent of half the field of view."""
     focal = f"{0.5 * SIDE / math.tan(math.radians(15)):.0f} pixels"
-    assert f"{focal}, a guess" in text(page)
-    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(STORY, guess=None))
-    better = report._facts(asset, capture, dataclasses.replace(STORY, guess=60.0))
-    assert f"{focal} (estimated; the guess was 60)<" in better
+    assert f"{focal}, assumed" in text(page)
+    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(SUMMARY, assumed_focal=None))
+    better = report._facts(asset, capture, dataclasses.replace(SUMMARY, assumed_focal=60.0))
+    assert f"{focal} (estimated; 60 was assumed at the start)<" in better
 
 
 def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:
@@ -127,7 +127,7 @@ def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:
         data = embedded(page, name)
         assert data.startswith(b"#?RADIANCE")
         read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
-        # A shared exponent leaves the largest channel eight bits.
+        # With a shared exponent the largest channel has eight bits.
         true = light.radiance.numpy()
         assert (np.abs(read - true) <= true.max(-1, keepdims=True) / 128).all()
     for data in re.findall(r'src="data:image/webp;base64,([^"]*)"', page.read_text("utf-8")):
@@ -148,17 +148,17 @@ def test_without_xatlas_there_is_a_page_without_a_mesh(
     asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    with pytest.warns(UserWarning, match="xatlas.*the report shows no mesh"):
-        assert report.model(asset, tmp_path) is None
+    with pytest.warns(UserWarning, match="xatlas.*the report has no live view"):
+        assert report.write_model(asset, tmp_path) is None
 
 
-def test_a_name_is_text_and_not_markup(page: Path) -> None:
+def test_a_name_is_escaped(page: Path) -> None:
     assert "a <mug> & more" in text(page)
     assert "<mug>" not in page.read_text("utf-8")
 
 
-def test_the_start_of_the_live_view_is_the_pose_of_a_frame(page: Path, asset: Asset) -> None:
-    """The quaternion, by its textbook matrix, is the rotation from object to OpenGL camera axes of some frame."""
+def test_the_live_view_starts_at_the_pose_of_a_frame(page: Path, asset: Asset) -> None:
+    """The quaternion, as a matrix, is the rotation from object to OpenGL camera axes of some frame."""
     found = re.search(r'id="about">(.*?)</script>', page.read_text("utf-8"))
     assert found is not None
     about = json.loads(found[1])
@@ -175,78 +175,78 @@ def test_the_start_of_the_live_view_is_the_pose_of_a_frame(page: Path, asset: As
     assert (asset.trajectory.R_env_obj - R).flatten(1).norm(dim=1).min() < 1e-5
 
 
-def test_renders_of_photographs_that_are_renders_are_the_same(asset: Asset, capture: Capture) -> None:
-    frames = list(training_views.frames(training_views.scene(asset), capture))
+def test_renders_equal_photos_that_are_renders(asset: Asset, capture: Capture) -> None:
+    frames = list(training_views.frames(training_views.prepare(asset), capture))
     assert [frame.name for frame in frames] == list(capture.names)
-    # Code values are rounded: an error of at most half of 1 / 255, with a uniform spread 10.8 dB above 1 / 255.
+    # Rounding to code values: a uniform error of at most half of 1 / 255, 10.8 dB below an error of 1 / 255.
     assert min(frame.psnr for frame in frames) > 55
     assert all(frame.iou == 1 for frame in frames)
-    assert max(abs(frame.stops) for frame in frames) < 0.02
+    assert max(abs(frame.exposure_stops) for frame in frames) < 0.02
     rows = health_card.card(frames, None, confidence.confidence_of(asset, asset.camera))
-    assert [row.verdict for row in rows[:5]] == ["good", "good", "good", "none", "none"]
+    assert [row.rating for row in rows[:5]] == ["good", "good", "good", "none", "none"]
 
 
-def test_the_card_names_drift_lost_frames_and_outliers(asset: Asset, capture: Capture) -> None:
+def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: Capture) -> None:
     images = capture.images.clone()
     half = srgb_from_linear(0.5 * linear_from_srgb(images[: N // 2].float() / 255))
     images[: N // 2] = (255 * half).round().to(torch.uint8)
     masks = capture.masks.clone()
     masks[N - 1] = masks[N - 1].roll(SIDE // 4, 0)
-    spoilt = dataclasses.replace(capture, images=images, masks=masks)
+    damaged = dataclasses.replace(capture, images=images, masks=masks)
     lost = torch.zeros(N, dtype=torch.bool)
     lost[3] = True
     ones = torch.ones(N)
-    sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
-    health = PoseQuality(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), sight)
-    frames = list(training_views.frames(training_views.scene(asset), spoilt))
-    fit, outline, exposure, away, match, _ = health_card.card(
-        frames, health, confidence.confidence_of(asset, asset.camera)
+    observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
+    quality = PoseQuality(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), observability)
+    frames = list(training_views.frames(training_views.prepare(asset), damaged))
+    photo, silhouette, exposure, lost_frames, match, _ = health_card.card(
+        frames, quality, confidence.confidence_of(asset, asset.camera)
     )
-    assert fit.marks[0] == "bad" or fit.verdict != "good"
-    # One frame's mask is shifted by a quarter of the picture.
-    assert outline.verdict == "good"
-    assert "0009.png" in outline.sentence
-    assert outline.marks[-1] == "bad"
+    assert photo.marks[0] == "bad" or photo.rating != "good"
+    # One frame's mask is shifted by a quarter of the image.
+    assert silhouette.rating == "good"
+    assert "0009.png" in silhouette.sentence
+    assert silhouette.marks[-1] == "bad"
     # Half of the frames are one stop darker.
-    assert exposure.verdict == "bad"
+    assert exposure.rating == "bad"
     assert float(exposure.value.split()[0]) == pytest.approx(1.0, abs=0.05)
-    assert (away.value, away.verdict) == ("1 of 10", "warn")
-    assert (match.value, match.verdict) == ("4.00 px", "bad")
-    assert health_card.overall([fit, outline, exposure, away, match])[0] == "bad"
+    assert (lost_frames.value, lost_frames.rating) == ("1 of 10", "warn")
+    assert (match.value, match.rating) == ("4.00 px", "bad")
+    assert health_card.overall([photo, silhouette, exposure, lost_frames, match])[0] == "bad"
 
 
-def test_matches_that_agree_do_not_hide_a_drift() -> None:
+def test_a_small_residual_does_not_hide_a_drift() -> None:
     ones = torch.ones(N)
-    sight = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
-    health = PoseQuality(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), sight)
-    row = health_card._match(health)
-    assert row.verdict == "bad"
+    observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
+    quality = PoseQuality(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), observability)
+    row = health_card._match_row(quality)
+    assert row.rating == "bad"
     assert "28.6 degrees" in row.sentence
 
 
-def test_light_that_turns_with_the_object_comes_from_few_sides(asset: Asset) -> None:
-    """At most one cell per lamp; under light that stands still, more."""
-    still = confidence.confidence_of(asset, asset.camera)
-    turned = dataclasses.replace(asset, trajectory=dataclasses.replace(asset.trajectory, light="object"))
-    static = confidence.confidence_of(turned, asset.camera)
-    assert static.lights.max() <= confidence.LAMPS < health_card.FEW_LIGHTS
-    seen = still.views > 0
-    assert torch.equal(seen, static.views > 0)
-    assert still.lights[seen].mean() > 2 * static.lights[seen].mean()
-    assert (still.views >= 0).all()
-    assert (still.views <= 1).all()
+def test_light_that_is_fixed_to_the_object_comes_from_few_directions(asset: Asset) -> None:
+    """At most one cell per bright light; light that is fixed to the camera reaches more."""
+    handheld = confidence.confidence_of(asset, asset.camera)
+    static_asset = dataclasses.replace(asset, trajectory=dataclasses.replace(asset.trajectory, light="object"))
+    static = confidence.confidence_of(static_asset, asset.camera)
+    assert static.lights.max() <= confidence.N_LIGHTS < health_card.MIN_LIGHT_DIRECTIONS
+    visible = handheld.views > 0
+    assert torch.equal(visible, static.views > 0)
+    assert handheld.lights[visible].mean() > 2 * static.lights[visible].mean()
+    assert (handheld.views >= 0).all()
+    assert (handheld.views <= 1).all()
 
 
-def test_lamps_are_found_where_they_are() -> None:
+def test_the_brightest_directions_are_those_of_the_lights() -> None:
     radiance = torch.full((32, 64, 3), 0.1)
     radiance[14:18, 46:50] = 50.0  # right quarter: +x
-    found = confidence.lamps(Environment.from_radiance(radiance))
-    assert found[0][0] > math.cos(math.radians(10))
-    apart = (found @ found.T).clamp(-1, 1).acos() + 9 * torch.eye(len(found))
-    assert apart.min() > confidence.APART - 1e-4
+    directions = confidence.brightest_directions(Environment.from_radiance(radiance))
+    assert directions[0][0] > math.cos(math.radians(10))
+    apart = (directions @ directions.T).clamp(-1, 1).acos() + 9 * torch.eye(len(directions))
+    assert apart.min() > confidence.MIN_LIGHT_ANGLE - 1e-4
 
 
-def test_a_window_is_a_square_around_the_object_inside_the_picture() -> None:
+def test_a_window_is_a_square_around_the_object_inside_the_image() -> None:
     mask = torch.zeros(50, 80, dtype=torch.bool)
     mask[2:12, 70:79] = True
     top, left, height, width = training_views.window(mask)
@@ -258,7 +258,7 @@ def test_a_window_is_a_square_around_the_object_inside_the_picture() -> None:
     assert training_views.window(torch.zeros(50, 80, dtype=torch.bool)) == (0, 0, 50, 80)
 
 
-def test_bars_skip_what_is_not_known() -> None:
+def test_bars_leave_gaps_for_nan() -> None:
     drawn = svg.bars([1.0, math.nan, 2.0], ["good", "none", "bad"])
     assert re.findall(r'class="b-(\w+)" x="([\d.]+)" y="([\d.]+)"', drawn) == [
         ("good", "0.1", "50.00"),
@@ -268,12 +268,12 @@ def test_bars_skip_what_is_not_known() -> None:
 
 
 def test_another_capture_is_refused(asset: Asset, capture: Capture) -> None:
-    with pytest.raises(BadFile, match=r"mug: is not the capture of this run \(say which it is: --capture\)"):
-        report.of_run(capture, asset, ["0000.png", "elsewhere.png"], Path("mug"))
+    with pytest.raises(BadFile, match=r"mug: is not the capture of this run \(give the right one with --capture\)"):
+        report.frames_of_run(capture, asset, ["0000.png", "elsewhere.png"], Path("mug"))
 
 
 def test_without_a_surface_the_live_view_is_left_out(asset: Asset, capture: Capture, tmp_path: Path) -> None:
-    report.build(asset, capture, None, STORY, None, tmp_path / "report.html")
+    report.build(asset, capture, None, SUMMARY, None, tmp_path / "report.html")
     source = (tmp_path / "report.html").read_text("utf-8")
     assert "<script" not in source
     assert "#relight" not in re.sub(r"<style>.*?</style>", "", source, flags=re.S)
@@ -286,7 +286,7 @@ LOOK = """(() => {
   copy.drawImage(document.getElementById("view"), 0, 0, 32, 32);
   return [...copy.getImageData(0, 0, 32, 32).data];
 })()"""
-"""What the live view shows, as 32 x 32 code values with coverage."""
+"""The image of the live view, as 32 x 32 RGBA code values."""
 DROP = """(() => {
   const files = new DataTransfer();
   const bytes = Uint8Array.from(atob(TEXT), (c) => c.charCodeAt(0));
@@ -306,17 +306,17 @@ def drop(tab: devtools.Page, name: str, text: str) -> None:
     tab.value(DROP.replace("TEXT", text).replace("NAME", json.dumps(name)))
 
 
-def complaints(tab: devtools.Page) -> list[str]:
-    """What the console holds. The software renderer warns of its own slowness, which is no fault of the page."""
-    said = [str(event) for event in tab.events if event["method"] in ("Runtime.consoleAPICalled", "Log.entryAdded")]
-    said += [str(event) for event in tab.events if event["method"] == "Runtime.exceptionThrown"]
-    return [words for words in said if "GL Driver Message" not in words]
+def console_messages(tab: devtools.Page) -> list[str]:
+    """Messages of the console, without the software renderer's warnings about its own speed."""
+    messages = [str(event) for event in tab.events if event["method"] in ("Runtime.consoleAPICalled", "Log.entryAdded")]
+    messages += [str(event) for event in tab.events if event["method"] == "Runtime.exceptionThrown"]
+    return [message for message in messages if "GL Driver Message" not in message]
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(devtools.browser() is None, reason=f"needs one of {devtools.BROWSERS}")
 @pytest.mark.parametrize("width", [500, 1400])
-def test_the_live_view_draws_and_takes_a_dropped_light(page: Path, tmp_path: Path, width: int) -> None:
+def test_the_live_view_draws_and_accepts_a_dropped_light(page: Path, tmp_path: Path, width: int) -> None:
     with devtools.opened(page.as_uri(), tmp_path, width, 900) as tab:
         tab.until("document.documentElement.dataset.panel")
         assert tab.value("document.documentElement.dataset.panel") == "drawn"
@@ -327,12 +327,14 @@ def test_the_live_view_draws_and_takes_a_dropped_light(page: Path, tmp_path: Pat
         dropped = look(tab)
         drop(tab, "mine.jpg", '"AAAA"')
         tab.until('document.getElementById("note").textContent.includes("mine.jpg")')
-        assert tab.value('document.getElementById("note").textContent').endswith("a light is a Radiance .hdr file here")
+        assert tab.value('document.getElementById("note").textContent').endswith(
+            "only Radiance .hdr files can be used here"
+        )
         assert tab.value("document.documentElement.dataset.light") == "mine.hdr"
         tab.value('document.getElementById("view").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }))')
         turned = look(tab)
-        assert complaints(tab) == []
-    # The ball covers the middle of the picture and not its corners.
+        assert console_messages(tab) == []
+    # The sphere covers the middle of the image but not its corners.
     assert recovered[16, 16, 3] == 255
     assert recovered[0, 0, 3] == 0
     solid = recovered[..., 3] == 255

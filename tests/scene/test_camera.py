@@ -1,4 +1,4 @@
-"""The camera's and the trajectory's conventions, on asymmetric cases worked out by hand."""
+"""Conventions of camera and trajectory, on asymmetric cases computed by hand."""
 
 import math
 
@@ -32,7 +32,7 @@ def test_unproject_inverts_project() -> None:
     torch.testing.assert_close(CAMERA.project(d * 5), torch.tensor([3.5, 2.5]))
 
 
-def test_resizing_and_cropping_move_pixels_as_the_picture_does() -> None:
+def test_resized_and_cropped_cameras_project_to_the_changed_image() -> None:
     x = torch.tensor([0.3, -0.2, 2.0])
     torch.testing.assert_close(CAMERA.resized(12, 18).project(x), 2 * CAMERA.project(x))
     torch.testing.assert_close(CAMERA.cropped(1, 2, 3, 4).project(x), CAMERA.project(x) - torch.tensor([2.0, 1.0]))
@@ -50,14 +50,14 @@ def test_transform_matrix_is_camera_to_object_in_opengl_axes() -> None:
     matrix = torch.eye(4)[None].clone()
     matrix[0, 2, 3] = 4.0
     trajectory = Trajectory.from_camera_to_object(matrix, "camera")
-    # The object's +y is up in the picture, that is -y in OpenCV axes; its +z comes towards the camera.
+    # The object's +y is up in the image, that is -y in OpenCV axes; its +z comes towards the camera.
     x_cam = trajectory.T_cam_obj @ torch.tensor([[0.1, 0.2, 0.3]])
     torch.testing.assert_close(x_cam, torch.tensor([[0.1, -0.2, 3.7]]))
     torch.testing.assert_close(trajectory.camera_positions, torch.tensor([[0.0, 0.0, 4.0]]))
     torch.testing.assert_close(trajectory.camera_to_object(), matrix)
 
 
-def test_transform_matrices_come_back_unchanged() -> None:
+def test_transform_matrices_are_preserved() -> None:
     torch.manual_seed(1)
     matrices = SE3.exp(torch.randn(7, 6)).matrix()
     for light in ("camera", "object"):
@@ -65,11 +65,11 @@ def test_transform_matrices_come_back_unchanged() -> None:
         torch.testing.assert_close(again, matrices, atol=2e-6, rtol=0)
 
 
-def test_the_light_stands_still_with_what_the_word_says() -> None:
+def test_the_light_is_static_in_the_named_frame() -> None:
     torch.manual_seed(2)
     T_cam_obj = SE3.exp(torch.randn(5, 6))
     assert torch.equal(Trajectory(T_cam_obj, "object").R_env_obj, torch.eye(3).expand(5, 3, 3))
-    # An object direction that points up in the picture (OpenCV -y) points to the top of the map (env +y).
+    # An object direction that points up in the image (OpenCV -y) points to the top of the map (env +y).
     up_obj = T_cam_obj.rotation.inverse() @ torch.tensor([0.0, -1.0, 0.0])
     up_env = (Trajectory(T_cam_obj, "camera").R_env_obj @ up_obj[..., None])[..., 0]
     torch.testing.assert_close(up_env, torch.tensor([0.0, 1.0, 0.0]).expand(5, 3), atol=1e-6, rtol=0)
@@ -85,11 +85,11 @@ def test_selected_frames_keep_their_order() -> None:
     assert len(trajectory) == 4
 
 
-def test_zooming_moves_pictures_away_from_the_principal_point() -> None:
-    """And changes nothing else: where a point is seen, from the principal point, times the factor."""
+def test_zooming_scales_positions_about_the_principal_point() -> None:
+    """The offset of a projected point from the principal point is multiplied by the factor."""
     camera = Camera(torch.tensor([100.0, 110.0, 30.0, 20.0]), 40, 60)
     x_cam = torch.tensor([0.1, -0.2, 2.0])
     centre = torch.tensor([30.0, 20.0])
-    seen = camera.zoomed(1.5).project(x_cam)
-    torch.testing.assert_close(seen - centre, 1.5 * (camera.project(x_cam) - centre))
+    zoomed = camera.zoomed(1.5).project(x_cam)
+    torch.testing.assert_close(zoomed - centre, 1.5 * (camera.project(x_cam) - centre))
     assert (camera.zoomed(1.5).height, camera.zoomed(1.5).width) == (40, 60)

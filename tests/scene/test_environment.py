@@ -1,4 +1,4 @@
-"""The light map through every convention, and what resampling must keep."""
+"""Conventions of the environment map, and invariants of resampling."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ def one_texel(row: int, column: int, h: int = 16, w: int = 32) -> Environment:
 @pytest.mark.parametrize(
     ("row", "column", "direction"),
     [
-        # Worked out by hand from u = atan2(x, -z) / 2pi + 1/2, v = acos(y) / pi, for the texel whose centre is there.
+        # Computed by hand from u = atan2(x, -z) / 2pi + 1/2, v = acos(y) / pi, for the texel whose centre is there.
         (7, 15, (-math.sin(math.pi / 32), math.sin(math.pi / 32), -1)),  # left of and above the centre, which is -z
         (7, 23, (1, math.sin(math.pi / 32), -math.sin(math.pi / 32))),  # the right quarter is +x, from the -z side
         (7, 8, (-1, math.sin(math.pi / 32), -math.sin(math.pi / 32))),  # the left quarter is -x
@@ -32,13 +32,13 @@ def one_texel(row: int, column: int, h: int = 16, w: int = 32) -> Environment:
         (15, 15, (-0.0096, -1, -0.0976)),  # the bottom row is -y
     ],
 )
-def test_one_bright_texel_shines_from_where_the_formula_says(
+def test_a_bright_texel_is_found_in_the_direction_of_the_formula(
     row: int, column: int, direction: tuple[float, float, float]
 ) -> None:
     d = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=-1)
-    found = one_texel(row, column).lookup(d)
+    radiance = one_texel(row, column).lookup(d)
     # The directions above are rounded, so the lookup may sit a few percent off the texel's centre.
-    torch.testing.assert_close(found, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), rtol=0.05, atol=0)
+    torch.testing.assert_close(radiance, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), rtol=0.05, atol=0)
 
 
 def test_texel_centres_look_up_their_own_texel() -> None:
@@ -48,7 +48,7 @@ def test_texel_centres_look_up_their_own_texel() -> None:
     torch.testing.assert_close(environment.lookup(d), environment.radiance)
 
 
-def test_the_light_is_continuous_over_the_seam_and_the_poles() -> None:
+def test_the_light_is_continuous_across_the_seam_and_the_poles() -> None:
     torch.manual_seed(1)
     environment = Environment.from_radiance(torch.rand(8, 16, 3, dtype=torch.float64))
     tiny = 1e-7
@@ -66,7 +66,7 @@ def test_upsampling_keeps_the_integral_and_the_seam() -> None:
     finer = environment.upsampled()
     assert finer.log_radiance.shape == (16, 32, 3)
     torch.testing.assert_close(finer.integral(), environment.integral())
-    # Rolling before or after upsampling is the same: the seam is a place like any other.
+    # Rolling before or after upsampling is the same: the seam has no effect.
     rolled = Environment(environment.log_radiance.roll(5, 1)).upsampled()
     torch.testing.assert_close(rolled.log_radiance, finer.log_radiance.roll(10, 1))
 
@@ -103,7 +103,7 @@ def test_lookup_has_a_gradient_to_texels_and_direction() -> None:
 
 
 @pytest.mark.parametrize("name", ["light.exr", "light.hdr"])
-def test_a_light_comes_back_from_disk(tmp_path: Path, name: str) -> None:
+def test_environments_are_written_and_read(tmp_path: Path, name: str) -> None:
     radiance = torch.rand(4, 8, 3) + 0.5
     Environment.from_radiance(radiance).write(tmp_path / name)
     # Radiance HDR keeps eight bits of the brightest channel, here up to three times another.
@@ -120,7 +120,7 @@ def test_a_light_comes_back_from_disk(tmp_path: Path, name: str) -> None:
         (np.full((4, 8, 3), np.nan, np.float32), "NaN"),
     ],
 )
-def test_a_broken_light_is_refused_by_its_rule(tmp_path: Path, pixels: np.ndarray, rule: str) -> None:
+def test_invalid_maps_are_rejected_with_the_rule(tmp_path: Path, pixels: np.ndarray, rule: str) -> None:
     files.write_exr(tmp_path / "light.exr", pixels)
     with pytest.raises(BadFile, match=rf"light\.exr: .*{rule}"):
         Environment.read(tmp_path / "light.exr")

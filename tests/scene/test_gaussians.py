@@ -8,15 +8,15 @@ from tumble.scene.gaussians import Gaussians, opacity, sdf_from_opacity
 from tumble.scene.material import Material
 
 
-def test_opacity_is_the_papers_formula_where_that_does_not_overflow() -> None:
+def test_opacity_matches_the_formula_of_the_paper_where_it_does_not_overflow() -> None:
     sdf = torch.linspace(-0.5, 0.5, 11, dtype=torch.float64)
     gamma = torch.tensor(9.0, dtype=torch.float64)
-    printed = 4 * torch.exp(-gamma * sdf) / (1 + torch.exp(-gamma * sdf)) ** 2
-    torch.testing.assert_close(opacity(sdf, gamma), printed)
+    formula = 4 * torch.exp(-gamma * sdf) / (1 + torch.exp(-gamma * sdf)) ** 2
+    torch.testing.assert_close(opacity(sdf, gamma), formula)
     assert opacity(sdf, gamma).argmax() == 5
 
 
-def test_opacity_and_its_gradient_survive_far_from_the_surface() -> None:
+def test_opacity_and_its_gradient_are_finite_far_from_the_surface() -> None:
     sdf = torch.tensor([-300.0, 300.0], requires_grad=True)
     value = opacity(sdf, torch.tensor(100.0))
     value.sum().backward()
@@ -24,7 +24,7 @@ def test_opacity_and_its_gradient_survive_far_from_the_surface() -> None:
     assert torch.isfinite(sdf.grad).all()
 
 
-def test_the_inverse_meets_values_worked_out_by_hand() -> None:
+def test_sdf_from_opacity_matches_values_computed_by_hand() -> None:
     # gamma |s| for these opacities, from 2 arccosh(o^-1/2).
     opacities = torch.tensor([0.99, 0.8, 0.5, 0.1, 0.01], dtype=torch.float64)
     expected = torch.tensor([0.2007, 0.9624, 1.7627, 3.6369, 5.9864], dtype=torch.float64)
@@ -53,7 +53,7 @@ def test_normals_and_their_gradients_are_those_of_the_rotation() -> None:
     assert torch.autograd.gradcheck(normals, quats)
 
 
-def test_a_constant_material_has_the_values_asked_for() -> None:
+def test_a_constant_material_has_the_given_values() -> None:
     material = Material.constant(2, torch.tensor([0.1, 0.5, 0.8]), 0.3)
     torch.testing.assert_close(material.albedo, torch.tensor([0.1, 0.5, 0.8]).expand(2, 4, 3))
     torch.testing.assert_close(material.roughness, torch.full((2, 4), 0.3))

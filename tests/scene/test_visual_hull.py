@@ -1,4 +1,4 @@
-"""The visual hull of an ellipsoid that is seen from all around is that ellipsoid, nearly."""
+"""The visual hull of an ellipsoid recorded from all sides approximates that ellipsoid."""
 
 import math
 
@@ -18,7 +18,7 @@ DISTANCE = trajectories.distance_for(math.radians(30))
 
 
 def silhouettes(n: int = 40, size: int = 64) -> tuple[Capture, Trajectory]:
-    """Masks of a lopsided ellipsoid, by the discriminant of each pixel's ray."""
+    """Masks of an off-centre ellipsoid, by the discriminant of each pixel's ray."""
     camera = Camera.from_fov(math.radians(30), size, size)
     T = trajectories.handheld(n, DISTANCE, seed=1)
     T_cam_obj = SE3(T.wxyz.float(), T.xyz.float())
@@ -50,7 +50,7 @@ def test_the_hull_is_the_ellipsoid(carved: torch.Tensor) -> None:
 
 
 def test_points_lie_on_the_surface_with_outward_normals(carved: torch.Tensor) -> None:
-    points = visual_hull.surface(carved, 1500, torch.Generator().manual_seed(0))
+    points = visual_hull.sample_surface(carved, 1500, torch.Generator().manual_seed(0))
     level = (points.positions - CENTER) / AXES
     assert level.norm(dim=-1).median() == pytest.approx(1.0, abs=0.05)
     true = torch.nn.functional.normalize(level / AXES, dim=-1)
@@ -69,23 +69,24 @@ def test_unknown_pixels_carve_nothing() -> None:
     )
     carved = visual_hull.carve(unknown, trajectory, resolution=8)
     ticks = (torch.arange(8) + 0.5) / 8 * 2 - 1
-    ball = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).norm(dim=-1) <= 1
-    torch.testing.assert_close(carved, ball.float())
+    sphere = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).norm(dim=-1) <= 1
+    torch.testing.assert_close(carved, sphere.float())
 
 
-def test_contradicting_silhouettes_are_named() -> None:
+def test_an_empty_hull_is_an_error() -> None:
     capture, trajectory = silhouettes(6)
     nothing = torch.full_like(capture.masks, BACKGROUND)
     empty = Capture(capture.images, nothing, capture.camera, capture.names, "camera", trajectory)
-    with pytest.raises(ValueError, match="leave nothing standing"):
-        visual_hull.surface(visual_hull.carve(empty, trajectory, resolution=16), 100, torch.Generator().manual_seed(0))
+    cells = visual_hull.carve(empty, trajectory, resolution=16)
+    with pytest.raises(ValueError, match="is empty"):
+        visual_hull.sample_surface(cells, 100, torch.Generator().manual_seed(0))
 
 
-def test_a_speck_of_one_cell_does_no_harm() -> None:
-    """It gets emptier on all sides alike, so its middle has no normal."""
+def test_an_isolated_cell_does_not_produce_points_without_normals() -> None:
+    """The gradient is zero in the middle of an isolated cell, so that it has no normal there."""
     inside = torch.zeros(40, 40, 40)
     inside[5:13, 5:13, 5:13] = 1.0
     inside[30, 30, 30] = 1.0
-    points = visual_hull.surface(inside, 100, torch.Generator().manual_seed(0))
+    points = visual_hull.sample_surface(inside, 100, torch.Generator().manual_seed(0))
     assert len(points.positions) == 100
     torch.testing.assert_close(points.normals.norm(dim=-1), torch.ones(100))

@@ -1,4 +1,4 @@
-"""Truth from Mitsuba: every convention on an asymmetric case whose answer is known without rendering."""
+"""Ground truth from Mitsuba: each convention is tested on an asymmetric case with an independently known result."""
 
 import json
 import math
@@ -23,7 +23,7 @@ from tumble.scene.trajectory import Trajectory  # noqa: E402
 from tumble.synthetic import pathtracer, synthesize, trajectories  # noqa: E402
 from tumble.synthetic.options import SynthOptions  # noqa: E402
 
-# Dr.Jit speaks of its own deprecations when it is imported; they are not ours to mend.
+# Dr.Jit emits deprecation warnings about its own code when it is imported.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 CAMERA = Camera.from_fov(math.radians(30), 48, 48)
@@ -31,19 +31,19 @@ DISTANCE = trajectories.distance_for(math.radians(30))
 
 
 def export(path: Path, mesh: "trimesh.Trimesh", texture: np.ndarray, roughness: float, uv: np.ndarray) -> Path:
-    """A GLB with one texture; `uv` counts from the texture's top left corner, as glTF does."""
+    """A GLB with one texture; the origin of `uv` is the texture's top left corner, as in glTF."""
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=Image.fromarray(texture), roughnessFactor=roughness, metallicFactor=0.0
     )
-    upward = np.stack([uv[:, 0], 1 - uv[:, 1]], 1)  # trimesh counts v from the bottom
-    mesh.visual = trimesh.visual.TextureVisuals(uv=upward, material=material)
+    v_up = np.stack([uv[:, 0], 1 - uv[:, 1]], 1)  # trimesh's v axis points up
+    mesh.visual = trimesh.visual.TextureVisuals(uv=v_up, material=material)
     path.write_bytes(trimesh.Scene(mesh).export(file_type="glb"))
     return path
 
 
 @pytest.fixture(scope="module")
 def pebble(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A smooth, convex, lopsided pebble whose colour tells the side: redder towards +x, greener towards +y."""
+    """A convex ellipsoid whose colour varies with position: redder towards +x, greener towards +y."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     normals = mesh.vertices / [1.0, 0.7, 0.5]
     mesh = trimesh.Trimesh(mesh.vertices * [1.0, 0.7, 0.5], mesh.faces, vertex_normals=normals, process=False)
@@ -84,7 +84,7 @@ def env_from_obj(T_cam_obj: SE3) -> torch.Tensor:
 
 
 def test_a_handheld_frame_is_a_dome_frame_under_the_counter_rotated_light(pebble: Path) -> None:
-    shapes = pathtracer.shape(pathtracer.read_model(pebble), "original", None)
+    shapes = pathtracer.mitsuba_shapes(pathtracer.read_model(pebble), "original", None)
     T_cam_obj = a_pose(0.7, -1.1, 0.4)
     R_env_obj = env_from_obj(T_cam_obj)
     counter_rotated = room(64).rotated(R_env_obj.T)
@@ -97,7 +97,7 @@ def test_a_handheld_frame_is_a_dome_frame_under_the_counter_rotated_light(pebble
         render(counter_rotated, torch.eye(3)),
         render(room(64), torch.eye(3)),
     )
-    # The same noise in both pictures; resampling a 64-row map costs some thousandths.
+    # Both images have the same noise; resampling a map of 64 rows adds an error of some thousandths.
     scale = handheld.mean()
     assert np.abs(handheld - dome).mean() < 0.02 * scale
     assert np.abs(handheld - wrong).mean() > 0.2 * scale
@@ -115,7 +115,7 @@ def test_depth_reprojects_from_one_view_to_another(pebble: Path) -> None:
     normal_obj = torch.from_numpy(a.normal)[solid]
     to_b = torch.nn.functional.normalize(T_b_obj.inverse().xyz - x_obj, dim=-1)
     uv = CAMERA.project(x_b)
-    # Seen well from both sides, and away from b's silhouette; the nearest pixel of b is up to 0.7 pixel off.
+    # Points that both cameras see, away from b's silhouette; the nearest pixel centre of b is up to 0.7 pixel away.
     column, row = uv[:, 0].long(), uv[:, 1].long()
     known = torch.from_numpy(b.coverage > 0.999)[row, column] & ((normal_obj * to_b).sum(-1) > 0.6)
     assert known.sum() > 150
@@ -123,7 +123,7 @@ def test_depth_reprojects_from_one_view_to_another(pebble: Path) -> None:
     pixel = DISTANCE / float(CAMERA.fx_fy_cx_cy[0])
     assert error[known].abs().max() < pixel
     assert error[known].mean().abs() < 0.1 * pixel
-    # The same points carry the same colour and normal. A texture step of one pixel is 0.03 in albedo.
+    # The same points have the same colour and normal. The albedo changes by 0.03 per texel.
     albedo_error = torch.from_numpy(b.albedo)[row, column] - torch.from_numpy(a.albedo)[solid]
     assert albedo_error[known].abs().max() < 0.06
     cosine = (torch.from_numpy(b.normal)[row, column] * normal_obj).sum(-1)
@@ -131,7 +131,7 @@ def test_depth_reprojects_from_one_view_to_another(pebble: Path) -> None:
 
 
 @pytest.mark.parametrize(("row", "column"), [(8, 20), (5, 38), (14, 58)])
-def test_one_bright_texel_puts_its_highlight_where_the_formula_says(sphere: Path, row: int, column: int) -> None:
+def test_the_highlight_of_a_bright_texel_is_at_the_computed_pixel(sphere: Path, row: int, column: int) -> None:
     h, w = 32, 64
     radiance = torch.full((h, w, 3), 1e-6)
     radiance[row, column] = 1000.0
@@ -144,20 +144,22 @@ def test_one_bright_texel_puts_its_highlight_where_the_formula_says(sphere: Path
     T_cam_obj = a_pose(0.2, 2.0, -0.8)
     R_env_obj = env_from_obj(T_cam_obj)
     model = pathtracer.read_model(sphere)
-    scene = pathtracer.lit_scene(pathtracer.shape(model, "original", None), Environment.from_radiance(radiance), 2)
+    scene = pathtracer.lit_scene(
+        pathtracer.mitsuba_shapes(model, "original", None), Environment.from_radiance(radiance), 2
+    )
     pixels, _ = pathtracer.radiance(scene, T_cam_obj, CAMERA, R_env_obj, samples=256, seed=0)
-    # The highlight lies where the normal halves the angle between eye and light.
+    # At the highlight the normal bisects the directions to camera and light.
     centers, brightness = CAMERA.pixel_centers(), torch.from_numpy(pixels.sum(-1))
-    sharp = (brightness - 0.5 * brightness.max()).clamp_min(0)
-    found_uv = (centers * sharp[..., None]).sum((0, 1)) / sharp.sum()
+    weight = (brightness - 0.5 * brightness.max()).clamp_min(0)
+    rendered_uv = (centers * weight[..., None]).sum((0, 1)) / weight.sum()
     light_obj = R_env_obj.T @ light_env
     x_obj = torch.zeros(3)
-    for _ in range(50):  # the eye's direction depends on the point
-        eye_obj = torch.nn.functional.normalize(T_cam_obj.inverse().xyz - x_obj, dim=-1)
-        x_obj = torch.nn.functional.normalize(eye_obj + light_obj, dim=-1)
+    for _ in range(50):  # fixed point, since the direction to the camera depends on the point
+        view_obj = torch.nn.functional.normalize(T_cam_obj.inverse().xyz - x_obj, dim=-1)
+        x_obj = torch.nn.functional.normalize(view_obj + light_obj, dim=-1)
     expected_uv = CAMERA.project(T_cam_obj @ x_obj)
     # A texel is 5.6 degrees wide; half of that on a sphere of radius 21 pixels is one pixel.
-    assert (found_uv - expected_uv).norm() < 1.0
+    assert (rendered_uv - expected_uv).norm() < 1.0
 
 
 def test_normals_and_albedo_are_in_the_object_frame(sphere: Path, pebble: Path) -> None:
@@ -165,7 +167,7 @@ def test_normals_and_albedo_are_in_the_object_frame(sphere: Path, pebble: Path) 
     view = pathtracer.maps(pathtracer.unlit_scenes(pathtracer.read_model(sphere), None), T_cam_obj, CAMERA, samples=16)
     x_obj = T_cam_obj.inverse() @ CAMERA.unproject(CAMERA.pixel_centers(), torch.from_numpy(view.depth[..., 0]))
     solid = view.coverage == 1
-    # On the unit sphere the normal is the point itself; a pixel at the rim spans several degrees.
+    # On the unit sphere the normal equals the position; a pixel at the contour spans several degrees.
     outward = torch.nn.functional.normalize(x_obj, dim=-1).numpy()
     cosine = (outward * view.normal).sum(-1)[solid]
     assert cosine.min() > math.cos(math.radians(6))
@@ -181,7 +183,7 @@ def test_normals_and_albedo_are_in_the_object_frame(sphere: Path, pebble: Path) 
 
 
 def test_a_texture_is_neither_mirrored_nor_upside_down(tmp_path: Path) -> None:
-    """A square that faces +z: seen from there, its texture's top left corner is top left in the picture."""
+    """A square that faces +z: seen from +z, the texture's top left corner is at the top left of the image."""
     corners = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     mesh = trimesh.Trimesh(corners, [[0, 2, 1], [0, 3, 2]], process=False)
     texture = np.zeros((2, 2, 3), np.uint8)
@@ -223,7 +225,7 @@ def steps(T_cam_obj: SE3) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_tumble_turns_five_to_twelve_degrees_and_shows_all_sides(seed: int) -> None:
+def test_a_handheld_trajectory_rotates_5_to_12_degrees_per_frame_and_shows_all_sides(seed: int) -> None:
     T_cam_obj = trajectories.handheld(64, DISTANCE, seed=seed)
     assert steps(T_cam_obj).min() >= 5 - 1e-6
     assert steps(T_cam_obj).max() <= 12 + 1e-6
@@ -231,7 +233,7 @@ def test_a_tumble_turns_five_to_twelve_degrees_and_shows_all_sides(seed: int) ->
     from tumble.maths.directions import fibonacci_sphere
 
     nearest = (views @ fibonacci_sphere(200).double().T).amax(0)
-    # Every side is seen from within 60 degrees, most from much closer; the underside too.
+    # The view nearest to each direction is within 60 degrees, mostly much closer, also for directions from below.
     assert nearest.min() > math.cos(math.radians(60))
     assert nearest.median() > math.cos(math.radians(25))
     assert views[:, 1].min() < -0.7
@@ -239,10 +241,10 @@ def test_a_tumble_turns_five_to_twelve_degrees_and_shows_all_sides(seed: int) ->
     assert torch.equal(T_cam_obj.wxyz, trajectories.handheld(64, DISTANCE, seed=seed).wxyz)
     axes = SO3(T_cam_obj.wxyz[1:]) @ SO3(T_cam_obj.wxyz[:-1]).inverse()
     bend = torch.nn.functional.cosine_similarity(axes.log()[1:], axes.log()[:-1], dim=-1)
-    assert bend.median() > math.cos(math.radians(30)), "a smooth tumble changes its axis slowly"
+    assert bend.median() > math.cos(math.radians(30)), "the axis of a smooth trajectory changes slowly"
 
 
-def test_the_turntable_turns_about_the_vertical_seen_from_25_degrees_above() -> None:
+def test_the_turntable_rotates_about_the_vertical_seen_from_25_degrees_above() -> None:
     T_cam_obj = trajectories.turntable(36, DISTANCE)
     torch.testing.assert_close(steps(T_cam_obj), torch.full((35,), 10.0, dtype=torch.float64))
     camera = T_cam_obj.inverse().xyz / DISTANCE
@@ -272,8 +274,8 @@ def test_shared_views_lie_between_15_and_35_degrees_and_look_at_the_object_uprig
     torch.testing.assert_close(up_cam[:, 0], torch.zeros(12, dtype=torch.float64))
 
 
-def test_a_turntables_camera_sees_the_rooms_ceiling_where_it_is(tmp_path: Path) -> None:
-    """The camera looks 25 degrees down, so the zenith lies 25 degrees behind the top of its own frame."""
+def test_the_light_of_a_turntable_capture_is_pitched_by_the_cameras_elevation(tmp_path: Path) -> None:
+    """The camera looks 25 degrees down, so that the zenith is 25 degrees behind the up direction of its frame."""
     h = 64
     radiance = torch.full((h, 2 * h, 3), 0.01)
     radiance[:3] = 50.0
@@ -305,16 +307,16 @@ def captures(pebble: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     }
 
 
-def test_truth_agrees_across_settings_on_the_shared_views(captures: dict[str, Path]) -> None:
+def test_ground_truth_is_the_same_in_all_settings(captures: dict[str, Path]) -> None:
     truths = {setting: folder.load_truth(path) for setting, path in captures.items()}
-    one, *others = truths.values()
-    assert one.regions == ("shared", "shared", "sphere")
+    first, *others = truths.values()
+    assert first.regions == ("shared", "shared", "sphere")
     for other in others:
         for name in ("albedo", "normals", "depth", "roughness", "masks"):
-            assert torch.equal(getattr(one, name), getattr(other, name)), name
-        assert torch.equal(one.relit["other"], other.relit["other"])
-        torch.testing.assert_close(one.trajectory.T_cam_obj.matrix(), other.trajectory.T_cam_obj.matrix())
-    # Only the light on the photograph differs.
+            assert torch.equal(getattr(first, name), getattr(other, name)), name
+        assert torch.equal(first.relit["other"], other.relit["other"])
+        torch.testing.assert_close(first.trajectory.T_cam_obj.matrix(), other.trajectory.T_cam_obj.matrix())
+    # Only the light in the images differs.
     assert not torch.equal(truths["dome"].images, truths["handheld"].images)
     assert truths["dome"].trajectory.light == "object"
     assert truths["handheld"].trajectory.light == truths["turntable"].trajectory.light == "camera"
@@ -327,33 +329,37 @@ def test_the_exposure_saturates_about_one_percent_of_the_object(captures: dict[s
         assert 0.001 < (brightest == 255).double().mean() < 0.06
 
 
-def test_the_written_light_is_the_light_of_the_photographs(captures: dict[str, Path], pebble: Path) -> None:
-    """Rendering again from what is on disk alone gives the picture on disk."""
+def test_the_stored_light_is_the_light_of_the_images(captures: dict[str, Path], pebble: Path) -> None:
+    """Rendering with the stored light, pose and camera reproduces the stored image."""
     capture, truth = folder.load(captures["handheld"]), folder.load_truth(captures["handheld"])
-    scene = pathtracer.lit_scene(pathtracer.shape(pathtracer.read_model(pebble), "original", None), truth.light, 5)
+    scene = pathtracer.lit_scene(
+        pathtracer.mitsuba_shapes(pathtracer.read_model(pebble), "original", None), truth.light, 5
+    )
     pose = SE3(capture.trajectory.T_cam_obj.wxyz[1], capture.trajectory.T_cam_obj.xyz[1])
     pixels, _ = pathtracer.radiance(scene, pose, capture.camera, capture.trajectory.R_env_obj[1], samples=64, seed=5)
     solid = capture.masks[1].numpy() == 255
     error = images.to_srgb8(torch.from_numpy(pixels)).numpy()[solid].astype(float) - capture.images[1].numpy()[solid]
-    # Sixteen samples a pixel leave noise of some code values, and no bias.
+    # Sixteen samples per pixel leave noise of some code values, but no bias.
     assert abs(error.mean()) < 1.5
     assert np.abs(error).mean() < 12
 
 
-def test_an_interrupted_capture_goes_on_and_ends_the_same(captures: dict[str, Path], pebble: Path) -> None:
+def test_a_resumed_capture_equals_an_uninterrupted_one(captures: dict[str, Path], pebble: Path) -> None:
     path = captures["turntable"]
     before = {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
-    for gone in ("images/0001.png", "masks/0001.png", "images/0004.png", "transforms.json"):
-        (path / gone).unlink()
-    kept = (path / "images" / "0000.png").stat().st_mtime_ns
+    for missing in ("images/0001.png", "masks/0001.png", "images/0004.png", "transforms.json"):
+        (path / missing).unlink()
+    timestamp = (path / "images" / "0000.png").stat().st_mtime_ns
     root = path.parent
     options = SynthOptions(env=str(root / "room.hdr"), setting="turntable", relight=(str(root / "other.hdr"),), **TINY)
     synthesize.render_capture(pebble, path, options)
-    assert (path / "images" / "0000.png").stat().st_mtime_ns == kept
+    assert (path / "images" / "0000.png").stat().st_mtime_ns == timestamp
     assert {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()} == before
 
 
-def test_a_folder_of_another_capture_is_not_touched(captures: dict[str, Path], pebble: Path, tmp_path: Path) -> None:
+def test_a_folder_with_other_content_raises_and_is_unchanged(
+    captures: dict[str, Path], pebble: Path, tmp_path: Path
+) -> None:
     options = SynthOptions(env="white", setting="dome", **TINY)
     with pytest.raises(BadFile, match="other options"):
         synthesize.render_capture(pebble, captures["dome"], options)
@@ -363,7 +369,7 @@ def test_a_folder_of_another_capture_is_not_touched(captures: dict[str, Path], p
     assert [p.name for p in tmp_path.iterdir()] == ["diary.txt"]
 
 
-def test_a_pose_free_film_under_a_white_light(pebble: Path, tmp_path: Path) -> None:
+def test_a_pose_free_video_under_a_white_light(pebble: Path, tmp_path: Path) -> None:
     options = SynthOptions(env="white", material="diffuse", pose_free=True, video=True, **TINY)
     path = synthesize.render_capture(pebble, tmp_path / "clip", options)
     capture, truth = folder.load(path), folder.load_truth(path)
@@ -372,17 +378,17 @@ def test_a_pose_free_film_under_a_white_light(pebble: Path, tmp_path: Path) -> N
     assert not any("transform_matrix" in f for f in json.loads((path / "transforms.json").read_text())["frames"][:3])
     frames = np.stack(list(video.read_clip(path / "clip.mp4")))
     assert frames.shape == capture.images.shape
-    # Halved colour resolution blurs the rim; the film is the same scene, frame by frame.
+    # The frames equal the images up to compression: the video's halved colour resolution blurs the contour.
     assert np.abs(frames.astype(float) - capture.images.numpy()).mean() < 6
-    # Lambert, convex, uniform light: radiance is albedo times the light, wherever the point faces. Pixels of the rim
-    # mix with the background, so they are left out.
+    # For a convex Lambertian object in uniform light, radiance is albedo times the light. Pixels at the contour are
+    # excluded, because they mix with the background.
     solid = -torch.nn.functional.max_pool2d(-(truth.masks == 255).float(), 3, 1, 1) == 1
     light = truth.light.radiance[0, 0]
     expected = images.to_srgb8(truth.albedo[solid] * light).numpy()
     assert np.abs(expected.astype(float) - truth.images[solid].numpy()).mean() < 2
 
 
-def test_a_roughness_sweep_changes_roughness_alone(pebble: Path, tmp_path: Path) -> None:
+def test_a_roughness_sweep_changes_only_roughness(pebble: Path, tmp_path: Path) -> None:
     low, high = synthesize.render_captures(pebble, tmp_path, SynthOptions(env="white", **TINY), (0.2, 0.8))
     assert (low.name, high.name) == ("r0.20", "r0.80")
     a, b = folder.load_truth(low), folder.load_truth(high)
@@ -396,17 +402,17 @@ def test_a_roughness_sweep_changes_roughness_alone(pebble: Path, tmp_path: Path)
     ("change", "message"),
     [
         ({"resolution": 33}, "resolution is out of range: 33"),
-        ({"relight": ("a/sun.hdr", "b/sun.hdr")}, "relight needs lights of different names"),
+        ({"relight": ("a/sun.hdr", "b/sun.hdr")}, "the file names of the relight maps must differ"),
         ({"roughness": 0.0}, "roughness"),
         ({"views": 0}, "views"),
     ],
 )
-def test_impossible_options_are_refused_by_name(change: dict, message: str) -> None:
+def test_the_error_for_an_invalid_option_has_its_name(change: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SynthOptions(env="white", **change)
 
 
-def test_broken_sources_are_named_and_leave_nothing(pebble: Path, tmp_path: Path) -> None:
+def test_an_unreadable_source_raises_before_anything_is_written(pebble: Path, tmp_path: Path) -> None:
     (tmp_path / "x.glb").write_bytes(b"glTFjunk")
     for model, env, message in (
         (tmp_path / "x.glb", "white", "not a readable GLB"),
@@ -429,7 +435,7 @@ def test_the_version_of_llvm_is_read_from_its_name_without_loading_it(name: str,
     assert pathtracer.llvm_version(Path("/nowhere") / name) == version
 
 
-def test_old_llvm_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_versions_of_llvm_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(pathtracer, "LLVM_FOLDERS", (str(tmp_path),))
     (tmp_path / "libLLVM-15.so.1").touch()
@@ -441,8 +447,7 @@ def test_old_llvm_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-def test_a_real_object_has_consistent_truth(shared_data: Path, tmp_path: Path) -> None:
-    """A real scan through the whole generator: depth of its evaluation views agrees where they overlap."""
+def test_depth_of_a_scanned_object_is_consistent_between_views(shared_data: Path, tmp_path: Path) -> None:
     options = SynthOptions(env=str(shared_data / "hdri" / "st_fagans_interior_1k.hdr"), views=4, up="z", samples=64)
     path = synthesize.render_capture(shared_data / "meshes" / "ycb_006_mustard_bottle.glb", tmp_path / "out", options)
     truth = folder.load_truth(path)
@@ -462,7 +467,7 @@ def test_a_real_object_has_consistent_truth(shared_data: Path, tmp_path: Path) -
 
 
 def test_white_and_files_are_read_as_lights(tmp_path: Path) -> None:
-    assert torch.equal(synthesize._light("white").radiance, torch.ones(16, 32, 3))
+    assert torch.equal(synthesize._read_light("white").radiance, torch.ones(16, 32, 3))
     files.write_exr(tmp_path / "x.exr", np.ones((4, 4, 3), np.float32))
     with pytest.raises(BadFile, match="twice as wide"):
-        synthesize._light(str(tmp_path / "x.exr"))
+        synthesize._read_light(str(tmp_path / "x.exr"))

@@ -1,20 +1,19 @@
-"""Renderers, tensors in and tensors out: this page is the contract, a file in this folder is one that keeps it.
+"""Rendering backends: the interface of rasterization, ray tracing and shading, and the choice of an implementation.
 
-Three kernels carry the method: **rasterize** (what the camera sees of the Gaussians), **trace** (what a ray
-meets on its way) and **shade** (reflected light). `reference.py` defines *correct*; the others are the same
-thing, faster. There are no options: culling, depth and corner interpolation are what the method *is*. Another
-rule is another file.
+This file defines the interface; every other module of this folder without a leading underscore implements it. Three
+kernels are needed: **rasterize** (splatting of Gaussians), **trace** (rays against Gaussians) and **shade** (reflected
+light). `reference.py` defines the correct result; the others compute the same, faster. There are no options: rules
+for culling, depth and interpolation are part of the method, and other rules need another module.
 
 Vocabulary
-    *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third
-    axis `n = R_q[:, 2]` is its outward normal. `W = diag(1/s) R_q^T` whitens: the Gaussian at x is `o
-    exp(-|W(x - mu)|^2/2)`.
-    *Peak*: the point of a ray where that is largest. For a ray `x = a + z d`: `z = W(mu - a).Wd / |Wd|^2`.
-    Rasterizer and tracer both take response, depth and corner coordinates at the peak. It is exact in
-    perspective (no affine approximation), is the ray-plane hit for a thin Gaussian, and is never further from
-    the centre than the response says, edge-on too.
-    No screen-space blur: a sphere of 8000 Gaussians at 128 pixels has a silhouette 0.6 pixels too wide without, 1.4
-    with the usual 0.3 px^2, and the tracer has none. Gaussians much smaller than a pixel may fall between pixels.
+    *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third axis
+    `n = R_q[:, 2]` is its outward normal. `W = diag(1/s) R_q^T` is its whitening matrix: the Gaussian at x is
+    `o exp(-|W(x - mu)|^2/2)`.
+    *Peak*: the point of a ray at which a Gaussian is largest. For a ray `x = a + z d`: `z = W(mu - a).Wd / |Wd|^2`.
+    Rasterizer and tracer evaluate response, depth and corner coordinates at the peak. This is exact in perspective
+    (there is no affine approximation), equals the ray-plane intersection for a thin Gaussian, and its distance from the
+    centre is bounded by the response, even for a Gaussian seen edge-on. No screen-space blur is added, so that
+    Gaussians much smaller than a pixel may fall between pixel centres.
     *alpha*: `min(ALPHA_MAX, o exp(-|W(peak - mu)|^2/2))`, and 0 where that is below `ALPHA_MIN`.
 
 Frames: OpenCV camera with pixel centres at +0.5, object radius 1, linear radiance, quaternions wxyz.
@@ -58,43 +57,44 @@ __all__ = [
 ]
 
 ALPHA_MAX = 0.99
-"""Largest alpha of one Gaussian; the gradient is zero beyond, as the function says."""
+"""Upper limit of the alpha of one Gaussian, which is clamped and has no gradient beyond."""
 ALPHA_MIN = 1 / 255
-"""A Gaussian does not touch a pixel or ray where its alpha is below this."""
+"""Alpha below which a Gaussian does not contribute to a pixel or ray."""
 T_MIN = 1e-4
-"""A pixel is finished once its transmittance is below this: Gaussians behind contribute nothing."""
+"""Transmittance below which a pixel is finished; Gaussians behind it do not contribute."""
 FACING = -0.01
-"""A Gaussian is seen only if (p/|p|).n <= FACING, p its centre from the camera: back faces are culled."""
+"""Upper limit of the cosine (p/|p|).n between view direction and normal, with p the centre in the camera frame;
+Gaussians above it are back-facing and culled."""
 NEAR = 0.05
-"""Nearest z-depth of a centre that is drawn [object radius]."""
+"""z-depth of the centre below which a Gaussian is culled [object radius]."""
 NEAR_SIGMAS = 4.0
-"""A Gaussian reaching to within this many standard deviations of the camera's plane is not drawn."""
+"""z-depth of the centre below which a Gaussian is culled [its standard deviations along z]."""
 CORNER = 2.0
-"""Corners of a Gaussian's plane lie at +-CORNER standard deviations; 91 % of its weight falls between."""
+"""Distance of the corners of a Gaussian's plane from its centre along both axes [standard deviations]; 91 % of its
+weight lies between the corners."""
 TRACE_SIGMAS = 3.0
-"""The tracer cuts a Gaussian where its peak is further than this from the centre."""
+"""Distance of the peak from the centre beyond which the tracer ignores a Gaussian [standard deviations]."""
 TRACE_T_MIN = 0.03
-"""A ray with less transmittance than this is blocked: transmittance 0, radiance divided by its opacity."""
+"""Transmittance below which a ray is blocked: its transmittance becomes 0, its radiance is divided by its opacity."""
 VISIBLE = 0.5
-"""A direction is visible from a point where transmittance is at least this."""
+"""Minimum transmittance at which a direction is visible from a point."""
 ROUGHNESS_MIN = 0.05
-"""Roughness below this shades as this: the lobe would be narrower than any set of directions."""
+"""Lower limit of the roughness used for shading; narrower lobes would fall between the sampled directions."""
 
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 def threads() -> int:
-    """How many a kernel on the processor may take: torch's number, or what that was before `threads_for_kernels`."""
+    """Number of threads that kernels on the CPU use: torch's number, or its value before `threads_for_kernels`."""
     return _threads.get() or torch.get_num_threads()
 
 
 @contextmanager
 def threads_for_kernels() -> Iterator[None]:
-    """Leave all threads to the kernels: torch's own operations take one.
+    """Context in which torch's own operations use one thread, while the kernels keep all threads.
 
-    Those of a training step are so small that a second thread costs more than it gives: when this came in, stages 2
-    and 3 of a capture of 128 pixels took 164 s with two threads for both, 120 s with one for both, and 104 s so.
+    The tensors of a training step are so small that more threads slow torch's operations down.
     """
     before = torch.get_num_threads()
     token = _threads.set(threads())
@@ -107,64 +107,64 @@ def threads_for_kernels() -> Iterator[None]:
 
 
 def usable_device(name: str) -> torch.device:
-    """The device of a name, if this machine has it.
+    """The device with the given name.
 
     Raises:
-        ValueError: Torch sees none.
+        ValueError: The device is "cuda", and torch finds no NVIDIA GPU.
     """
     if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: torch sees no NVIDIA GPU here; tumble doctor says what it sees")
+        raise ValueError("--device cuda: torch finds no NVIDIA GPU on this machine; for details run: tumble doctor")
     return torch.device(name)
 
 
 def vector_bits() -> int:
-    """Width of the vectors that the CPU's kernels compute with, on this machine."""
+    """Width of the SIMD vectors of the CPU kernels on this machine [bits]."""
     from tumble.backends import _native
 
     return 32 * _native.library().lanes()
 
 
 class Rendering(NamedTuple):
-    """One view. With w_i = alpha_i prod_{j in front} (1 - alpha_j), "mean" is sum w_i x_i / sum w_i, 0 where
-    nothing is."""
+    """One rendered view. The *mean* of x is sum w_i x_i / sum w_i, with the blending weights
+    w_i = alpha_i prod_{j in front} (1 - alpha_j), and 0 where all weights are 0."""
 
     rgb: Float[Tensor, "h w 3"]
     """Linear radiance over black: sum w_i c_i, not divided by alpha."""
     alpha: Float[Tensor, "h w"]
-    """Coverage: sum w_i. It is 0, or at least ALPHA_MIN."""
+    """Coverage: sum w_i, which is 0 or at least ALPHA_MIN."""
     depth: Float[Tensor, "h w"]
     """Mean z-depth of the peaks, camera frame [object radius]."""
     depth_var: Float[Tensor, "h w"]
-    """Variance of the same [object radius^2], summed about t_cam_obj.z so that it survives 32 bits."""
+    """Variance of the z-depth [object radius^2], summed about t_cam_obj.z to avoid cancellation in float32."""
     normal: Float[Tensor, "h w 3"]
-    """Mean outward normal, object frame; shorter than 1 where Gaussians disagree."""
+    """Mean outward normal, object frame; shorter than 1 where the normals of Gaussians differ."""
     features: Float[Tensor, "h w c"]
-    """Mean of the features, each interpolated between its Gaussian's four corners at the peak."""
+    """Mean of the features, each interpolated at the peak between the four corners of its Gaussian."""
     weight: Float[Tensor, " n"]
     """Sum of w_i over all pixels. Not differentiable."""
     touched: Int32[Tensor, " n"]
-    """Number of pixels under the mask that the Gaussian contributes to."""
+    """Number of pixels within the mask to which the Gaussian contributes."""
     dominant: Int32[Tensor, "h w"]
-    """The Gaussian of largest w_i in each pixel, -1 where there is none."""
+    """Index of the Gaussian with the largest w_i in each pixel, -1 where there is none."""
 
 
 class Hits(NamedTuple):
-    """What rays meet."""
+    """Result of tracing rays."""
 
     transmittance: Float[Tensor, " r"]
     """prod (1 - alpha_i); 0 for a blocked ray."""
     radiance: Float[Tensor, "r 3"]
-    """sum w_i radiance_i, front to back by peak, over black; zeros when no radiance was given."""
+    """sum w_i radiance_i over black, front to back in order of the peaks; zeros if no radiance was given."""
     hit: Int32[Tensor, " r"]
-    """The Gaussian of largest w_i, -1 if the ray meets none."""
+    """Index of the Gaussian with the largest w_i, -1 if the ray hits none."""
 
 
 @runtime_checkable
 class Backend(Protocol):
-    """A module of this folder. All float tensors of a call share one device and dtype; sizes may be zero."""
+    """Interface of a backend module. All float tensors of a call share one device and dtype; sizes may be zero."""
 
     def ready(self, device: torch.device, dtype: torch.dtype) -> str:
-        """Empty if this backend can take tensors of that kind here and now, else the reason and the fix."""
+        """Empty if this backend can process tensors of that device and dtype now, else the reason and the fix."""
         ...
 
     def rasterize(
@@ -182,27 +182,28 @@ class Backend(Protocol):
         width: int,
         mask: Float[Tensor, "#h #w"],
     ) -> Rendering:
-        """One view of the Gaussians; differentiable in every float input but the mask.
+        """One view of the Gaussians; differentiable in every float input except the mask.
 
-        The Gaussians of a view are sorted by the z-depth of their centres, ties by index, and drawn front to
-        back. Left out are those with z < NEAR, z < NEAR_SIGMAS * (standard deviation along z), or a normal
-        that does not face the camera (FACING). The adjoint of `R_cam_obj` is of its nine numbers, taken as
-        free (`W = diag(1/s) R_q^T R_cam_obj^T`, view direction `R_cam_obj^T p`); the caller's chart of
-        rotations projects it.
+        Gaussians are sorted by the z-depth of their centres, ties by index, and blended front to back. Those with
+        z < NEAR, z < NEAR_SIGMAS * (standard deviation along z), or a normal that does not face the camera (FACING)
+        are culled. The gradient of `R_cam_obj` is that of its nine numbers as independent variables
+        (`W = diag(1/s) R_q^T R_cam_obj^T`, view direction `R_cam_obj^T p`); the caller's parametrisation of rotations
+        projects it.
 
         Args:
             means: Centres, object frame [object radius].
-            quats: Local to object rotations, wxyz, of any length but 0.
+            quats: Rotations from local to object frame, wxyz, of any length except 0.
             scales: Standard deviations along the local axes, > 0; the third is the thickness.
             opacity: In [0, 1].
-            sh: Radiance c = max(0, sum_k Y_k(v) sh_k), v the object-frame direction from the camera to the
-                centre, k in {1, 4, 9, 16}; Y in the order and signs of 3D Gaussian splatting (Y_1.. = -y, z,
-                -x times .4886). Linear in its range, so that k = 1 hands over radiance computed elsewhere: sh
-                = c / 0.28209479. A negative sum gives black and no gradient; start from positive colours.
-            corners: Features at (-,-), (+,-), (-,+), (+,+) CORNER standard deviations along the first two
-                axes, bilinear between, constant beyond; c may be 0.
-            R_cam_obj: Rotation of the object to the camera.
-            t_cam_obj: Translation of the object to the camera [object radius].
+            sh: Spherical harmonics of the radiance c = max(0, sum_k Y_k(v) sh_k), where v is the object-frame direction
+                from the camera to the centre, and k is 1, 4, 9 or 16. Y has the order and signs of 3D Gaussian
+                splatting (Y_1.. = -y, z, -x times .4886). With k = 1 and sh = c / 0.28209479 any radiance c computed
+                elsewhere can be passed. A negative sum gives black without a gradient, so colours should be initialised
+                positive.
+            corners: Features at (-,-), (+,-), (-,+), (+,+) CORNER standard deviations along the first two axes,
+                interpolated bilinearly between the corners and constant beyond; c may be 0.
+            R_cam_obj: Rotation from object to camera.
+            t_cam_obj: Translation from object to camera [object radius].
             fx_fy_cx_cy: Focal lengths and principal point [pixels].
             height: Rows of the image.
             width: Columns of the image.
@@ -217,8 +218,7 @@ class Backend(Protocol):
         scales: Float[Tensor, "n 3"],
         opacity: Float[Tensor, " n"],
     ) -> Any:
-        """A search tree over the Gaussians in the object frame, to hand to `trace`, `visible` and `blockers`
-        only."""
+        """A search tree over the Gaussians, object frame: an opaque argument of `trace`, `visible` and `blockers`."""
         ...
 
     def trace(
@@ -228,13 +228,13 @@ class Backend(Protocol):
         directions: Float[Tensor, "r 3"],
         radiance: Float[Tensor, "m 3"],
     ) -> Hits:
-        """What rays meet, object frame; not differentiable.
+        """Trace rays against the Gaussians, object frame; not differentiable.
 
-        A Gaussian counts where its peak lies ahead (z > 0), within TRACE_SIGMAS and with alpha >= ALPHA_MIN,
-        and where it faces the ray (n.d <= 0). Origins should be lifted off their own surface by the caller.
+        A Gaussian is hit if its peak lies ahead (z > 0), within TRACE_SIGMAS and with alpha >= ALPHA_MIN, and if it
+        faces the ray (n.d <= 0). The caller should offset origins from the surface they lie on.
 
         Args:
-            bvh: From `build`, of the same backend.
+            bvh: Result of `build` of the same backend.
             origins: Ray origins [object radius].
             directions: Unit directions.
             radiance: Linear radiance of every Gaussian (m = n), or none (m = 0).
@@ -248,11 +248,10 @@ class Backend(Protocol):
         normals: Float[Tensor, "p 3"],
         directions: Float[Tensor, "d 3"],
     ) -> Int32[Tensor, "p words"]:
-        """One bit per point and shared direction: bit j % 32 of word j // 32 is set where direction j is
-        visible.
+        """Visibility of directions shared by all points: bit j % 32 of word j // 32 is set if direction j is visible.
 
-        Visible means: above the point's horizon (n.d > 0) and transmittance >= VISIBLE by the rule of
-        `trace`.
+        A direction is visible if it is above the point's horizon (n.d > 0) and its transmittance by `trace` is at least
+        VISIBLE.
         """
         ...
 
@@ -264,8 +263,7 @@ class Backend(Protocol):
         directions: Float[Tensor, "d 3"],
         visibility: Int32[Tensor, "p words"],
     ) -> Int32[Tensor, "p d"]:
-        """Which Gaussian (`Hits.hit`) stands in each direction above the horizon that is not visible; -1
-        elsewhere."""
+        """Index of the Gaussian (`Hits.hit`) in each direction above the horizon that is not visible; -1 elsewhere."""
         ...
 
     def shade(
@@ -281,7 +279,7 @@ class Backend(Protocol):
         blocker_radiance: Float[Tensor, "m 3"],
         f0: float,
     ) -> Float[Tensor, "p 3"]:
-        """Reflected radiance under d equal-area directions w_j of the whole sphere, Lambert + GGX.
+        """Reflected radiance (Lambert + GGX) under light from d directions w_j of equal solid angle over the sphere.
 
             L_o = 4 pi / d  sum_j (albedo / pi + f_j) L_j max(n.w_j, 0)
             f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = f0 (1 + 24 q(1 - v.h))
@@ -289,42 +287,41 @@ class Backend(Protocol):
             t = (|n x H|^2 + a^2 (n.H)^2) / |H|^2,  H = v + w_j,  |H|^2 = 2 (1 + v.w_j),  v.h = |H| / 2
             g(x) = (x + sqrt(a^2 + (1 - a^2) x^2)) / 2 for x > 0, else a / 2,  r = max(roughness, ROUGHNESS_MIN)
 
-        (t is the usual (n.h)^2 (a^2 - 1) + 1, written so that a narrow lobe survives 32 bits.)
-        Differentiable in normal, albedo, roughness, view and both radiances; normal and view as free vectors
-        in the formulas above. f is 0 for an eye below the horizon (n.v <= 0), and where |H| = 0 (v = -w).
+        (t is the usual (n.h)^2 (a^2 - 1) + 1 in a form without cancellation for narrow lobes in float32.)
+        Differentiable in normal, albedo, roughness, view and both radiances; normal and view count as independent
+        vectors in the formulas above. f is 0 for a camera below the horizon (n.v <= 0), and where |H| = 0 (v = -w).
 
         Args:
             normal: Unit normals.
-            albedo: Linear.
-            roughness: Perceptual.
+            albedo: Linear albedo.
+            roughness: Perceptual roughness.
             view: Unit directions from surface to camera.
             directions: Unit directions shared by all points, in the frame of normal and view.
-            radiance: What arrives from each direction if nothing is in the way.
-            visibility: As `visible` packs it: L_j is radiance[j] where the bit is set; where it is not,
-                blocker_radiance[blocker[p, j]], or 0 if that is -1.
-            blocker: As from `blockers`; `[1 1]` of -1 when what stands in the way is black.
-            blocker_radiance: Linear radiance of whatever `blocker` indexes; m may be 0.
+            radiance: Linear radiance arriving from each direction where it is visible.
+            visibility: Bits of `visible`. L_j is radiance[j] where the bit is set; elsewhere it is
+                blocker_radiance[blocker[p, j]], or 0 if blocker[p, j] is -1.
+            blocker: Result of `blockers`, or `[1 1]` of -1 for black blockers.
+            blocker_radiance: Linear radiance of the Gaussians that `blocker` indexes; m may be 0.
             f0: Reflectance at normal incidence.
         """
         ...
 
 
 def names() -> list[str]:
-    """The backends there are, by file name."""
+    """Names of all backends, which are their file names."""
     return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
 
 
 def load(name: str) -> Backend:
-    """The backend in file `name`."""
+    """The backend with the given name, imported."""
     return cast(Backend, importlib.import_module(f"{__name__}.{name}"))
 
 
 def choose(device: torch.device, dtype: torch.dtype) -> Backend:
-    """The fastest backend for tensors of a device and dtype: the device's own if it is ready, else the
-    reference.
+    """The fastest backend for tensors of a device and dtype: that of the device if it is ready, else the reference.
 
-    Only float32 has fast kernels; other dtypes are for tests and take the reference in silence. When the
-    device's kernels are not ready, one warning says why and what to do.
+    Fast kernels exist for float32 only; other dtypes, which only tests use, get the reference without a warning. If the
+    kernels of the device are not ready, one warning gives the reason and the fix.
     """
     if dtype != torch.float32 or device.type not in names():
         return load("reference")
@@ -337,4 +334,4 @@ def choose(device: torch.device, dtype: torch.dtype) -> Backend:
 
 @cache
 def _warn_once(name: str, reason: str) -> None:
-    warnings.warn(f"rendering on {name} with the slow reference: {reason}", RuntimeWarning, stacklevel=4)
+    warnings.warn(f"rendering on {name} with the slow reference backend: {reason}", RuntimeWarning, stacklevel=4)

@@ -1,4 +1,4 @@
-"""The tracer of the reference: every ray against every Gaussian, in plain torch, any device and dtype."""
+"""Brute-force tracer of the reference backend: every ray against every Gaussian, in torch on any device and dtype."""
 
 import math
 from typing import NamedTuple
@@ -10,15 +10,16 @@ from torch.nn.functional import normalize
 
 from tumble.backends import ALPHA_MAX, ALPHA_MIN, TRACE_SIGMAS, TRACE_T_MIN, VISIBLE, Hits
 
-PAIRS = 1 << 22
-"""Pairs of a ray and a Gaussian at once: bounds memory, changes nothing else."""
+MAX_PAIRS = 1 << 22
+"""Ray-Gaussian pairs that are computed at once; limits memory and does not affect results."""
 
 
-class Cloud(NamedTuple):
-    """What the tracer of this file searches: everything, one by one."""
+class GaussianList(NamedTuple):
+    """The result of `build`: all Gaussians, without a search tree."""
 
     means: Float[Tensor, "n 3"]
     W: Float[Tensor, "n 3 3"]
+    """Whitening matrices."""
     opacity: Float[Tensor, " n"]
     normals: Float[Tensor, "n 3"]
 
@@ -29,15 +30,15 @@ def build(
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
     opacity: Float[Tensor, " n"],
-) -> Cloud:
+) -> GaussianList:
     """See `Backend.build`."""
     R_obj_local = rotation(quats)
-    return Cloud(means, R_obj_local.mT / scales[..., None], opacity, R_obj_local[..., 2])
+    return GaussianList(means, R_obj_local.mT / scales[..., None], opacity, R_obj_local[..., 2])
 
 
 @torch.no_grad()
 def trace(
-    bvh: Cloud,
+    bvh: GaussianList,
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     radiance: Float[Tensor, "m 3"],
@@ -47,13 +48,13 @@ def trace(
     if n == 0 or r == 0:
         none = torch.full((r,), -1, dtype=torch.int32, device=origins.device)
         return Hits(origins.new_ones(r), origins.new_zeros(r, 3), none)
-    chunk = max(1, PAIRS // n)
+    chunk = max(1, MAX_PAIRS // n)
     parts = [_trace(bvh, o, d, radiance) for o, d in zip(origins.split(chunk), directions.split(chunk), strict=True)]
     return Hits(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
 
 def _trace(
-    bvh: Cloud,
+    bvh: GaussianList,
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     radiance: Float[Tensor, "m 3"],
@@ -63,22 +64,22 @@ def _trace(
     z = (Wd * Wp).sum(-1) / (Wd * Wd).sum(-1)
     distance_2 = (z[..., None] * Wd - Wp).square().sum(-1)
     alpha = (bvh.opacity * torch.exp(-0.5 * distance_2)).clamp(max=ALPHA_MAX)
-    met = (z > 0) & (distance_2 <= TRACE_SIGMAS**2) & (alpha >= ALPHA_MIN) & (directions @ bvh.normals.T <= 0)
-    order = torch.argsort(torch.where(met, z, math.inf), dim=1, stable=True)
-    alpha = torch.where(met, alpha, 0).gather(1, order)
+    is_hit = (z > 0) & (distance_2 <= TRACE_SIGMAS**2) & (alpha >= ALPHA_MIN) & (directions @ bvh.normals.T <= 0)
+    order = torch.argsort(torch.where(is_hit, z, math.inf), dim=1, stable=True)
+    alpha = torch.where(is_hit, alpha, 0).gather(1, order)
     T = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], 1), 1)
     w = torch.where(T[:, :-1] >= TRACE_T_MIN, alpha * T[:, :-1], 0)
     total = w.sum(1)
     blocked = 1 - total < TRACE_T_MIN
-    seen = radiance.new_zeros(len(w), 3) if len(radiance) == 0 else torch.einsum("rn,rnc->rc", w, radiance[order])
-    seen = torch.where(blocked[:, None], seen / total[:, None], seen)
+    sums = radiance.new_zeros(len(w), 3) if len(radiance) == 0 else torch.einsum("rn,rnc->rc", w, radiance[order])
+    sums = torch.where(blocked[:, None], sums / total[:, None], sums)
     best, which = w.max(1)
     hit = torch.where(best > 0, order.gather(1, which[:, None])[:, 0], -1)
-    return Hits(torch.where(blocked, 0, 1 - total), seen, hit.to(torch.int32))
+    return Hits(torch.where(blocked, 0, 1 - total), sums, hit.to(torch.int32))
 
 
 def visible(
-    bvh: Cloud,
+    bvh: GaussianList,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -89,7 +90,7 @@ def visible(
 
 
 def blockers(
-    bvh: Cloud,
+    bvh: GaussianList,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -101,29 +102,29 @@ def blockers(
 
 
 def _around(
-    bvh: Cloud, points: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"], directions: Float[Tensor, "d 3"]
+    bvh: GaussianList, points: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"], directions: Float[Tensor, "d 3"]
 ) -> tuple[Bool[Tensor, "p d"], Hits]:
-    """Which directions are above each point's horizon, and what rays in all of them meet."""
+    """Which directions are above the horizon of each point, and the hits of rays in all directions from all points."""
     p, d = len(points), len(directions)
     hits = trace(bvh, points.repeat_interleave(d, 0), directions.repeat(p, 1), points.new_zeros(0, 3))
     return normals @ directions.T > 0, hits
 
 
 def pack(bits: Bool[Tensor, "p d"]) -> Int32[Tensor, "p words"]:
-    """Bit j % 32 of word j // 32."""
+    """Bits packed into words: bit j becomes bit j % 32 of word j // 32."""
     padded = torch.nn.functional.pad(bits, (0, -bits.shape[1] % 32)).unflatten(1, (-1, 32))
     words = (padded.long() << torch.arange(32, device=bits.device)).sum(-1)
     return torch.where(words < 1 << 31, words, words - (1 << 32)).to(torch.int32)
 
 
 def unpack(words: Int32[Tensor, "p words"], d: int) -> Bool[Tensor, "p d"]:
-    """The first d bits of each row."""
+    """The first d bits of each row of words, the inverse of `pack`."""
     bits = (words.long()[..., None] >> torch.arange(32, device=words.device)) & 1
     return bits.flatten(1)[:, :d].bool()
 
 
 def rotation(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Matrix of a quaternion wxyz of any length but 0."""
+    """Rotation matrices of quaternions wxyz of any length except 0."""
     w, x, y, z = normalize(quats, dim=-1).unbind(-1)
     rows = [
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -1,8 +1,8 @@
-"""The kernels of `native/` through the Clang that Warp brings, for machines without a compiler.
+"""Compile the CPU kernels of `native/` with the Clang inside NVIDIA Warp, for machines without a C++ compiler.
 
-They become the preamble of a Warp module whose one Warp kernel exchanges addresses: what Clang makes here is linked to
-nothing, so it is given the system's thread functions and gives its own entry points in return. Warp caches the object
-file, by the text of the kernels, its own version and the processor, in the folder that `_warp` names.
+The kernels become the preamble of a Warp module. The result is not linked to any library, so the only Warp kernel of
+the module exchanges addresses: it receives those of the system's thread functions and returns those of the entry
+points. Warp caches the object file by the source text, its own version and the processor, in the folder set in `_warp`.
 """
 
 import ctypes
@@ -18,11 +18,12 @@ ENTRY_POINTS = (
     *("lanes", "sizes", "raster_prepare", "raster_forward", "raster_adjoint", "bvh_build"),
     *("rays_trace", "rays_visible", "rays_blockers", "shade_forward", "shade_adjoint"),
 )
+"""Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (
     *("pthread_create", "pthread_mutex_init", "pthread_mutex_lock", "pthread_mutex_unlock"),
     *("pthread_cond_init", "pthread_cond_wait", "pthread_cond_broadcast", "getpid"),
 )
-"""What `native/parallel.h` calls on POSIX; elsewhere it makes do with one thread."""
+"""System functions that `native/parallel.h` calls on POSIX systems; on others it uses one thread."""
 
 _used = FROM_SYSTEM if os.name == "posix" else ()
 
@@ -56,7 +57,7 @@ def _exchange(given: wp.array[wp.uint64], taken: wp.array[wp.uint64]):
 
 
 def library() -> SimpleNamespace:
-    """The compiled kernels, called as those of a shared library are; raises what Warp raises."""
+    """The compiled kernels, with the same functions as the shared library; passes on all exceptions of Warp."""
     addresses = [ctypes.cast(getattr(ctypes.CDLL(None), name), ctypes.c_void_p).value for name in _used]
     given = wp.array(addresses or [0], dtype=wp.uint64, device="cpu")
     taken = wp.zeros(len(ENTRY_POINTS), dtype=wp.uint64, device="cpu")

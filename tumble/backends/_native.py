@@ -1,9 +1,9 @@
-"""Compile the kernels of `native/` on first use, keep them in a user cache, and load them.
+"""Compile the CPU kernels of `native/` on first use, cache them, and load them.
 
-By the system's compiler; without one that works, by the Clang inside Warp, if that is installed (`_jit`).
-
-A *build* is one shared library, named by a hash of everything that decides its machine code: sources, flags, compiler
-and processor. Processes that start at once may compile the same build twice; each puts a whole file in place.
+They are compiled by the system's C++ compiler or, if none works, by the Clang inside NVIDIA Warp if that is installed
+(`_jit`). A *build* is one shared library, named by a hash of everything that determines its machine code: sources,
+flags, compiler and processor. Processes that start at the same time may compile the same build twice; each writes it
+atomically.
 """
 
 import contextlib
@@ -25,28 +25,31 @@ FLAGS = (
     *("-std=c++17", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-Wno-psabi"),
     *("-fno-exceptions", "-fno-rtti", "-fno-math-errno", "-fno-trapping-math", "-pthread"),
 )
-"""Never -ffast-math: it folds the rounding trick of the kernels' exp away."""
+"""Compiler flags. -ffast-math must not be added: it would remove the rounding trick in the kernels' exp."""
 VARIANTS = (("-march=native",), ("-mcpu=native",), ())
-"""Tried in this order: not every compiler knows its own processor, nor by the same word."""
+"""Flags for the processor of this machine, tried in this order because compilers differ in what they accept."""
 COMPILERS = ("c++", "g++", "clang++")
+"""Compilers, tried in this order."""
 
 
 class CannotCompile(RuntimeError):
-    """There is no compiler, or it fails; the message says which and what to do."""
+    """Error for a missing or failing compiler; the message holds the reason and the fix."""
 
 
 @cache
 def library() -> ctypes.CDLL | SimpleNamespace:
-    """The compiled kernels of this machine.
+    """The kernels compiled for this machine.
 
     Raises:
-        CannotCompile: There is no working C++ compiler, and no Warp that could stand in.
+        CannotCompile: Neither a C++ compiler nor Warp can compile the kernels.
     """
     try:
         kernels = _by_compiler()
     except CannotCompile as reason:
         kernels = _by_warp(reason)
-    assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), "layouts differ"
+    assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), (
+        "the structures in _structs.py differ from those in native/"
+    )
     return kernels
 
 
@@ -68,57 +71,57 @@ def _place(name: str) -> Path:
 
 
 def _by_warp(no_compiler: CannotCompile) -> SimpleNamespace:
-    """What Warp offers for this is marked as experimental: if a version lacks or changes it, the reason is told."""
+    """The kernels compiled by Warp; any exception is caught because Warp marks the functions used as experimental."""
     try:
         import warp
     except ImportError:
-        raise CannotCompile(f"{no_compiler}; or pip install 'tumble[cuda]', which brings one (no GPU needed)") from None
+        fix = "or pip install 'tumble[cuda]', which includes a compiler (no GPU needed)"
+        raise CannotCompile(f"{no_compiler}; {fix}") from None
     try:
         from tumble.backends import _jit
 
         return _jit.library()
     except Exception as reason:
-        raise CannotCompile(
-            f"{no_compiler}; nor can Warp {warp.__version__}, which is here, compile the kernels: {reason}"
-        ) from reason
+        failure = f"the installed Warp {warp.__version__} cannot compile the kernels either: {reason}"
+        raise CannotCompile(f"{no_compiler}; {failure}") from reason
 
 
 def find_compiler() -> str:
-    """Path of the C++ compiler: $CXX if set, else the system's.
+    """Path of the C++ compiler: $CXX if set, else that of the system.
 
     Raises:
-        CannotCompile: There is none.
+        CannotCompile: There is no compiler.
     """
-    wanted = [os.environ["CXX"]] if os.environ.get("CXX") else COMPILERS
-    for name in wanted:
+    candidates = [os.environ["CXX"]] if os.environ.get("CXX") else COMPILERS
+    for name in candidates:
         path = shutil.which(name)
         if path:
             return path
     raise CannotCompile(
-        f"no C++ compiler ({', '.join(wanted)}) on the PATH; install one "
+        f"no C++ compiler ({', '.join(candidates)}) on the PATH; install one "
         "(Debian: apt install g++; macOS: xcode-select --install; conda: conda install cxx-compiler)"
     )
 
 
 def compile_to(path: Path, compiler: str) -> None:
-    """Compile the kernels to a shared library; the file appears whole or not at all.
+    """Compile the kernels to a shared library, which is written atomically.
 
     Raises:
-        CannotCompile: No variant of the flags works; the message ends with what the compiler said.
+        CannotCompile: No variant of the flags works; the message ends with the output of the compiler.
     """
     handle, partial = tempfile.mkstemp(prefix=".partial-", suffix=".so", dir=path.parent)
     os.close(handle)
     try:
-        said = ""
+        output = ""
         for variant in VARIANTS:
             command = [compiler, *FLAGS, *variant, str(SOURCES / "kernels.cpp"), "-o", partial]
             run = subprocess.run(command, capture_output=True, text=True, check=False)
             if run.returncode == 0:
                 Path(partial).replace(path)
                 return
-            said = run.stderr
+            output = run.stderr
         raise CannotCompile(
-            f"{compiler} cannot compile the kernels; set CXX to another compiler. It says: {said[-400:]}"
+            f"{compiler} cannot compile the kernels; set CXX to another compiler. Its output: {output[-400:]}"
         )
     finally:
         Path(partial).unlink(missing_ok=True)
@@ -132,7 +135,7 @@ def _build_hash(compiler: str) -> str:
 
 
 def _cpu_features() -> str:
-    """What -march=native looks at: a home folder may be shared by machines of several kinds."""
+    """Processor features that -march=native depends on; machines with different processors may share a cache."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return "\n".join(sorted({x for x in lines if x.startswith(("flags", "Features", "model name"))}))

@@ -1,6 +1,6 @@
-"""The argument structures of the kernels, field by field as in `native/`, and how tensors get into them.
+"""Argument structures of the CPU kernels as ctypes, with the fields of those in `native/`.
 
-Layouts are compared with the library's own when it is loaded.
+Their sizes are compared with those of the library when it is loaded.
 """
 
 import ctypes
@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 LEVELS = 8
-"""Most levels of a tree: 16^8 leaves."""
+"""Maximum number of levels of a tree, enough for 16^8 leaves."""
 
 
 def _pointers(names: str) -> list[tuple[str, Any]]:
@@ -26,7 +26,7 @@ def _floats(names: str) -> list[tuple[str, Any]]:
 
 
 class Raster(ctypes.Structure):
-    """`native/raster.h`."""
+    """`Raster` of `native/raster.h`: arguments of the rasterizer."""
 
     _fields_ = [
         *_pointers("means quats scales opacity sh corners R t focal mask"),
@@ -42,7 +42,7 @@ class Raster(ctypes.Structure):
 
 
 class Bvh(ctypes.Structure):
-    """`native/bvh.h`."""
+    """`Bvh` of `native/bvh.h`: the search tree."""
 
     _fields_ = [
         *_pointers("means quats scales opacity"),
@@ -54,7 +54,7 @@ class Bvh(ctypes.Structure):
 
 
 class Rays(ctypes.Structure):
-    """`native/bvh.h`."""
+    """`Rays` of `native/bvh.h`: arguments of the tracer."""
 
     _fields_ = [
         *_pointers("bvh origins directions radiance normals"),
@@ -64,7 +64,7 @@ class Rays(ctypes.Structure):
 
 
 class Shade(ctypes.Structure):
-    """`native/shade.h`."""
+    """`Shade` of `native/shade.h`: arguments of shading."""
 
     _fields_ = [
         *_pointers("normal albedo roughness view directions radiance visibility blocker blocker_radiance"),
@@ -76,13 +76,13 @@ class Shade(ctypes.Structure):
 
 
 STRUCTURES = (Raster, Bvh, Rays, Shade)
-"""In the order of `sizes` in `native/kernels.cpp`."""
+"""All structures, in the order of `sizes` in `native/kernels.cpp`."""
 
 
-def point(
+def set_pointers(
     struct: ctypes.Structure, tensors: Mapping[str, Tensor | None] | None = None, **more: Tensor | None
 ) -> list[Tensor]:
-    """Set pointer fields to tensors, or to null; these must outlive the call, so they are handed back."""
+    """Set pointer fields to the data of tensors, or to null; returns the tensors, which must outlive the call."""
     for name, tensor in {**(tensors or {}), **more}.items():
         setattr(struct, name, None if tensor is None else tensor.data_ptr())
     return [x for x in [*(tensors or {}).values(), *more.values()] if x is not None]

@@ -1,10 +1,10 @@
-"""What the Warp kernels share: their start, launches on torch's stream, and sums over lanes.
+"""Common parts of the Warp kernels: initialisation, launches on torch's stream, and sums over lanes.
 
-A *lane* is one of 32 GPU threads in step. Where pixels add to the same number, their lanes add to each other first and
-one of them to memory: native code on a GPU. On the CPU, where Warp runs one thread after the other, these are plain
-additions; so the same kernels compute the same thing, and are tested, on machines without a GPU.
+A *lane* is one of the 32 threads of a GPU warp. When the pixels of a warp add to the same number, lanes are summed
+first and one of them adds the sum to memory, by native code on a GPU. On the CPU, where Warp runs one thread after
+another, these functions are plain additions, so that the same kernels can be tested on machines without a GPU.
 
-Compiled kernels go to the folder of the CPU's ones unless $WARP_CACHE_PATH names another.
+Compiled kernels are cached in the folder of the CPU kernels unless $WARP_CACHE_PATH is set.
 """
 
 import os
@@ -19,10 +19,11 @@ from torch import Tensor
 from tumble.backends import _cache
 
 LANES = 32
+"""Threads of a GPU warp."""
 
 if "WARP_CACHE_PATH" not in os.environ and wp.config.kernel_cache_dir is None:
     wp.config.kernel_cache_dir = str(_cache.writable() / "warp")
-# No greeting; what goes wrong is still said.
+# Suppresses Warp's banner, but not its warnings.
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 wp.init()
 
@@ -30,22 +31,22 @@ X = TypeVar("X", bound=Callable[..., Any])
 
 
 def no_type_check(warped: X) -> X:
-    """Marks a function or struct in Warp's language for the shape checker of the tests, which goes by this name.
+    """Decorator that excludes Warp functions and structs from the shape checks of the tests, which look for its name.
 
-    `typing.no_type_check` would hide the annotations from Warp as well.
+    `typing.no_type_check` cannot be used because it would also hide the annotations from Warp.
     """
     return warped
 
 
 def stream(device: torch.device) -> AbstractContextManager[Any]:
-    """Inside, Warp works on a device in torch's current stream."""
+    """Context in which Warp uses torch's current stream on a device."""
     if device.type != "cuda":
         return wp.ScopedDevice(str(device))
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
 
 
 def launch(kernel: Any, threads: int | tuple[int, int], *arguments: Tensor | float | wp.uint64) -> None:
-    """Run a kernel over tensors, on their device; inside `stream` only."""
+    """Launch a kernel on tensors; must be called within `stream`."""
     wp.launch(kernel, threads, inputs=[_argument(p, x) for p, x in zip(kernel.adj.args, arguments, strict=True)])
 
 
@@ -56,7 +57,7 @@ def _argument(parameter: Any, value: Tensor | float | wp.uint64) -> Any:
 
 
 vec32 = wp.types.vector(length=LANES, dtype=float)
-"""What one lane adds to a row."""
+"""Numbers that one lane adds to a row."""
 
 
 @wp.func_native(
@@ -69,7 +70,7 @@ vec32 = wp.types.vector(length=LANES, dtype=float)
 """
 )
 def any_lane(x: bool) -> bool:
-    """Whether x holds in any lane. All lanes must ask."""
+    """Whether x is true in any lane. All lanes must call this function."""
     ...
 
 
@@ -86,7 +87,7 @@ def any_lane(x: bool) -> bool:
 )
 @no_type_check
 def add_lanes(out: wp.array[float], i: int, x: float):
-    """Add every lane's x to out[i]. All lanes must call, with the same i."""
+    """Add the sum of x over all lanes to out[i]. All lanes must call this function with the same i."""
     ...
 
 
@@ -102,7 +103,7 @@ def add_lanes(out: wp.array[float], i: int, x: float):
 )
 @no_type_check
 def count_lanes(out: wp.array[int], i: int, x: bool):
-    """Add the number of lanes in which x holds to out[i]. All lanes must call, with the same i."""
+    """Add the number of lanes in which x is true to out[i]. All lanes must call this function with the same i."""
     ...
 
 
@@ -110,8 +111,8 @@ def count_lanes(out: wp.array[int], i: int, x: bool):
     """
     float* to = out.data + (size_t)row * out.shape[1] + column;
 #if defined(__CUDA_ARCH__)
-    // Halves change places between lanes 16 apart, quarters between lanes 8 apart, and so on: lane i ends with the sum
-    // of x[i]. Loop bounds are constants, so that x stays in registers.
+    // Butterfly reduction: lanes 16 apart exchange halves of x, lanes 8 apart exchange quarters, and so on, so that
+    // lane i ends with the sum of x[i]. Loop bounds are constants, so that x stays in registers.
     int lane = threadIdx.x & 31;
     #pragma unroll
     for (int step = 4; step >= 0; step--) {
@@ -132,5 +133,8 @@ def count_lanes(out: wp.array[int], i: int, x: bool):
 )
 @no_type_check
 def add_row(out: wp.array2d[float], row: int, column: int, count: int, x: vec32):  # type: ignore
-    """Add the first numbers of every lane's x to out[row, column:]. All lanes must call, with the same place."""
+    """Add the sum over all lanes of the first `count` numbers of x to out[row, column:].
+
+    All lanes must call this function with the same row, column and count.
+    """
     ...

@@ -1,7 +1,7 @@
 # type: ignore (this is Warp's language: arrays of vectors, `int / int`, ...)
-"""Kernel: from the sums that the pixels found for a Gaussian to the gradients of its inputs and the camera's.
+"""Adjoint of the projection: gradients of the Gaussians and the camera from the gradient sums over pixels.
 
-Formulas and the layout of sums, records and the camera are in `_warp_project.py`. `v_x` is the gradient of x.
+Formulas and the layouts of sums, records and camera are in `_warp_project.py`. `v_x` is the gradient of x.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.struct
 @no_type_check
 class Gradient:
-    """Of what projection computes from a Gaussian's inputs."""
+    """Gradients of the fields of `Projected` with the same names."""
 
     p: wp.vec3
     P: wp.vec3
@@ -36,7 +36,7 @@ class Gradient:
 @wp.func
 @no_type_check
 def screen_adjoint(o: Projected, sums: wp.array2d[float], i: int) -> Gradient:
-    """Through the conic, the corner coordinates and the projected centre."""
+    """Gradients through the conic, the corner coordinates and the projected centre."""
     v = Gradient()
     v_a = sums[i, 0]
     v_b = 2.0 * sums[i, 1]
@@ -84,7 +84,7 @@ def project_adjoint(
     v_sh: wp.array2d[wp.vec3],
     v_camera: wp.array2d[float],
 ):
-    """Gradients of a Gaussian; that of the camera is summed over lanes, so threads come in whole lanes."""
+    """Gradients of each Gaussian and of the camera; the latter is summed over lanes, which needs whole warps."""
     i = wp.tid()
     v_cam = vec32()
     if i < means.shape[0] and n_tiles[i] > 0:
@@ -123,7 +123,7 @@ def project_adjoint(
 def colour_adjoint(
     Y: vec16, view: wp.vec3, sums: wp.array2d[float], sh: wp.array2d[wp.vec3], i: int, v_sh: wp.array2d[wp.vec3]
 ) -> wp.vec3:
-    """Gradient of the view direction; writes that of the harmonics' coefficients."""
+    """Gradient of the view direction; also writes the gradient of the coefficients of the harmonics."""
     raw = colour(Y, sh, i)
     v = wp.vec3()
     for ch in range(3):

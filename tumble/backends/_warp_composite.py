@@ -1,12 +1,13 @@
 # type: ignore (this is Warp's language: arrays of vectors, `int / int`, ...)
 # ruff: noqa: UP018, RUF046 (in it `float(0.0)` is a variable and `0.0` a constant)
-"""Kernels: blending front to back, and its adjoint, which also walks front to back.
+"""Kernels of blending front to back, and of its adjoint, which also traverses the Gaussians front to back.
 
-With s_i = dL/dw_i, what lies behind Gaussian i contributes rem = dL/dout . out - sum_{j <= i} w_j s_j: no reverse list
-and no state of a pixel is stored. Formulas and the layout of records and sums are in `_warp_project.py`.
+With s_i = dL/dw_i, the Gaussians behind Gaussian i contribute rem = dL/dout . out - sum_{j <= i} w_j s_j, so that
+neither a reversed list nor a state per pixel is stored. Formulas and the layouts of records and sums are in
+`_warp_project.py`.
 
 A *pixel* is rgb, alpha, depth, variance of depth, normal, features. A tile is a block of 256 threads; the 32 lanes of a
-warp are a patch of 8 x 4 pixels and walk the tile's list together.
+warp cover 8 x 4 pixels and traverse the list of the tile together.
 """
 
 from functools import cache
@@ -20,15 +21,15 @@ from tumble.backends._warp_project import CORNERS, SUMS, TILE
 wp.set_module_options({"enable_backward": False})
 
 FIXED = 9
-"""Numbers of a pixel before its features."""
+"""Numbers of a pixel without features."""
 WIDTHS = (0, 8, 16)
-"""Numbers of features that kernels are made for; others are padded with zeros."""
+"""Numbers of features for which kernels are compiled; other numbers are padded with zeros."""
 
 
 @wp.struct
 @no_type_check
 class Peak:
-    """A Gaussian at a pixel; alpha is 0 where it does not touch."""
+    """The response of a Gaussian at a pixel; alpha is 0 if it does not contribute."""
 
     dx: float
     dy: float
@@ -67,7 +68,7 @@ def peak_at(record: wp.array2d[wp.vec4], g: int, at: wp.vec2i) -> Peak:
 @wp.func
 @no_type_check
 def corner_coordinates(p: Peak, record: wp.array2d[wp.vec4], g: int) -> wp.vec2:
-    """u and v, not clamped."""
+    """Corner coordinates u and v at the peak, not clamped."""
     step = record[g, 5]
     zeta = p.l * p.r
     u = 0.5 + p.zeta_1 * record[g, 3][3] + zeta * (step[0] * p.dx + step[1] * p.dy)
@@ -86,7 +87,7 @@ def corner_weights(uv: wp.vec2) -> wp.vec4:
 @wp.func
 @no_type_check
 def pixel_of(thread: int, width: int) -> wp.vec2i:
-    """Column and row of a thread's pixel, which may lie outside the image."""
+    """Column and row of the pixel of a thread; it may lie outside the image."""
     tile = thread // (TILE * TILE)
     patch = (thread // 32) % 8
     lane = thread % 32
@@ -99,7 +100,7 @@ def pixel_of(thread: int, width: int) -> wp.vec2i:
 @wp.struct
 @no_type_check
 class Blend:
-    """Sums over a pixel's Gaussians."""
+    """Weighted sums over the Gaussians of a pixel."""
 
     rgb: wp.vec3
     normal: wp.vec3
@@ -128,7 +129,7 @@ def blend(b: Blend, w: float, p: Peak, record: wp.array2d[wp.vec4], g: int) -> B
 @wp.func
 @no_type_check
 def write_pixel(pixels: wp.array2d[float], i: int, b: Blend, alpha: float, z_0: float):
-    """All but the features."""
+    """Write all numbers of a pixel except the features."""
     inv = 1.0 / alpha
     mean = b.z * inv
     pixels[i, 3] = alpha
@@ -141,7 +142,7 @@ def write_pixel(pixels: wp.array2d[float], i: int, b: Blend, alpha: float, z_0: 
 
 @cache
 def forward(channels: int) -> wp.Kernel:
-    """Blending with so many features (of WIDTHS)."""
+    """The blending kernel for a number of features out of WIDTHS."""
     vec = wp.types.vector(length=channels or 1, dtype=float)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -204,7 +205,7 @@ def forward(channels: int) -> wp.Kernel:
 @wp.struct
 @no_type_check
 class PixelSeed:
-    """Gradient of a pixel's sums, and what is left of dL/dout . out."""
+    """Gradients of the sums of a pixel, and the remaining part `rem` of dL/dout . out."""
 
     rgb: wp.vec3
     normal: wp.vec3
@@ -217,7 +218,7 @@ class PixelSeed:
 @wp.func
 @no_type_check
 def seed_at(pixels: wp.array2d[float], v_pixels: wp.array2d[float], i: int, z_0: float) -> PixelSeed:
-    """All but the features'."""
+    """Gradients of the sums of a pixel, except those of the features."""
     s = PixelSeed()
     alpha = pixels[i, 3]
     inv = 1.0 / alpha
@@ -238,7 +239,7 @@ def seed_at(pixels: wp.array2d[float], v_pixels: wp.array2d[float], i: int, z_0:
 @wp.struct
 @no_type_check
 class BlendStep:
-    """Of the walk at one Gaussian: its blending weight, and the gradients of what was computed at its peak."""
+    """Blending weight of one Gaussian at a pixel, and gradients of the quantities at its peak."""
 
     w: float
     value: float
@@ -250,7 +251,7 @@ class BlendStep:
 @wp.func
 @no_type_check
 def step_at(p: Peak, s: PixelSeed, T: float, record: wp.array2d[wp.vec4], g: int) -> BlendStep:
-    """Without the features."""
+    """Blending weight and gradients at the peak of one Gaussian, without those of the features."""
     o = BlendStep()
     o.w = T * p.alpha
     z = record[g, 2][3] + record[g, 2][2] * p.zeta_1
@@ -262,7 +263,7 @@ def step_at(p: Peak, s: PixelSeed, T: float, record: wp.array2d[wp.vec4], g: int
 @wp.func
 @no_type_check
 def geometry_sums(p: Peak, s: PixelSeed, o: BlendStep, T: float, record: wp.array2d[wp.vec4], g: int) -> vec32:
-    """A pixel's part of a Gaussian's sums, but for its features."""
+    """Contribution of a pixel to the sums of a Gaussian, except those of the features."""
     x = vec32()
     conic = record[g, 1]
     beta = record[g, 2]
@@ -303,7 +304,7 @@ def geometry_sums(p: Peak, s: PixelSeed, o: BlendStep, T: float, record: wp.arra
 
 @cache
 def adjoint(channels: int) -> wp.Kernel:
-    """Adjoint of blending with so many features (of WIDTHS); theirs are added corner by corner, 32 numbers at once."""
+    """The adjoint of `forward`; gradients of features are added corner by corner, 32 numbers at once."""
     vec = wp.types.vector(length=channels or 1, dtype=float)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 32})
@@ -368,7 +369,7 @@ def adjoint(channels: int) -> wp.Kernel:
 @wp.func
 @no_type_check
 def corner_slopes(uv: wp.vec2, at_corner: wp.vec4) -> wp.vec2:
-    """Gradient of the interpolated value in u and v; none where they are clamped."""
+    """Gradients of the interpolated value in u and v, which are 0 where u or v is clamped."""
     u = wp.clamp(uv[0], 0.0, 1.0)
     v = wp.clamp(uv[1], 0.0, 1.0)
     slope = wp.vec2()

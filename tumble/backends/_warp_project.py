@@ -1,22 +1,23 @@
 # type: ignore (this is Warp's language: arrays of vectors, `int / int`, ...)
 # ruff: noqa: UP018, RUF046 (in it `float(0.0)` is a variable and `0.0` a constant)
-"""Kernels: projection of Gaussians to the screen, its adjoint, and the tiles that each one touches.
+"""Kernels of the projection of Gaussians to the screen, and of the assignment of Gaussians to tiles.
 
-On screen, with (dx, dy) the offset of a pixel from the projected centre, everything at the peak of the pixel's ray is
+With (dx, dy) the offset of a pixel from the projected centre, the quantities at the peak of the pixel's ray are
     K = a dx^2 + b dx dy + c dy^2,   l = 1 + beta_x dx + beta_y dy,   q = l^2 + kappa K,
     |W(peak - mu)|^2 = K / q,   zeta = (z-depth of the peak) / (z-depth of the centre) = l / q.
-Exact in perspective. K comes from a cross product and zeta - 1 = -(l (l - 1) + kappa K) / q is summed as written, so
-nothing cancels in 32 bits however thin the Gaussian. The corner coordinates are
-    u = 1/2 + (zeta - 1) e_u + zeta (u_x dx + u_y dy), and v alike, clamped to [0, 1].
+They are exact in perspective. K is computed by a cross product and zeta - 1 as -(l (l - 1) + kappa K) / q, which avoids
+cancellation in float32 for thin Gaussians. The corner coordinates are
+    u = 1/2 + (zeta - 1) e_u + zeta (u_x dx + u_y dy), and the same for v, clamped to [0, 1].
 
 A Gaussian's *record* is eight groups of four numbers:
     0: projected centre x y, cut, opacity     1: a b c, kappa              2: beta_x beta_y, z, z - t.z
     3: red green blue, e_u                    4: normal, e_v               5: u_x u_y v_x v_y
-    6: outline centre x y, moments xx xy      7: outline moment yy
-Alpha reaches ALPHA_MIN where K <= cut q; the outline of that on screen is an ellipse, given by its second moments.
+    6: footprint centre x y, moments xx xy    7: footprint moment yy
+Alpha is at least ALPHA_MIN where K <= cut q. This region is the *footprint*, an ellipse on screen that is described by
+its centre and second moments.
 
-Its *sums* are what the pixels find for its gradient: those of a b c, beta_x beta_y, the centre, kappa, opacity, z,
-u_x u_y, e_u, v_x v_y, e_v, red green blue, normal, in this order, then (from CORNERS on) of its corners' features.
+The *sums* of a Gaussian are gradients summed over pixels: those of a b c, beta_x beta_y, the centre, kappa, opacity, z,
+u_x u_y, e_u, v_x v_y, e_v, red green blue, normal, in this order, then (from CORNERS on) those of the corner features.
 
 The camera is 16 numbers: R_cam_obj by rows, t_cam_obj, focal lengths, principal point.
 """
@@ -29,15 +30,19 @@ from tumble.backends._warp import no_type_check
 wp.set_module_options({"enable_backward": False})
 
 TILE = 16
-"""Pixels along the side of a tile."""
+"""Side of a tile [pixels]."""
 RECORD = 8
+"""Groups of four numbers in a record."""
 SUMS = 22
+"""Number of sums of a Gaussian without features."""
 OPACITY = 8
-"""Place of the opacity among the sums."""
+"""Index of the opacity among the sums."""
 CORNERS = 32
+"""Index of the first feature among the sums."""
 FAR = 3.0e38
-"""Depth of what is not drawn."""
+"""Sorting depth of culled Gaussians."""
 UV = 1.0 / (2.0 * CORNER)
+"""Factor from standard deviations to corner coordinates."""
 
 vec16 = wp.types.vector(length=16, dtype=float)
 
@@ -45,7 +50,7 @@ vec16 = wp.types.vector(length=16, dtype=float)
 @wp.struct
 @no_type_check
 class Projected:
-    """Everything between the inputs and the record, kept for the adjoint."""
+    """Intermediate values of the projection, which the adjoint needs again."""
 
     quat: wp.vec4
     quat_scale: float
@@ -117,7 +122,7 @@ def rotation_adjoint(q: wp.vec4, g: wp.mat33) -> wp.vec4:
 @wp.func
 @no_type_check
 def harmonics(d: wp.vec3) -> vec16:
-    """Real spherical harmonics in the signs of 3D Gaussian splatting."""
+    """Real spherical harmonics with the signs of 3D Gaussian splatting."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -147,7 +152,7 @@ def harmonics(d: wp.vec3) -> vec16:
 @wp.func
 @no_type_check
 def harmonics_adjoint(d: wp.vec3, v: vec16) -> wp.vec3:
-    """Gradient of v . harmonics(d) in d as a free vector."""
+    """Gradient of v . harmonics(d) with the components of d as independent variables."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -210,7 +215,7 @@ def project(mean: wp.vec3, quat: wp.vec4, scale: wp.vec3, camera: wp.array[float
 @wp.func
 @no_type_check
 def colour(Y: vec16, sh: wp.array2d[wp.vec3], i: int) -> wp.vec3:
-    """Radiance before its clamp."""
+    """Radiance of a Gaussian before clamping at 0."""
     rgb = wp.vec3()
     for j in range(16):
         if j < sh.shape[1]:
@@ -220,8 +225,8 @@ def colour(Y: vec16, sh: wp.array2d[wp.vec3], i: int) -> wp.vec3:
 
 @wp.func
 @no_type_check
-def facing(o: Projected, sigma_z: float) -> bool:
-    """Whether a Gaussian is in front of the camera and turned to it."""
+def faces_camera(o: Projected, sigma_z: float) -> bool:
+    """Whether a Gaussian is in front of the camera and faces it."""
     n = wp.vec3(o.R_cam_local[0, 2], o.R_cam_local[1, 2], o.R_cam_local[2, 2])
     in_front = o.p[2] > NEAR and o.p[2] > NEAR_SIGMAS * sigma_z
     return in_front and wp.dot(o.p, n) <= FACING * wp.length(o.p)
@@ -242,7 +247,7 @@ def project_forward(
     depth: wp.array[float],
     n_tiles: wp.array[int],
 ):
-    """Records, sorting depths and numbers of tiles touched; FAR and 0 of what is not drawn."""
+    """Write the record, sorting depth and number of tiles of each Gaussian; FAR and 0 if it is culled."""
     i = wp.tid()
     o = project(means[i], quats[i], scales[i], camera)
     X = wp.cw_mul(row_of(o.R_cam_local, 0), scales[i])
@@ -250,7 +255,7 @@ def project_forward(
     Z = wp.cw_mul(row_of(o.R_cam_local, 2), scales[i])
     depth[i] = FAR
     n_tiles[i] = 0
-    if opacity[i] < ALPHA_MIN or not facing(o, wp.length(Z)):
+    if opacity[i] < ALPHA_MIN or not faces_camera(o, wp.length(Z)):
         return
     cut = 2.0 * wp.log(wp.max(opacity[i] / ALPHA_MIN, 1.0)) + 1.0e-4
     p = o.p
@@ -264,8 +269,8 @@ def project_forward(
     x2 = o.fx * o.fx * scale * (wp.dot(x, x) + cut * (xz * xz - wp.dot(X, X) * zz))
     xy = o.fx * o.fy * scale * (wp.dot(x, y) + cut * (xz * yz - wp.dot(X, Y) * zz))
     y2 = o.fy * o.fy * scale * (wp.dot(y, y) + cut * (yz * yz - wp.dot(Y, Y) * zz))
-    outline_x = camera[14] + o.fx * (p[0] * p[2] - cut * xz) * inv_D
-    outline_y = camera[15] + o.fy * (p[1] * p[2] - cut * yz) * inv_D
+    footprint_x = camera[14] + o.fx * (p[0] * p[2] - cut * xz) * inv_D
+    footprint_y = camera[15] + o.fy * (p[1] * p[2] - cut * yz) * inv_D
     rgb = colour(harmonics(o.view), sh, i)
     R = o.R_obj_local
     uz = UV * p[2]
@@ -275,7 +280,7 @@ def project_forward(
     record[i, 3] = wp.vec4(wp.max(rgb[0], 0.0), wp.max(rgb[1], 0.0), wp.max(rgb[2], 0.0), UV * o.P[0])
     record[i, 4] = wp.vec4(R[0, 2], R[1, 2], R[2, 2], UV * o.P[1])
     record[i, 5] = uz * wp.vec4(o.E1[0], o.E2[0], o.E1[1], o.E2[1])
-    record[i, 6] = wp.vec4(outline_x, outline_y, wp.max(x2, 0.0), xy)
+    record[i, 6] = wp.vec4(footprint_x, footprint_y, wp.max(x2, 0.0), xy)
     record[i, 7] = wp.vec4(wp.max(y2, 1.0e-12), 0.0, 0.0, 0.0)
     rows = tile_rows(record, i, height)
     count = int(0)
@@ -287,13 +292,13 @@ def project_forward(
 
 
 MARGIN = 0.02
-"""Pixels by which an outline is widened against rounding."""
+"""Distance by which a footprint is widened against rounding errors [pixels]."""
 
 
 @wp.func
 @no_type_check
 def tile_rows(record: wp.array2d[wp.vec4], i: int, height: int) -> wp.vec2i:
-    """First row of tiles that an outline may touch, and the one after the last."""
+    """First row of tiles that a footprint may overlap, and the row after the last."""
     half = wp.sqrt(record[i, 7][0]) + MARGIN
     top = wp.max(record[i, 6][1] - half, 0.0)
     bottom = wp.min(record[i, 6][1] + half, float(height) - 0.5)
@@ -305,10 +310,10 @@ def tile_rows(record: wp.array2d[wp.vec4], i: int, height: int) -> wp.vec2i:
 @wp.func
 @no_type_check
 def tile_columns(record: wp.array2d[wp.vec4], i: int, row: int, width: int) -> wp.vec2i:
-    """First tile of a row with a pixel centre inside an outline, and the one after the last.
+    """First tile of a row with a pixel centre inside a footprint, and the tile after the last.
 
-    Left and right ends of the part of an ellipse that lies in a row of tiles are at its own extreme, or else where it
-    crosses the row's border.
+    The leftmost and rightmost points of the part of an ellipse within a row of tiles are the extreme points of the
+    ellipse, or else its intersections with the border of the row.
     """
     none = wp.vec2i(0, 0)
     centre = record[i, 6]
@@ -327,7 +332,7 @@ def tile_columns(record: wp.array2d[wp.vec4], i: int, row: int, width: int) -> w
     y_left = wp.clamp(-extreme, top, bottom)
     right = centre[0] + xy / y2 * y_right + wp.sqrt(rest * wp.max(1.0 - y_right * y_right / y2, 0.0)) + MARGIN
     left = centre[0] + xy / y2 * y_left - wp.sqrt(rest * wp.max(1.0 - y_left * y_left / y2, 0.0)) - MARGIN
-    # A pixel centre x + 1/2 in [left, right].
+    # Pixels whose centre x + 1/2 lies in [left, right].
     first = int(wp.ceil(wp.max(left, 0.5) - 0.5))
     last = int(wp.floor(wp.min(right, float(width) - 0.5) - 0.5))
     if first > last:
@@ -347,13 +352,13 @@ def list_tiles(
     tiles: wp.array[int],
     gaussians: wp.array[int],
 ):
-    """Pairs of a tile and a Gaussian; those of the Gaussian at place i by depth end before ends[i]."""
-    place = wp.tid()
-    i = int(order[place])
+    """Write pairs of a tile and a Gaussian; those of the i-th Gaussian by depth end before ends[i]."""
+    rank = wp.tid()
+    i = int(order[rank])
     if n_tiles[i] == 0:
         return
     across = (width + TILE - 1) // TILE
-    pair = int(ends[place]) - n_tiles[i]
+    pair = int(ends[rank]) - n_tiles[i]
     rows = tile_rows(record, i, height)
     for row in range(rows[0], rows[1]):
         columns = tile_columns(record, i, row, width)

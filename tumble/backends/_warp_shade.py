@@ -1,9 +1,9 @@
 # type: ignore (this is Warp's language: arrays of vectors, `int / int`, ...)
-"""Kernels: Lambert + GGX of points under shared directions, and the adjoint.
+"""Kernels of shading (Lambert + GGX) under light directions shared by all points, and of its adjoint.
 
-The formulas are in `Backend.shade`; f below is the specular part, t_h2 is t |H|^2, `v_x` is the gradient of x. Forward,
-and for the gradient of what belongs to a point, the 32 lanes of a warp share the point and lane i takes the directions
-of bit i. For what belongs to a direction or a blocker, a thread takes one direction and some points.
+The formulas are in `Backend.shade`; f below is the specular part, t_h2 is t |H|^2, `v_x` is the gradient of x. In the
+forward kernel and in the gradient of surface quantities, the 32 lanes of a warp process one point, and lane i takes the
+directions of bit i. In the gradient of radiances, a thread processes one direction and several points.
 """
 
 import math
@@ -16,7 +16,7 @@ from tumble.backends._warp import LANES, add_lanes, add_row, no_type_check, vec3
 wp.set_module_options({"enable_backward": False})
 
 POINTS = 32
-"""Points of a thread that gathers for a direction."""
+"""Points per thread in the gradient of radiances."""
 INV_PI = 1.0 / math.pi
 FOUR_PI = 4.0 * math.pi
 
@@ -24,7 +24,7 @@ FOUR_PI = 4.0 * math.pi
 @wp.struct
 @no_type_check
 class Point:
-    """What a point's directions share."""
+    """Quantities of a point that do not depend on the direction."""
 
     n: wp.vec3
     v: wp.vec3
@@ -37,7 +37,7 @@ class Point:
 @wp.func
 @no_type_check
 def smith_root(x: float, aa: float) -> float:
-    """Smith's g(x) = (x + root) / 2."""
+    """The root in Smith's g(x) = (x + root) / 2."""
     return wp.sqrt(aa + (1.0 - aa) * x * x)
 
 
@@ -58,7 +58,7 @@ def point_at(normal: wp.array[wp.vec3], roughness: wp.array[float], view: wp.arr
 @wp.struct
 @no_type_check
 class Lobe:
-    """The specular part of one direction: f = F rest."""
+    """The specular lobe in one direction: f = F rest."""
 
     w: wp.vec3
     n_w: float
@@ -89,7 +89,7 @@ def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
     o.g_w = 0.5 * (n_w + smith_root(n_w, p.aa))
     o.vh = 0.5 * wp.sqrt(o.HH)
     m = 1.0 - o.vh
-    # brdf.fresnel, and its slope in m.
+    # `tumble.rendering.brdf.fresnel` and its derivative in m.
     o.F = f0 * (1.0 + 24.0 * m * m * m * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
     o.slope = f0 * 24.0 * m * m * (2.9634 + m * (-15.5544 + m * (45.961 + m * (-57.7302 + m * 30.3121))))
     x = o.HH / o.t_h2
@@ -98,8 +98,10 @@ def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
     return o
 
 
-OPEN = wp.constant(-1)
+UNBLOCKED = wp.constant(-1)
+"""Source index of the environment."""
 BLACK = wp.constant(-2)
+"""Source index of a black blocker."""
 
 
 @wp.func
@@ -107,9 +109,9 @@ BLACK = wp.constant(-2)
 def source_of(
     visibility: wp.array2d[int], blocker: wp.array2d[int], blocker_radiance: wp.array[wp.vec3], i: int, j: int
 ) -> int:
-    """What sends light to point i from direction j: OPEN sky, BLACK, or the blocker of that index."""
+    """Source of the light at point i from direction j: UNBLOCKED, BLACK, or the index of a blocker."""
     if (visibility[i, j // 32] >> (j % 32)) & 1 == 1:
-        return OPEN
+        return UNBLOCKED
     if blocker_radiance.shape[0] == 0:
         return BLACK
     return wp.where(blocker[i, j] < 0, BLACK, blocker[i, j])
@@ -118,7 +120,8 @@ def source_of(
 @wp.func
 @no_type_check
 def arriving(source: int, radiance: wp.array[wp.vec3], blocker_radiance: wp.array[wp.vec3], j: int) -> wp.vec3:
-    if source == OPEN:
+    """Radiance arriving from direction j, given its source."""
+    if source == UNBLOCKED:
         return radiance[j]
     return blocker_radiance[source]
 
@@ -156,7 +159,7 @@ def shade_forward(
 @wp.struct
 @no_type_check
 class PointSums:
-    """What some of a point's directions find for its gradient."""
+    """Gradients of a point, summed over some of its directions."""
 
     n: wp.vec3
     v: wp.vec3
@@ -169,7 +172,7 @@ class PointSums:
 @wp.func
 @no_type_check
 def lobe_adjoint(p: Point, o: Lobe, v_f: float, v_n_w: float, sum: PointSums) -> PointSums:
-    """Adds one direction's part. v.h and |H| depend on v.w only, |C| and n.H on the rest."""
+    """The sums with one direction added. v.h and |H| depend on v.w only, |C| and n.H on the other variables."""
     to = sum
     v_log_f = v_f * o.f
     v_t_h2 = -2.0 * v_log_f / o.t_h2
@@ -226,7 +229,7 @@ def shade_adjoint(
     v_out: wp.array[wp.vec3],
     v_points: wp.array2d[float],
 ):
-    """What belongs to a point."""
+    """Gradients of normal, view, albedo and roughness of each point."""
     i, lane = wp.tid()
     p = point_at(normal, roughness, view, i)
     sum = PointSums()
@@ -263,9 +266,9 @@ def light_adjoint(
     v_radiance: wp.array[wp.vec3],
     v_blocker_radiance: wp.array[wp.vec3],
 ):
-    """What belongs to a direction and to blockers."""
+    """Gradients of the radiance of directions and blockers."""
     group, j = wp.tid()
-    open = wp.vec3()
+    v_unblocked = wp.vec3()
     for i in range(POINTS * group, wp.min(POINTS * group + POINTS, normal.shape[0])):
         p = point_at(normal, roughness, view, i)
         n_w = wp.dot(p.n, directions[j])
@@ -274,8 +277,8 @@ def light_adjoint(
             f = lobe_at(p, directions[j], n_w, f0).f
             v_L = n_w * (INV_PI * wp.cw_mul(v_out[i], albedo[i]) + f * v_out[i])
             v_L *= FOUR_PI / float(directions.shape[0])
-            if source == OPEN:
-                open += v_L
+            if source == UNBLOCKED:
+                v_unblocked += v_L
             else:
                 wp.atomic_add(v_blocker_radiance, source, v_L)
-    wp.atomic_add(v_radiance, j, open)
+    wp.atomic_add(v_radiance, j, v_unblocked)

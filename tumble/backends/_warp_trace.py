@@ -1,11 +1,12 @@
 # type: ignore (this is Warp's language: arrays of vectors, `int / int`, ...)
 # ruff: noqa: UP018, RUF046 (in it `float(0.0)` is a variable and `0.0` a constant)
-"""Kernels: rays through a cloud of Gaussians, found by Warp's tree of boxes.
+"""Kernels of ray tracing through Gaussians, with Warp's bounding volume hierarchy.
 
-A Gaussian's *record* is four groups of four numbers: the rows of its whitening matrix W, each followed by a coordinate
-of its mean, and its opacity.
+The *record* of a Gaussian is four groups of four numbers: the rows of its whitening matrix W, each followed by a
+coordinate of its mean, and its opacity.
 
-Rays that run side by side fall to neighbouring threads: one direction of many points, not many directions of one point.
+Neighbouring threads process parallel rays, that is one direction at many points, because these are more coherent than
+many directions at one point.
 """
 
 import warp as wp
@@ -16,14 +17,17 @@ from tumble.backends._warp_project import rotation
 
 wp.set_module_options({"enable_backward": False})
 
-AT_ONCE = 8
-"""Hits that a ray keeps in order; if it meets more it searches again behind them."""
-NOWHERE = 3.0e38
-FARTHEST = 1.0e30
+HITS_PER_PASS = 8
+"""Number of nearest hits that a ray collects in one traversal; further hits need another traversal behind these."""
+UNREACHABLE = 3.0e38
+"""Distance of an unused hit, and coordinates of the box of an empty scene."""
+MAX_DISTANCE = 1.0e30
+"""Upper limit of the distance of hits."""
 REACH_2 = TRACE_SIGMAS * TRACE_SIGMAS
+"""Largest squared distance of a peak from the centre [variances]."""
 
-vec8 = wp.types.vector(length=AT_ONCE, dtype=float)
-vec8i = wp.types.vector(length=AT_ONCE, dtype=int)
+vec8 = wp.types.vector(length=HITS_PER_PASS, dtype=float)
+vec8i = wp.types.vector(length=HITS_PER_PASS, dtype=int)
 
 
 @wp.kernel
@@ -37,12 +41,12 @@ def enclose(
     low: wp.array[wp.vec3],
     high: wp.array[wp.vec3],
 ):
-    """Records, and boxes around what a ray can meet of each Gaussian."""
+    """Write the record of each Gaussian, and the bounding box of its region that rays can hit."""
     i = wp.tid()
     R = rotation(wp.normalize(quats[i]))
     mean = means[i]
     s = scales[i]
-    # A little wider than the cuts, against rounding.
+    # Slightly wider than the thresholds, against rounding errors.
     cut = wp.min(2.0 * wp.log(wp.max(opacity[i] / ALPHA_MIN, 1.0)) + 1.0e-4, REACH_2 * 1.0001)
     half = wp.vec3()
     for a in range(3):
@@ -56,8 +60,8 @@ def enclose(
 
 @wp.func
 @no_type_check
-def meet(record: wp.array2d[wp.vec4], i: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec2:
-    """Alpha of a Gaussian on a ray, 0 if not met, and the distance of its peak."""
+def intersect(record: wp.array2d[wp.vec4], i: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec2:
+    """Alpha of a Gaussian on a ray, 0 if it is not hit, and the distance of its peak."""
     missed = wp.vec2(0.0, 0.0)
     x = record[i, 0]
     y = record[i, 1]
@@ -87,7 +91,7 @@ def is_visible(boxes: wp.uint64, record: wp.array2d[wp.vec4], origin: wp.vec3, d
     i = int(0)
     query = wp.bvh_query_ray(boxes, origin, direction)
     while wp.bvh_query_next(query, i):
-        T *= 1.0 - meet(record, i, origin, direction)[0]
+        T *= 1.0 - intersect(record, i, origin, direction)[0]
         if T < VISIBLE:
             break
     return T >= VISIBLE
@@ -96,7 +100,7 @@ def is_visible(boxes: wp.uint64, record: wp.array2d[wp.vec4], origin: wp.vec3, d
 @wp.struct
 @no_type_check
 class Nearest:
-    """The nearest hits of a ray, in order; equal distances (exact duplicates) are told apart by index."""
+    """The nearest hits of a ray, by distance; equal distances (exact duplicates) are ordered by index."""
 
     z: vec8
     alpha: vec8
@@ -114,28 +118,29 @@ def before(z: float, i: int, other_z: float, other_i: int) -> bool:
 def nearest_behind(
     boxes: wp.uint64, record: wp.array2d[wp.vec4], origin: wp.vec3, direction: wp.vec3, last_z: float, last_i: int
 ) -> Nearest:
+    """The nearest hits of a ray behind the hit (last_z, last_i)."""
     o = Nearest()
-    for j in range(AT_ONCE):
-        o.z[j] = NOWHERE
+    for j in range(HITS_PER_PASS):
+        o.z[j] = UNREACHABLE
     i = int(0)
     query = wp.bvh_query_ray(boxes, origin, direction)
-    # A box holds all peaks of its Gaussian, so one that starts behind the last hit kept has none to offer.
-    while wp.bvh_query_next(query, i, wp.min(o.z[AT_ONCE - 1] * 1.0001, FARTHEST)):
-        met = meet(record, i, origin, direction)
-        alpha = met[0]
-        z = met[1]
+    # A box contains all peaks of its Gaussian, so boxes behind the last collected hit need not be visited.
+    while wp.bvh_query_next(query, i, wp.min(o.z[HITS_PER_PASS - 1] * 1.0001, MAX_DISTANCE)):
+        hit = intersect(record, i, origin, direction)
+        alpha = hit[0]
+        z = hit[1]
         if alpha > 0.0 and before(last_z, last_i, z, i):
-            moving = i
-            for j in range(AT_ONCE):
-                if before(z, moving, o.z[j], o.i[j]):
+            inserted = i
+            for j in range(HITS_PER_PASS):
+                if before(z, inserted, o.z[j], o.i[j]):
                     z_j = o.z[j]
                     i_j = o.i[j]
                     alpha_j = o.alpha[j]
                     o.z[j] = z
-                    o.i[j] = moving
+                    o.i[j] = inserted
                     o.alpha[j] = alpha
                     z = z_j
-                    moving = i_j
+                    inserted = i_j
                     alpha = alpha_j
     return o
 
@@ -143,6 +148,8 @@ def nearest_behind(
 @wp.struct
 @no_type_check
 class Traced:
+    """Result of tracing a ray: transmittance, radiance and dominant Gaussian."""
+
     T: float
     radiance: wp.vec3
     hit: int
@@ -157,7 +164,7 @@ def trace_ray(
     origin: wp.vec3,
     direction: wp.vec3,
 ) -> Traced:
-    """Front to back along a ray."""
+    """Blend the hits of a ray front to back."""
     o = Traced()
     o.T = 1.0
     o.hit = -1
@@ -167,8 +174,8 @@ def trace_ray(
     searching = bool(True)
     while searching:
         hits = nearest_behind(boxes, record, origin, direction, z, i)
-        for j in range(AT_ONCE):
-            if hits.z[j] < FARTHEST and o.T >= TRACE_T_MIN:
+        for j in range(HITS_PER_PASS):
+            if hits.z[j] < MAX_DISTANCE and o.T >= TRACE_T_MIN:
                 i = hits.i[j]
                 w = o.T * hits.alpha[j]
                 if w > best:
@@ -177,8 +184,8 @@ def trace_ray(
                 if radiance.shape[0] > 0:
                     o.radiance += w * radiance[i]
                 o.T -= w
-        z = hits.z[AT_ONCE - 1]
-        searching = z < FARTHEST and o.T >= TRACE_T_MIN
+        z = hits.z[HITS_PER_PASS - 1]
+        searching = z < MAX_DISTANCE and o.T >= TRACE_T_MIN
     if o.T < TRACE_T_MIN:
         o.radiance /= 1.0 - o.T
         o.T = 0.0
@@ -206,7 +213,7 @@ def trace_rays(
 
 @wp.kernel
 @no_type_check
-def look_around(
+def trace_visibility(
     boxes: wp.uint64,
     record: wp.array2d[wp.vec4],
     points: wp.array[wp.vec3],
@@ -214,7 +221,7 @@ def look_around(
     directions: wp.array[wp.vec3],
     bits: wp.array2d[int],
 ):
-    """One word of visibility bits."""
+    """Write the visibility bits of each point, one word per thread."""
     word, point = wp.tid()
     set = int(0)
     for j in range(32 * word, wp.min(32 * word + 32, directions.shape[0])):
@@ -229,16 +236,17 @@ def look_around(
 def find_blockers(
     boxes: wp.uint64,
     record: wp.array2d[wp.vec4],
-    nothing: wp.array[wp.vec3],
+    no_radiance: wp.array[wp.vec3],
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     bits: wp.array2d[int],
     blocker: wp.array2d[int],
 ):
+    """Write the dominant Gaussian in each blocked direction above the horizon of each point; -1 elsewhere."""
     j, point = wp.tid()
-    found = int(-1)
-    clear = (bits[point, j // 32] >> (j % 32)) & 1
-    if clear == 0 and wp.dot(normals[point], directions[j]) > 0.0:
-        found = trace_ray(boxes, record, nothing, points[point], directions[j]).hit
-    blocker[point, j] = found
+    index = int(-1)
+    visible = (bits[point, j // 32] >> (j % 32)) & 1
+    if visible == 0 and wp.dot(normals[point], directions[j]) > 0.0:
+        index = trace_ray(boxes, record, no_radiance, points[point], directions[j]).hit
+    blocker[point, j] = index

@@ -1,6 +1,6 @@
-"""The contract of this folder on the processor: float32, SIMD and threads, through a plain C ABI (see `native/`).
+"""CPU backend: float32 kernels in C++ with SIMD and threads, called through a plain C ABI (see `native/`).
 
-`autograd.Function`s around the kernels: save, launch, return.
+This file wraps the kernels in `autograd.Function`s.
 """
 
 import ctypes
@@ -28,21 +28,36 @@ from tumble.backends import (
     _native,
     threads,
 )
-from tumble.backends._structs import Bvh, Raster, Rays, Shade, point
+from tumble.backends._structs import Bvh, Raster, Rays, Shade, set_pointers
 
-TILE, RECORD, GEOMETRY, SPAN, CAMERA = 8, 32, 16, 5, 16
-"""Sizes in `native/raster.h`."""
-WIDE, LEVELS, LEAF, NODE = 16, 8, 14 * 16, 10 * 16
-"""Sizes in `native/bvh.h`, the last two in numbers."""
-FEATURES_AT_ONCE = 16
-ROOM = 1 << 28
-"""Most numbers (1 GiB) for the threads' own sums of gradients: many threads and many Gaussians get fewer threads."""
-ROOM_KEPT = 1 << 24
-"""Most numbers kept from one backward pass to the next (64 MiB)."""
+TILE = 8
+"""Side of a tile in `native/raster.h` [pixels]."""
+RECORD = 32
+"""Numbers of a Gaussian's record in `native/raster.h`, without features."""
+GEOMETRY = 16
+"""Numbers of a Gaussian's gradient in `native/raster.h`, without colour, normal and features."""
+SPAN = 5
+"""Numbers of a Gaussian's footprint on screen in `native/raster.h`."""
+CAMERA = 16
+"""Numbers of the camera's gradient in `native/raster.h`."""
+WIDE = 16
+"""Children of a node, and Gaussians of a leaf, in `native/bvh.h`."""
+LEVELS = 8
+"""Maximum number of levels of the tree in `native/bvh.h`."""
+LEAF = 14 * 16
+"""Numbers of a leaf in `native/bvh.h`."""
+NODE = 10 * 16
+"""Numbers of a node in `native/bvh.h`."""
+FEATURES_PER_PASS = 16
+"""Maximum number of features that the kernels blend in one pass; more are split into several passes."""
+MAX_GRADIENT_SCRATCH = 1 << 28
+"""Maximum size of the gradient sums of all threads (1 GiB) [numbers]; with many Gaussians fewer threads are used."""
+MAX_KEPT_SCRATCH = 1 << 24
+"""Maximum size of the scratch memory kept from one backward pass to the next (64 MiB) [numbers]."""
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
-    """Empty if the kernels take such tensors and are compiled, else the reason and the fix."""
+    """Empty if the kernels accept such tensors and are compiled, else the reason and the fix."""
     if device.type != "cpu" or dtype != torch.float32:
         return f"the kernels take float32 on the CPU, not {dtype} on {device}"
     try:
@@ -69,12 +84,12 @@ def rasterize(
     """One view of the Gaussians; see `Backend.rasterize`."""
     geometry = (means, quats, scales, opacity, sh)
     camera = (R_cam_obj, t_cam_obj, fx_fy_cx_cy, height, width, mask)
-    # A slice of everything would cost its backward pass a copy.
-    group = corners if corners.shape[2] <= FEATURES_AT_ONCE else corners[..., :FEATURES_AT_ONCE]
+    # Without slicing where possible, because the gradient of a full slice would be copied.
+    group = corners if corners.shape[2] <= FEATURES_PER_PASS else corners[..., :FEATURES_PER_PASS]
     first = Rendering(*_Rasterize.apply(*geometry, group, *camera))
-    if corners.shape[2] <= FEATURES_AT_ONCE:
+    if corners.shape[2] <= FEATURES_PER_PASS:
         return first
-    rest = rasterize(*geometry, corners[..., FEATURES_AT_ONCE:], *camera)
+    rest = rasterize(*geometry, corners[..., FEATURES_PER_PASS:], *camera)
     return first._replace(features=torch.cat([first.features, rest.features], -1))
 
 
@@ -86,9 +101,9 @@ class _Rasterize(torch.autograd.Function):
         n, k, c = len(inputs[0]), inputs[4].shape[1], inputs[5].shape[2]
         mask = (mask if mask.numel() == 1 else mask.expand(height, width)).contiguous()
         r = _raster(n, k, c, height, width, mask.numel() > 1)
-        kept = point(r, dict(zip(_INPUTS, inputs, strict=True)), mask=mask)
+        kept = set_pointers(r, dict(zip(_INPUTS, inputs, strict=True)), mask=mask)
         n_tiles = -(-height // TILE) * -(-width // TILE)
-        kept += point(
+        kept += set_pointers(
             r,
             record=torch.empty(n * r.record_size),
             span=torch.empty(n * SPAN),
@@ -109,9 +124,9 @@ class _Rasterize(torch.autograd.Function):
             "touched": _int32(n),
             "dominant": _int32(height, width),
         }
-        parts = point(r, weight_parts=torch.empty(r.threads * n), touched_parts=_int32(r.threads * n))
-        kept += point(r, list=_int32(_native.library().raster_prepare(ctypes.byref(r))))
-        point(r, results)
+        parts = set_pointers(r, weight_parts=torch.empty(r.threads * n), touched_parts=_int32(r.threads * n))
+        kept += set_pointers(r, list=_int32(_native.library().raster_prepare(ctypes.byref(r))))
+        set_pointers(r, results)
         _native.library().raster_forward(ctypes.byref(r))
         del parts
         ctx.raster, ctx.kept, ctx.n_inputs = r, kept, len(args)
@@ -124,31 +139,32 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_results: Any) -> tuple[Tensor | None, ...]:
         r, inputs = ctx.raster, ctx.saved_tensors[: len(_INPUTS)]
         seeds = [None if v is None else v.contiguous() for v in v_results[: len(_SEEDED)]]
-        # Where geometry and pose are given, half of the work is for nobody.
-        whole = any((*ctx.needs_input_grad[:5], *ctx.needs_input_grad[6:9]))
-        gradients = [torch.empty_like(x) if whole or x is inputs[5] else None for x in inputs[:6]]
+        # If only features need gradients, the kernel skips those of geometry and pose, half of the work.
+        needs_geometry = any((*ctx.needs_input_grad[:5], *ctx.needs_input_grad[6:9]))
+        gradients = [torch.empty_like(x) if needs_geometry or x is inputs[5] else None for x in inputs[:6]]
         camera = torch.empty(CAMERA)
-        kept = point(r, dict(zip((f"v_{name}" for name in _SEEDED), seeds, strict=True)), v_camera=camera)
-        kept += point(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
-        kept += point(
+        kept = set_pointers(r, dict(zip((f"v_{name}" for name in _SEEDED), seeds, strict=True)), v_camera=camera)
+        kept += set_pointers(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
+        kept += set_pointers(
             r,
             parts=_scratch(r.threads * r.n * r.gradient_size),
             camera_parts=torch.empty(r.threads * CAMERA),
         )
         _native.library().raster_adjoint(ctypes.byref(r))
-        if not whole:
+        if not needs_geometry:
             return (*gradients, *(None for _ in range(6)))
         R, t, focal = camera.split([9, 3, 4])
         return (*gradients, R.view(3, 3), t, focal, None, None, None)
 
 
 _INPUTS = ("means", "quats", "scales", "opacity", "sh", "corners", "R", "t", "focal")
+"""Differentiable inputs of the rasterizer."""
 _SEEDED = ("rgb", "alpha", "depth", "depth_var", "normal", "features")
-"""The results that have a gradient."""
+"""Differentiable results of the rasterizer."""
 
 
 def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Raster:
-    """Sizes and constants of one view."""
+    """Arguments of the rasterizer with the sizes and constants of one view."""
     lanes = _native.library().lanes()
     c_drawn = -(-c // 4) * 4
     fixed_width, corner_width = (-(-x // lanes) * lanes for x in (6, c_drawn))
@@ -159,7 +175,7 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
         c=c,
         height=height,
         width=width,
-        threads=max(1, min(threads(), ROOM // max(1, n * gradient_size))),
+        threads=max(1, min(threads(), MAX_GRADIENT_SCRATCH // max(1, n * gradient_size))),
         alpha_max=ALPHA_MAX,
         alpha_min=ALPHA_MIN,
         T_min=T_MIN,
@@ -176,15 +192,18 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
 
 
 def _scratch(n: int) -> Tensor:
-    """Room for n numbers until the next call in this thread: fresh pages would cost as much as a small picture."""
-    if n > ROOM_KEPT:
+    """Uninitialised memory for n numbers, valid until the next call in this thread.
+
+    It is reused because allocating new pages takes as long as rendering a small image.
+    """
+    if n > MAX_KEPT_SCRATCH:
         return torch.empty(n)
-    if len(getattr(_kept, "room", ())) < n:
-        _kept.room = torch.empty(n)
-    return _kept.room
+    if len(getattr(_local, "scratch", ())) < n:
+        _local.scratch = torch.empty(n)
+    return _local.scratch
 
 
-_kept = threading.local()
+_local = threading.local()
 
 
 def _int32(*shape: int) -> Int32[Tensor, "..."]:
@@ -192,11 +211,11 @@ def _int32(*shape: int) -> Int32[Tensor, "..."]:
 
 
 class CpuBvh(NamedTuple):
-    """What `build` hands to the tracing functions."""
+    """The result of `build`: a search tree and its memory."""
 
     bvh: Bvh
     memory: list[Tensor]
-    """Leaves and nodes, to which the former points."""
+    """Leaves and nodes, to which `bvh` points."""
 
 
 @torch.no_grad()
@@ -224,9 +243,9 @@ def build(
         visible=VISIBLE,
     )
     inputs = [x.contiguous() for x in (means, quats, scales, opacity)]
-    point(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
-    memory = point(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
-    work = point(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
+    set_pointers(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
+    memory = set_pointers(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
+    work = set_pointers(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
     W = torch.empty(n * 9)
     _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(W.data_ptr()))
     del work
@@ -244,7 +263,7 @@ def trace(
     r = len(origins)
     hits = Hits(torch.empty(r), torch.empty(r, 3), _int32(r))
     rays = _rays(bvh, origins, directions, radiance=radiance)
-    point(rays.struct, transmittance=hits.transmittance, out=hits.radiance, hit=hits.hit)
+    set_pointers(rays.struct, transmittance=hits.transmittance, out=hits.radiance, hit=hits.hit)
     _native.library().rays_trace(ctypes.byref(rays.struct))
     return hits
 
@@ -259,7 +278,7 @@ def visible(
     """See `Backend.visible`."""
     rays = _rays(bvh, points, directions, normals=normals)
     bits = _int32(len(points), rays.struct.words)
-    point(rays.struct, bits=bits)
+    set_pointers(rays.struct, bits=bits)
     _native.library().rays_visible(ctypes.byref(rays.struct))
     return bits
 
@@ -275,18 +294,20 @@ def blockers(
     """See `Backend.blockers`."""
     rays = _rays(bvh, points, directions, normals=normals, bits=visibility)
     hit = _int32(len(points), len(directions))
-    point(rays.struct, hit=hit)
+    set_pointers(rays.struct, hit=hit)
     _native.library().rays_blockers(ctypes.byref(rays.struct))
     return hit
 
 
-class _Launch(NamedTuple):
+class _RaysLaunch(NamedTuple):
+    """Arguments of the tracer, and the tensors that they point to."""
+
     struct: Rays
     kept: list[Tensor]
 
 
-def _rays(bvh: CpuBvh, origins: Tensor, directions: Tensor, **more: Tensor) -> _Launch:
-    """Arguments of a search, and the tensors they point to."""
+def _rays(bvh: CpuBvh, origins: Tensor, directions: Tensor, **more: Tensor) -> _RaysLaunch:
+    """Arguments of the tracer; `more` are further pointer fields of `Rays`."""
     struct = Rays(
         bvh=ctypes.addressof(bvh.bvh),
         n_rays=len(origins),
@@ -296,7 +317,7 @@ def _rays(bvh: CpuBvh, origins: Tensor, directions: Tensor, **more: Tensor) -> _
         has_radiance=int("radiance" in more and len(more["radiance"]) > 0),
     )
     tensors = {"origins": origins, "directions": directions, **more}
-    return _Launch(struct, point(struct, {name: x.contiguous() for name, x in tensors.items()}))
+    return _RaysLaunch(struct, set_pointers(struct, {name: x.contiguous() for name, x in tensors.items()}))
 
 
 def shade(
@@ -323,7 +344,7 @@ class _ShadeFunction(torch.autograd.Function):
         tensors = [x.contiguous() for x in tensors]
         out = torch.empty_like(tensors[0])
         struct, kept = _shade_launch(tensors, f0)
-        point(struct, out=out)
+        set_pointers(struct, out=out)
         _native.library().shade_forward(ctypes.byref(struct))
         del kept
         ctx.f0 = f0
@@ -336,8 +357,10 @@ class _ShadeFunction(torch.autograd.Function):
         struct, kept = _shade_launch(tensors, ctx.f0)
         *v_surface, v_radiance, v_blocker = (torch.empty_like(x) for x in tensors[:6])
         v_rows = torch.empty(3, struct.stride)
-        kept += point(struct, dict(zip(("v_normal", "v_albedo", "v_roughness", "v_view"), v_surface, strict=True)))
-        kept += point(
+        kept += set_pointers(
+            struct, dict(zip(("v_normal", "v_albedo", "v_roughness", "v_view"), v_surface, strict=True))
+        )
+        kept += set_pointers(
             struct,
             v_out=v_out.contiguous(),
             v_radiance=v_rows,
@@ -351,7 +374,7 @@ class _ShadeFunction(torch.autograd.Function):
 
 
 def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
-    """Arguments of a shading, and the tensors they point to. Directions and radiance become padded rows."""
+    """Arguments of shading and the tensors that they point to; directions and radiance become padded rows."""
     normal, albedo, roughness, view, radiance, blocker_radiance, directions, visibility, blocker = tensors
     lanes = _native.library().lanes()
     padding = -len(directions) % lanes
@@ -370,5 +393,5 @@ def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
         roughness_min=ROUGHNESS_MIN,
     )
     rest = {"normal": normal, "albedo": albedo, "roughness": roughness, "view": view, "visibility": visibility}
-    kept = point(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
+    kept = set_pointers(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
     return struct, kept

@@ -1,10 +1,8 @@
-"""The contract of this folder on NVIDIA GPUs: float32, through kernels in Warp (the files `_warp*.py` beside this one).
+"""CUDA backend: float32 kernels written in NVIDIA Warp (`_warp*.py`).
 
-`autograd.Function`s around the kernels: save, launch, return. Warp is an optional package, so it is imported when the
-first tensor comes; it compiles the kernels then, in seconds, and keeps them in the user's cache. Gradients are summed
-by atomic additions: two runs on a GPU agree to rounding, not bit by bit.
-
-The kernels run where the tensors are, on the CPU too. They are slow there; that is for tests without a GPU.
+This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
+it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
+GPU differ by rounding errors. The kernels run on the device of the tensors; on the CPU they are slow and serve tests.
 """
 
 import importlib.util
@@ -19,11 +17,11 @@ from tumble.backends import Hits, Rendering
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
-    """Empty if the kernels take such tensors here and now, else the reason and the fix."""
+    """Empty if the kernels accept such tensors on this machine, else the reason and the fix."""
     if device.type != "cuda" or dtype != torch.float32:
         return f"the kernels take float32 on an NVIDIA GPU, not {dtype} on {device}"
     if not torch.cuda.is_available():
-        return "torch finds no NVIDIA GPU; it needs the driver, and a torch built for CUDA"
+        return "torch finds no NVIDIA GPU; install the NVIDIA driver and a torch built for CUDA"
     if importlib.util.find_spec("warp") is None:
         return "the kernels need NVIDIA Warp; install it: pip install 'tumble[cuda]'"
     return ""
@@ -43,7 +41,7 @@ def rasterize(
     width: int,
     mask: Float[Tensor, "#h #w"],
 ) -> Rendering:
-    """One view of the Gaussians; see `Backend.rasterize`. Many features are drawn in groups."""
+    """One view of the Gaussians; see `Backend.rasterize`. Many features are rendered in several passes."""
     from tumble.backends._warp_composite import WIDTHS
 
     camera = torch.cat([R_cam_obj.flatten(), t_cam_obj, fx_fy_cx_cy])
@@ -64,7 +62,7 @@ def rasterize(
 class _Rasterize(torch.autograd.Function):
     """(means, quats, scales, opacity, sh, corners, camera, height, width, mask) -> pixels, weight, touched, dominant.
 
-    Cameras and pixels are laid out as the kernels say.
+    The layouts of camera and pixels are those of `_warp_project` and `_warp_composite`.
     """
 
     @staticmethod
@@ -78,18 +76,18 @@ class _Rasterize(torch.autograd.Function):
         record = means.new_empty(n, _warp_project.RECORD, 4)
         depth, n_tiles = means.new_empty(n), _int32(means, n)
         pixels = means.new_zeros(height * width, _warp_composite.FIXED + channels)
-        counts = means.new_zeros(n), torch.zeros_like(n_tiles), _int32(means, height * width).fill_(-1)
+        statistics = means.new_zeros(n), torch.zeros_like(n_tiles), _int32(means, height * width).fill_(-1)
         with _warp.stream(means.device):
             prepared = record, depth, n_tiles
             _warp.launch(_warp_project.project_forward, n, *geometry, camera, height, width, *prepared)
             starts, listed = _bin(*prepared, height, width)
             drawing = record, _packed(corners), camera, mask.expand(height, width), starts, listed, height, width
             kernel = _warp_composite.forward(channels)
-            _warp.launch(kernel, _threads(starts), *drawing, pixels, *counts)
+            _warp.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
         ctx.size = height, width
         ctx.save_for_backward(*inputs, record, n_tiles, starts, listed, pixels)
-        ctx.mark_non_differentiable(*counts)
-        weight, touched, dominant = counts
+        ctx.mark_non_differentiable(*statistics)
+        weight, touched, dominant = statistics
         return pixels.view(height, width, -1), weight, touched, dominant.view(height, width)
 
     @staticmethod
@@ -106,20 +104,21 @@ class _Rasterize(torch.autograd.Function):
             kernel = _warp_composite.adjoint(channels)
             _warp.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
             gradients = v_means, v_quats, v_scales, v_sh, v_camera
-            whole = -(-n // _warp.LANES) * _warp.LANES
+            n_threads = -(-n // _warp.LANES) * _warp.LANES
             inputs = means, quats, scales, sh, camera, n_tiles
-            _warp.launch(_warp_adjoint.project_adjoint, whole, *inputs, sums, *gradients)
+            _warp.launch(_warp_adjoint.project_adjoint, n_threads, *inputs, sums, *gradients)
         v_opacity = sums[:, _warp_project.OPACITY]
         v_corners = sums[:, _warp_project.CORNERS :].view(n, 4, channels)
         return v_means, v_quats, v_scales, v_opacity, v_sh, v_corners, v_camera[0], None, None, None
 
 
 def _packed(corners: Float[Tensor, "n 4 c"]) -> Float[Tensor, "n 4 c1"]:
-    """Warp has no vectors of length 0; the kernel does not look at these."""
+    """The corners, or unused ones with one feature if there are none, because Warp has no vectors of length 0."""
     return corners if corners.shape[2] else corners.new_empty(len(corners), 4, 1)
 
 
 def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
+    """Number of threads of the blending kernels, one per pixel of all tiles."""
     from tumble.backends._warp_project import TILE
 
     return (len(starts) - 1) * TILE * TILE
@@ -128,7 +127,7 @@ def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
 def _bin(
     record: Float[Tensor, "n 8 4"], depth: Float[Tensor, " n"], n_tiles: Int32[Tensor, " n"], height: int, width: int
 ) -> tuple[Int32[Tensor, " tiles_1"], Int32[Tensor, " pairs"]]:
-    """Where each tile's list starts (and the last ends), and the lists: Gaussians by depth, ties by index."""
+    """Start of the list of each tile (and end of the last), and all lists: Gaussians by depth, ties by index."""
     import warp
 
     from tumble.backends import _warp, _warp_project
@@ -136,24 +135,26 @@ def _bin(
     order = torch.argsort(depth, stable=True)
     ends = n_tiles[order].cumsum(0)
     n_pairs = int(ends[-1]) if len(ends) else 0
-    # The second half of each is the sort's workspace. It is stable, so a tile's Gaussians stay in order of depth.
+    # The second half of both is workspace of the sort, which is stable and so keeps the depth order within a tile.
     tiles, listed = _int32(depth, 2 * n_pairs), _int32(depth, 2 * n_pairs)
     _warp.launch(_warp_project.list_tiles, len(order), order, ends, record, n_tiles, height, width, tiles, listed)
     n_all = -(-height // _warp_project.TILE) * -(-width // _warp_project.TILE)
     warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), n_pairs, end_bit=n_all.bit_length())
-    every = torch.arange(n_all + 1, dtype=torch.int32, device=depth.device)
-    return torch.searchsorted(tiles[:n_pairs], every, out_int32=True), listed[:n_pairs]
+    all_tiles = torch.arange(n_all + 1, dtype=torch.int32, device=depth.device)
+    return torch.searchsorted(tiles[:n_pairs], all_tiles, out_int32=True), listed[:n_pairs]
 
 
 class WarpBvh(NamedTuple):
-    """What `build` hands to the tracing functions."""
+    """The result of `build`: a search tree and its memory."""
 
     boxes: Any
-    """A `warp.Bvh`."""
+    """Bounding boxes of the Gaussians as a `warp.Bvh`."""
     record: Float[Tensor, "n 4 4"]
+    """Records of the Gaussians, see `_warp_trace`."""
     low: Float[Tensor, "n 3"]
+    """Lower corners of the boxes, to which `boxes` points."""
     high: Float[Tensor, "n 3"]
-    """Corners of the boxes, to which the first points."""
+    """Upper corners of the boxes, to which `boxes` points."""
 
 
 @torch.no_grad()
@@ -168,10 +169,10 @@ def build(
 
     from tumble.backends import _warp, _warp_trace
 
-    # Warp's tree is never empty: one box far away stands for no Gaussians.
+    # Warp's tree cannot be empty, so that without Gaussians it holds one box that no ray reaches.
     n = max(len(means), 1)
     record = means.new_zeros(n, 4, 4)
-    low, high = means.new_full((n, 3), _warp_trace.NOWHERE), means.new_full((n, 3), _warp_trace.NOWHERE)
+    low, high = means.new_full((n, 3), _warp_trace.UNREACHABLE), means.new_full((n, 3), _warp_trace.UNREACHABLE)
     with _warp.stream(means.device):
         gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
         _warp.launch(_warp_trace.enclose, len(means), *gaussians, record, low, high)
@@ -210,8 +211,8 @@ def visible(
     words = -(-len(directions) // 32)
     bits = _int32(points, len(points), words)
     with _warp.stream(points.device):
-        around = [x.contiguous() for x in (points, normals, directions)]
-        _warp.launch(_warp_trace.look_around, (words, len(points)), bvh.boxes.id, bvh.record, *around, bits)
+        inputs = [x.contiguous() for x in (points, normals, directions)]
+        _warp.launch(_warp_trace.trace_visibility, (words, len(points)), bvh.boxes.id, bvh.record, *inputs, bits)
     return bits
 
 
@@ -226,12 +227,12 @@ def blockers(
     """See `Backend.blockers`."""
     from tumble.backends import _warp, _warp_trace
 
-    found = _int32(points, len(points), len(directions))
+    blocker = _int32(points, len(points), len(directions))
     with _warp.stream(points.device):
-        around = [x.contiguous() for x in (points.new_zeros(0, 3), points, normals, directions, visibility)]
+        inputs = [x.contiguous() for x in (points.new_zeros(0, 3), points, normals, directions, visibility)]
         threads = len(directions), len(points)
-        _warp.launch(_warp_trace.find_blockers, threads, bvh.boxes.id, bvh.record, *around, found)
-    return found
+        _warp.launch(_warp_trace.find_blockers, threads, bvh.boxes.id, bvh.record, *inputs, blocker)
+    return blocker
 
 
 def _int32(like: Tensor, *shape: int) -> Int32[Tensor, "..."]:
@@ -256,7 +257,7 @@ def shade(
 
 
 class _Shade(torch.autograd.Function):
-    """The arguments of `shade`, one by one."""
+    """`shade` with positional arguments in the same order."""
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:

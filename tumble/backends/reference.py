@@ -1,8 +1,7 @@
-"""The definition of correct: the contract of this folder in plain torch, any device and dtype,
-differentiable.
+"""Reference backend in torch, for any device and dtype; it defines the correct results of all backends.
 
-Written for reading. Gradients are autograd's. Vocabulary: `mu` centre, `p_cam` the same in the camera frame,
-`W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a ray where a Gaussian is largest.
+It is written for readability; gradients are those of autograd. Vocabulary: `mu` centre, `p_cam` centre in the camera
+frame, `W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a ray at which a Gaussian is largest.
 """
 
 import math
@@ -29,24 +28,28 @@ from tumble.backends._brute import blockers, build, rotation, trace, unpack, vis
 __all__ = ["blockers", "build", "rasterize", "ready", "shade", "trace", "visible"]
 
 TILE = 32
-"""Pixels of a square drawn at once: bounds memory, changes nothing else."""
+"""Side of the squares that are rendered at once [pixels]; limits memory and does not affect results."""
 
 
-class Rules(NamedTuple):
-    """The thresholds that make a picture cheap, and its derivative discontinuous."""
+class Thresholds(NamedTuple):
+    """Thresholds of blending, which save time and make the image a discontinuous function of its inputs."""
 
     alpha_min: float
+    """See `ALPHA_MIN`."""
     alpha_max: float
+    """See `ALPHA_MAX`."""
     T_min: float
+    """See `T_MIN`."""
 
 
-SHARP = Rules(ALPHA_MIN, ALPHA_MAX, T_MIN)
-SMOOTH = Rules(0.0, 1.0, 0.0)
-"""No thresholds: for finite differences only."""
+THRESHOLDS = Thresholds(ALPHA_MIN, ALPHA_MAX, T_MIN)
+"""The thresholds of all backends."""
+NO_THRESHOLDS = Thresholds(0.0, 1.0, 0.0)
+"""Blending without thresholds, for finite differences in tests."""
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
-    """Always."""
+    """Always empty: the reference accepts any device and dtype."""
     return ""
 
 
@@ -66,19 +69,22 @@ def rasterize(
 ) -> Rendering:
     """One view of the Gaussians; see `Backend.rasterize`."""
     view = project(means, quats, scales, opacity, sh, R_cam_obj, t_cam_obj)
-    return composite(view, opacity, corners, t_cam_obj, fx_fy_cx_cy, mask.expand(height, width), SHARP)
+    return composite(view, opacity, corners, t_cam_obj, fx_fy_cx_cy, mask.expand(height, width), THRESHOLDS)
 
 
 class ProjectedView(NamedTuple):
-    """The Gaussians as a camera sees them, nearest first."""
+    """The Gaussians of a view after culling, sorted by depth."""
 
     index: Int64[Tensor, " v"]
-    """Which Gaussians; those not seen are left out."""
+    """Indices of the Gaussians that were not culled."""
     p_cam: Float[Tensor, "v 3"]
+    """Centres, camera frame."""
     WR_obj_cam: Float[Tensor, "v 3 3"]
-    """Whitening, from the camera frame."""
+    """Whitening matrices that take vectors in the camera frame."""
     normal: Float[Tensor, "v 3"]
+    """Outward normals, object frame."""
     rgb: Float[Tensor, "v 3"]
+    """Linear radiance."""
 
 
 def project(
@@ -90,7 +96,7 @@ def project(
     R_cam_obj: Float[Tensor, "3 3"],
     t_cam_obj: Float[Tensor, "3"],
 ) -> ProjectedView:
-    """Cull, sort by depth and colour the Gaussians."""
+    """The Gaussians of a view: culled, sorted by depth, and with their radiance towards the camera."""
     R_obj_local = rotation(quats)
     p_cam = means @ R_cam_obj.T + t_cam_obj
     R_cam_local = R_cam_obj @ R_obj_local
@@ -98,8 +104,8 @@ def project(
         z = p_cam[:, 2]
         sigma_z = (R_cam_local[:, 2] * scales).norm(dim=-1)
         facing = (normalize(p_cam, dim=-1) * R_cam_local[:, :, 2]).sum(-1)
-        seen = (z > NEAR) & (z > NEAR_SIGMAS * sigma_z) & (facing <= FACING) & (opacity >= ALPHA_MIN)
-        index = torch.where(seen)[0]
+        kept = (z > NEAR) & (z > NEAR_SIGMAS * sigma_z) & (facing <= FACING) & (opacity >= ALPHA_MIN)
+        index = torch.where(kept)[0]
         index = index[torch.argsort(z[index], stable=True)]
     p_cam, R_cam_local = p_cam[index], R_cam_local[index]
     direction = normalize(p_cam @ R_cam_obj, dim=-1)
@@ -116,9 +122,9 @@ def composite(
     t_cam_obj: Float[Tensor, "3"],
     fx_fy_cx_cy: Float[Tensor, "4"],
     mask: Float[Tensor, "h w"],
-    rules: Rules,
+    thresholds: Thresholds,
 ) -> Rendering:
-    """Blend a view's Gaussians front to back, square by square."""
+    """One view: its Gaussians blended front to back, one square of pixels after the other."""
     height, width = mask.shape
     n, c = corners.shape[0], corners.shape[2]
     sums = opacity.new_zeros(height, width, 9 + c)
@@ -132,9 +138,9 @@ def composite(
         for left in range(0, width, TILE):
             square = (slice(top, min(top + TILE, height)), slice(left, min(left + TILE, width)))
             d = _rays(fx_fy_cx_cy, square)
-            near = _near(view, opacity, d, rules)
+            near = _near(view, opacity, d, thresholds)
             part = ProjectedView(*(x[near] for x in view))
-            w, values = _blend(part, opacity, corners, d, z_0, rules)
+            w, values = _blend(part, opacity, corners, d, z_0, thresholds)
             row.append(torch.einsum("pv,pvc->pc", w, values).unflatten(0, sums[square].shape[:2]))
             if part.index.numel():
                 with torch.no_grad():
@@ -156,7 +162,7 @@ def _finish(
     touched: Int32[Tensor, " n"],
     dominant: Int32[Tensor, "h w"],
 ) -> Rendering:
-    """Turn sums into means."""
+    """The rendering whose means are computed from weighted sums."""
     rgb, alpha, z, zz, normal, features = sums.split([3, 1, 1, 1, 3, sums.shape[2] - 9], -1)
     covered = alpha > 0
     divisor = torch.where(covered, alpha, 1)
@@ -177,7 +183,7 @@ def _finish(
 
 
 def _rays(fx_fy_cx_cy: Float[Tensor, "4"], square: tuple[slice, slice]) -> Float[Tensor, "p 3"]:
-    """Directions with z = 1 through the pixel centres of a square, row by row."""
+    """Ray directions with z = 1 through the pixel centres of a square, row by row."""
     fx, fy, cx, cy = fx_fy_cx_cy
     y, x = (torch.arange(s.start, s.stop).to(fx_fy_cx_cy) + 0.5 for s in square)
     y, x = torch.meshgrid(y, x, indexing="ij")
@@ -186,16 +192,16 @@ def _rays(fx_fy_cx_cy: Float[Tensor, "4"], square: tuple[slice, slice]) -> Float
 
 @torch.no_grad()
 def _near(
-    view: ProjectedView, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], rules: Rules
+    view: ProjectedView, opacity: Float[Tensor, " n"], d: Float[Tensor, "p 3"], thresholds: Thresholds
 ) -> Bool[Tensor, " v"]:
-    """A superset of the Gaussians that reach any of the rays: their bounding spheres meet the rays' cone."""
-    if rules.alpha_min == 0 or view.index.numel() == 0:
+    """A superset of the Gaussians that contribute to any of the rays: bounding spheres that intersect their cone."""
+    if thresholds.alpha_min == 0 or view.index.numel() == 0:
         return torch.ones_like(view.index, dtype=torch.bool)
     d = normalize(d, dim=-1)
     axis = normalize(d.mean(0), dim=-1)
     cone = torch.acos((d @ axis).min().clamp(-1, 1))
     distance = view.p_cam.norm(dim=-1)
-    sigmas = (2 * torch.log(opacity[view.index] / rules.alpha_min)).clamp(min=0).sqrt()
+    sigmas = (2 * torch.log(opacity[view.index] / thresholds.alpha_min)).clamp(min=0).sqrt()
     largest = 1 / view.WR_obj_cam.norm(dim=-1).amin(-1)
     reach = torch.asin((sigmas * largest / distance).clamp(max=1))
     angle = torch.acos((view.p_cam @ axis / distance).clamp(-1, 1))
@@ -208,17 +214,17 @@ def _blend(
     corners: Float[Tensor, "n 4 c"],
     d: Float[Tensor, "p 3"],
     z_0: Float[Tensor, ""],
-    rules: Rules,
+    thresholds: Thresholds,
 ) -> tuple[Float[Tensor, "p v"], Float[Tensor, "p v s"]]:
-    """Blending weights of Gaussians at pixels, and the values to blend: rgb, 1, z, z^2, normal, features."""
+    """Blending weights of Gaussians at pixels, and their values to blend: rgb, 1, z, z^2, normal, features."""
     Wd = torch.einsum("vij,pj->pvi", view.WR_obj_cam, d)
     Wp = torch.einsum("vij,vj->vi", view.WR_obj_cam, view.p_cam)
     z = (Wd * Wp).sum(-1) / (Wd * Wd).sum(-1)
     peak = z[..., None] * Wd - Wp
     alpha = opacity[view.index] * torch.exp(-0.5 * (peak * peak).sum(-1))
-    alpha = torch.where(alpha >= rules.alpha_min, alpha.clamp(max=rules.alpha_max), 0)
+    alpha = torch.where(alpha >= thresholds.alpha_min, alpha.clamp(max=thresholds.alpha_max), 0)
     T = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], 1), 1)[:, :-1]
-    w = torch.where(rules.T_min > T, 0, alpha * T)
+    w = torch.where(thresholds.T_min > T, 0, alpha * T)
     u, v = (peak[..., :2] / (2 * CORNER) + 0.5).clamp(0, 1)[..., None].unbind(-2)
     f_00, f_10, f_01, f_11 = corners[view.index].unbind(1)
     features = (1 - v) * ((1 - u) * f_00 + u * f_10) + v * ((1 - u) * f_01 + u * f_11)
@@ -229,7 +235,7 @@ def _blend(
 
 
 def harmonics(d: Float[Tensor, "*b 3"], k: int) -> Float[Tensor, "*b k"]:
-    """The first k real spherical harmonics of unit directions, in the signs of 3D Gaussian splatting."""
+    """The first k real spherical harmonics at unit directions, with the signs of 3D Gaussian splatting."""
     x, y, z = d.unbind(-1)
     one = torch.ones_like(x)
     basis = [0.28209479177387814 * one]
@@ -273,8 +279,8 @@ def shade(
     arriving = torch.where(unpack(visibility, d)[..., None], radiance, 0)
     if blocker_radiance.shape[0]:
         blocker = blocker.expand(len(normal), d)
-        standing = ~unpack(visibility, d) & (blocker >= 0)
-        arriving = torch.where(standing[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
+        is_blocked = ~unpack(visibility, d) & (blocker >= 0)
+        arriving = torch.where(is_blocked[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
     a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
     n_w = normal @ directions.T
     n_v = (normal * view).sum(-1, keepdim=True)

@@ -1,11 +1,11 @@
-"""Drop a dataset here: one file that reads one layout.
+"""Dataset readers: one plugin file per layout. To add a layout, add a file with these four names:
 
-    LAYOUT                              one line: which files make a path a capture of this kind
-    recognises(path) -> bool            whether they are there
-    load(path) -> Capture               what a reconstruction may see
-    load_truth(path) -> Truth | None    what it is scored against
+    LAYOUT                              one line: the files by which the layout is recognised
+    recognises(path) -> bool            whether a path has these files
+    load(path) -> Capture               input of a reconstruction
+    load_truth(path) -> Truth | None    ground truth for its evaluation
 
-The last two are apart so that a reconstruction cannot read its own answer.
+`load` and `load_truth` are separate, so that a reconstruction cannot read its ground truth.
 """
 
 from pathlib import Path
@@ -14,39 +14,39 @@ from types import ModuleType
 from tumble.datasets import folder
 from tumble.datasets._capture_folder import MAPS, capture_document, evaluation_frame, save_capture, training_frame
 from tumble.datasets.folder import read_poses
-from tumble.io import BadFile, named, names
+from tumble.io import BadFile, load_plugin, plugin_names
 
 __all__ = [
     "MAPS",
     "capture_document",
     "evaluation_frame",
     "folder",
-    "layouts",
+    "matching_layouts",
     "read_poses",
     "save_capture",
     "training_frame",
-    "which",
+    "reader_for",
 ]
 
 
-def which(path: Path) -> ModuleType:
-    """The reader of the layout that a path has.
+def reader_for(path: Path) -> ModuleType:
+    """The reader of the layout of a path.
 
     Raises:
-        BadFile: It has none that is known, or several; the message lists those there are.
+        BadFile: The path has no known layout, or several; the message lists the known ones.
     """
-    readers, found = _readers(), layouts(path)
-    if len(found) == 1:
-        return readers[found[0]]
+    readers, matching = _readers(), matching_layouts(path)
+    if len(matching) == 1:
+        return readers[matching[0]]
     known = "; ".join(f"{name}: {reader.LAYOUT}" for name, reader in readers.items())
-    rule = "has no layout that is known" if path.is_dir() else "is not a folder" if path.exists() else "is missing"
-    raise BadFile(path, f"has the layouts of {' and '.join(found)}" if found else rule, f"known are {known}")
+    rule = "has no known layout" if path.is_dir() else "is not a folder" if path.exists() else "is missing"
+    raise BadFile(path, f"has the layouts {' and '.join(matching)}" if matching else rule, f"known layouts: {known}")
 
 
-def layouts(path: Path) -> list[str]:
-    """Names of the layouts that a path has."""
+def matching_layouts(path: Path) -> list[str]:
+    """Names of the layouts that recognise a path."""
     return [name for name, reader in _readers().items() if reader.recognises(path)]
 
 
 def _readers() -> dict[str, ModuleType]:
-    return {name: named("datasets", name) for name in names("datasets")}
+    return {name: load_plugin("datasets", name) for name in plugin_names("datasets")}

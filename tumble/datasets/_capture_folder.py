@@ -1,8 +1,7 @@
-"""Writing capture folders (docs/format.md): the entries of transforms.json, and whole captures.
+"""Writer of capture folders (docs/format.md): the entries of transforms.json, and whole captures.
 
-File names: a frame `0007.png` has its photograph in `images/`, its mask in `masks/`, its truth as
-`truth/albedo/0007.exr`, ..., `truth/relit/<light>/0007.png`. `transforms.json` is written last: a folder without it is
-not a capture yet.
+A frame `0007.png` has its image in `images/`, its mask in `masks/`, and its ground truth in `truth/albedo/0007.exr`,
+..., `truth/relit/<light>/0007.png`. `transforms.json` is written last, so a folder without it is an incomplete capture.
 """
 
 from collections.abc import Iterable
@@ -16,29 +15,30 @@ from tumble.io import BadFile, files
 from tumble.scene import Camera, Capture, Truth
 
 MAPS = ("albedo", "roughness", "normal", "depth")
-"""Truth maps of an evaluation view, as folders of truth/ and as keys `<map>_path` of its frame."""
+"""Ground-truth maps of an evaluation view; a map is a folder of truth/ and the key `<map>_path` of a frame."""
 
 
 def capture_document(
     camera: Camera, light: str, frames: list[dict[str, Any]], *, setting: str | None, with_light: bool
 ) -> dict[str, Any]:
-    """A transforms.json.
+    """Content of a transforms.json.
 
     Args:
-        light: What the light stands still with.
-        frames: From `training_frame` and `evaluation_frame`.
+        light: What the light is fixed to, "camera" or "object".
+        frames: Entries from `training_frame` and `evaluation_frame`.
+        setting: Label of the capture setting; None writes none.
         with_light: Whether there is a truth/light.hdr.
     """
     fx, fy, cx, cy = camera.fx_fy_cx_cy.tolist()
     intrinsics = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
     label = {} if setting is None else {"setting": setting}
-    path = {"light_path": "truth/light.hdr"} if with_light else {}
-    head = {"camera_model": "OPENCV", **intrinsics, "light": light, **label, **path, "units": "arbitrary"}
+    light_path = {"light_path": "truth/light.hdr"} if with_light else {}
+    head = {"camera_model": "OPENCV", **intrinsics, "light": light, **label, **light_path, "units": "arbitrary"}
     return head | {"frames": frames}
 
 
 def training_frame(name: str, matrix: list[list[float]] | None) -> dict[str, Any]:
-    """The entry of a training frame; `matrix` is camera to object in OpenGL axes, None when unknown."""
+    """Entry of a training frame; `matrix` is camera to object with OpenGL camera axes, None if unknown."""
     entry: dict[str, Any] = {"file_path": f"images/{name}", "mask_path": f"masks/{name}", "split": "train"}
     return entry if matrix is None else entry | {"transform_matrix": matrix}
 
@@ -46,32 +46,32 @@ def training_frame(name: str, matrix: list[list[float]] | None) -> dict[str, Any
 def evaluation_frame(
     name: str, matrix: list[list[float]], region: str, *, maps: Iterable[str], lights: Iterable[str]
 ) -> dict[str, Any]:
-    """The entry of an evaluation view that has truth maps, and relit pictures under some lights."""
+    """Entry of an evaluation view with ground-truth maps and with images relit by some lights."""
     entry = training_frame(name, matrix) | {"split": "eval", "region": region}
     entry |= {f"{kind}_path": f"truth/{kind}/{Path(name).stem}.exr" for kind in maps}
     return entry | {"relit": {light: f"truth/relit/{light}/{name}" for light in lights}}
 
 
 def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, setting: str | None = None) -> None:
-    """Write a capture, and what is true about it, as a new folder.
+    """Write a capture, and optionally its ground truth, as a new folder.
 
     Raises:
         BadFile: `path` exists and is not an empty folder.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise BadFile(path, "is there already", "choose a new folder")
+        raise BadFile(path, "exists already", "choose a new folder")
     for name, image, mask in zip(capture.names, capture.images, capture.masks, strict=True):
-        _save_photograph(path, name, image, mask)
+        _save_image_and_mask(path, name, image, mask)
     matrices = [None] * len(capture) if capture.trajectory is None else capture.trajectory.camera_to_object().tolist()
     frames = [training_frame(name, matrix) for name, matrix in zip(capture.names, matrices, strict=True)]
     if truth is not None:
         frames += _save_truth(path, capture, truth)
     with_light = truth is not None and truth.light is not None
     fields = capture_document(capture.camera, capture.light, frames, setting=setting, with_light=with_light)
-    files.write_json(path / "transforms.json", fields | ({"focal_source": "guess"} if capture.focal_guessed else {}))
+    files.write_json(path / "transforms.json", fields | ({"focal_source": "guess"} if capture.focal_assumed else {}))
 
 
-def _save_photograph(path: Path, name: str, image: Tensor, mask: Tensor) -> None:
+def _save_image_and_mask(path: Path, name: str, image: Tensor, mask: Tensor) -> None:
     files.write_png(path / "images" / name, image.cpu().numpy())
     files.write_png(path / "masks" / name, mask.cpu().numpy()[..., None])
 
@@ -90,7 +90,7 @@ def _save_truth(path: Path, capture: Capture, truth: Truth) -> list[dict[str, An
     maps = {kind: images.cpu().numpy() for kind, images in values.items() if images is not None}
     frames = []
     for i, (name, matrix) in enumerate(zip(truth.names, truth.trajectory.camera_to_object().tolist(), strict=True)):
-        _save_photograph(path, name, truth.images[i], truth.masks[i])
+        _save_image_and_mask(path, name, truth.images[i], truth.masks[i])
         for kind, images in maps.items():
             pixels = images[i] if images[i].ndim == 3 else images[i][..., np.newaxis]
             files.write_exr(path / "truth" / kind / f"{Path(name).stem}.exr", pixels)

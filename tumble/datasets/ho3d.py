@@ -1,15 +1,15 @@
-"""HO3D v2 and v3 sequences: a YCB object turned in the hand before a still camera; poses in metres.
+"""Reader of HO3D v2 and v3 sequences: a YCB object rotated in the hand in front of a static camera; poses in metres.
 
     DATASET/train|evaluation/SEQUENCE/rgb/0000.jpg (v3) or .png (v2)
                                       meta/0000.pkl      pickles of Python 2
-                                      masks/0000.png     not HO3D's own: 255 object, 128 unknown (a hand), 0 background
-                                      seg/0000.png       v3, train: green object, blue hand, fewer pixels
-    DATASET/masks_XMem/SEQUENCE/00000.png                masks in common use: not 0 is object,
-                       SEQUENCE_hand/0000.png            and here hand
+                                      masks/0000.png     your own: 255 object, 128 unknown (a hand), 0 background
+                                      seg/0000.png       v3, train: green object, blue hand, at a lower resolution
+    DATASET/masks_XMem/SEQUENCE/00000.png                masks by XMem: object where not 0,
+                       SEQUENCE_hand/0000.png            and hand where not 0
 
-The first of masks/, masks_XMem/ and seg/ that has a frame counts. A frame without mask, or with an empty one, is left
-out. A frame without annotation stays, for a tracker needs it, but has no true pose. Camera frames of the files have
-OpenGL axes, and the centre of their first pixel is (0, 0).
+Per frame the first of masks/, masks_XMem/ and seg/ that has a mask is used. A frame without a mask, or with an empty
+one, is omitted. A frame without annotation is kept, because tracking needs consecutive frames, but has no true pose.
+Camera frames have OpenGL axes, and the centre of the first pixel is (0, 0).
 """
 
 from dataclasses import replace
@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from tumble.datasets import _pictures, _unpickle
-from tumble.datasets.folder import three_valued
+from tumble.datasets import _images, _unpickle
+from tumble.datasets.folder import decode_nonempty_mask
 from tumble.io import BadFile, files
 from tumble.maths import SE3, SO3
 from tumble.scene import (
@@ -33,80 +33,80 @@ from tumble.scene import (
     Trajectory,
     Truth,
     mask_from_alpha,
-    no_views,
     opengl_from_opencv,
+    truth_without_views,
 )
 
 LAYOUT = "SEQUENCE/rgb/0000.jpg and SEQUENCE/meta/0000.pkl of HO3D v2 or v3, with masks as SEQUENCE/masks/0000.png"
-WRONG_AFTER = {"ABF12": 1135, "ABF14": 1135}
-"""Last frame of a sequence whose annotation is right: the dataset's known mistakes."""
+LAST_VALID_FRAME = {"ABF12": 1135, "ABF14": 1135}
+"""Last frame with a correct annotation, for sequences with known errors in the dataset."""
 
 
 def recognises(path: Path) -> bool:
-    """Whether a path is a sequence of HO3D."""
+    """Whether a path is an HO3D sequence."""
     return (path / "rgb").is_dir() and (path / "meta").is_dir()
 
 
 def load(path: Path | str) -> Capture:
-    """The frames of a sequence that have a mask, without poses; of the annotation only the camera is looked at.
+    """The frames of a sequence that have a mask, without poses; of the annotation only the camera matrix is used.
 
     Raises:
-        BadFile: A file is missing or broken, or no mask says where the object is.
+        BadFile: A file is missing or broken, or there is no mask.
     """
     root = Path(path)
-    pictures = _list(root)
-    masked = ((picture, mask) for picture in pictures if (mask := _mask(root, picture)) is not None)
-    return _pictures.capture(root, masked, _camera(root, pictures), "camera")
+    images = _list_images(root)
+    masked = ((image, mask) for image in images if (mask := _mask(root, image)) is not None)
+    return _images.build_capture(root, masked, _camera(root, images), "camera")
 
 
 def load_truth(path: Path | str) -> Truth | None:
-    """The annotated poses of a sequence, YCB object frame, in metres; None when there are none.
+    """Annotated poses of a sequence, in the YCB object frame [metres]; None if there are none.
 
     Raises:
         BadFile: A file is missing or broken.
     """
     root = Path(path)
-    pictures = _list(root)
-    motions = {p.name: motion for p in pictures if (motion := _motion(root, p)) is not None}
-    if not motions:
+    images = _list_images(root)
+    poses = {p.name: pose for p in images if (pose := _pose(root, p)) is not None}
+    if not poses:
         return None
-    turns, positions = (torch.from_numpy(np.stack(values)) for values in zip(*motions.values(), strict=True))
-    T_gl_obj = SE3.from_rotation(SO3.exp(turns), positions)
-    T_cam_obj = SE3.from_rotation_matrix(opengl_from_opencv(turns)) @ T_gl_obj
+    rotations, positions = (torch.from_numpy(np.stack(values)) for values in zip(*poses.values(), strict=True))
+    T_gl_obj = SE3.from_rotation(SO3.exp(rotations), positions)
+    T_cam_obj = SE3.from_rotation_matrix(opengl_from_opencv(rotations)) @ T_gl_obj
     return replace(
-        no_views(_camera(root, pictures)),
+        truth_without_views(_camera(root, images)),
         poses=Trajectory(SE3(T_cam_obj.wxyz.float(), T_cam_obj.xyz.float()), "camera"),
-        pose_names=tuple(motions),
+        pose_names=tuple(poses),
         units="m",
         setting="handheld",
     )
 
 
-def _list(root: Path) -> list[Path]:
-    """The photographs, in order."""
+def _list_images(root: Path) -> list[Path]:
+    """Image files of a sequence, sorted."""
     if not recognises(root):
-        raise BadFile(root, "is not a sequence of HO3D", LAYOUT)
-    pictures = sorted(p for p in (root / "rgb").iterdir() if p.suffix in (".jpg", ".png"))
-    if not pictures:
-        raise BadFile(root / "rgb", "holds no .jpg and no .png")
-    if odd := [p for p in pictures if not p.stem.isdecimal()]:
-        raise BadFile(odd[0], "is not named by its number", "HO3D counts frames as 0000, 0001, ...")
-    return pictures
+        raise BadFile(root, "is not an HO3D sequence", f"expected {LAYOUT}")
+    images = sorted(p for p in (root / "rgb").iterdir() if p.suffix in (".jpg", ".png"))
+    if not images:
+        raise BadFile(root / "rgb", "has no .jpg or .png files")
+    if misnamed := [p for p in images if not p.stem.isdecimal()]:
+        raise BadFile(misnamed[0], "is not named by a number", "HO3D names frames 0000, 0001, ...")
+    return images
 
 
 # Annotation -----------------------------------------------------------------------------------------------------------
 
 
-def _meta(root: Path, picture: Path) -> dict[str, Any]:
-    path = root / "meta" / f"{picture.stem}.pkl"
+def _meta(root: Path, image: Path) -> dict[str, Any]:
+    path = root / "meta" / f"{image.stem}.pkl"
     meta = _unpickle.read(path)
     if not isinstance(meta, dict):
-        raise BadFile(path, f"holds a {type(meta).__name__}, not a dictionary")
+        raise BadFile(path, f"contains a {type(meta).__name__}, not a dictionary")
     return meta
 
 
 def _array(path: Path, meta: dict[str, Any], name: str, size: int) -> np.ndarray | None:
-    """The numbers under a name, flat; None where the annotation is null or absent."""
+    """The flattened numbers of an entry; None if it is null or missing."""
     values = meta.get(name)
     if values is None:
         return None
@@ -115,56 +115,56 @@ def _array(path: Path, meta: dict[str, Any], name: str, size: int) -> np.ndarray
     return values.astype(np.float64).ravel()
 
 
-def _camera(root: Path, pictures: list[Path]) -> Camera:
-    """One camera took the sequence; frames without annotation do not tell which."""
-    for picture in pictures:
-        if (K := _array(picture, _meta(root, picture), "camMat", 9)) is not None:
-            return _pictures.camera(K.reshape(3, 3), pictures[0])
-    raise BadFile(root / "meta", 'has no frame with a camera, "camMat"')
+def _camera(root: Path, images: list[Path]) -> Camera:
+    """The camera of the sequence, from the first frame that has a camera matrix."""
+    for image in images:
+        if (K := _array(image, _meta(root, image), "camMat", 9)) is not None:
+            return _images.opencv_camera(K.reshape(3, 3), images[0])
+    raise BadFile(root / "meta", 'has no frame with the camera matrix "camMat"')
 
 
-def _motion(root: Path, picture: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rotation vector and position of the object before the OpenGL camera; None without annotation."""
-    if int(picture.stem) > WRONG_AFTER.get(root.name, int(picture.stem)):
+def _pose(root: Path, image: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotation vector and position of the object in the OpenGL camera frame; None without annotation."""
+    if int(image.stem) > LAST_VALID_FRAME.get(root.name, int(image.stem)):
         return None
-    meta = _meta(root, picture)
-    turn, position = (_array(picture, meta, name, 3) for name in ("objRot", "objTrans"))
-    return None if turn is None or position is None else (turn, position)
+    meta = _meta(root, image)
+    rotation, position = (_array(image, meta, name, 3) for name in ("objRot", "objTrans"))
+    return None if rotation is None or position is None else (rotation, position)
 
 
 # Masks ----------------------------------------------------------------------------------------------------------------
 
 
-def _mask(root: Path, picture: Path) -> UInt8[np.ndarray, "h w"] | None:
-    """Where the object is in one frame; None where nothing says so, or it is nowhere."""
-    own = root / "masks" / f"{picture.stem}.png"
-    tracked = root.parent.parent / "masks_XMem"
-    seg = root / "seg" / f"{picture.stem}.png"
+def _mask(root: Path, image: Path) -> UInt8[np.ndarray, "h w"] | None:
+    """Mask of one frame; None if there is none, or if it contains no object."""
+    mask_file = root / "masks" / f"{image.stem}.png"
+    xmem = root.parent.parent / "masks_XMem"
+    seg = root / "seg" / f"{image.stem}.png"
     mask = None
-    if own.exists():
-        values = files.read_image(own)[..., 0]
-        mask = three_valued(values, own) if values.any() else values
-    elif (path := tracked / root.name / f"{int(picture.stem):05}.png").exists():
-        hand = tracked / f"{root.name}_hand" / f"{int(picture.stem):04}.png"
+    if mask_file.exists():
+        values = files.read_image(mask_file)[..., 0]
+        mask = decode_nonempty_mask(values, mask_file) if values.any() else values
+    elif (path := xmem / root.name / f"{int(image.stem):05}.png").exists():
+        hand = xmem / f"{root.name}_hand" / f"{int(image.stem):04}.png"
         mask = _from_parts(files.read_image(path), files.read_image(hand) if hand.exists() else None)
     elif seg.exists():
-        mask = _from_colours(files.read_image(seg), picture)
+        mask = _from_colours(files.read_image(seg), image)
     return mask if mask is not None and (mask == OBJECT).any() else None
 
 
 def _from_parts(
     object_: UInt8[np.ndarray, "h w c"], hand: UInt8[np.ndarray, "h w d"] | None
 ) -> UInt8[np.ndarray, "h w"]:
-    held = np.zeros_like(object_[..., 0]) if hand is None else hand[..., :3].max(-1)
-    return np.select([object_[..., :3].max(-1) > 0, held > 0], [OBJECT, UNKNOWN], 0).astype(np.uint8)
+    is_hand = np.zeros_like(object_[..., 0]) if hand is None else hand[..., :3].max(-1)
+    return np.select([object_[..., :3].max(-1) > 0, is_hand > 0], [OBJECT, UNKNOWN], 0).astype(np.uint8)
 
 
-def _from_colours(seg: UInt8[np.ndarray, "h w c"], picture: Path) -> UInt8[np.ndarray, "H W"]:
-    """Green as object, blue as unknown, both enlarged to the picture's size; what lies between is unknown."""
+def _from_colours(seg: UInt8[np.ndarray, "h w c"], image: Path) -> UInt8[np.ndarray, "H W"]:
+    """Mask at the image's size from a colour segmentation: green is object; blue and mixed pixels are unknown."""
     if seg.shape[2] < 3:
-        raise BadFile(picture, "has a segmentation without colours", "green is object, blue is hand")
-    height, width = files.image_size(picture)
-    # Pixels are areas for cv2.resize: it keeps their edges where they are.
+        raise BadFile(image, "has a segmentation without colours", "green must be the object, blue the hand")
+    height, width = files.image_size(image)
+    # cv2.resize treats pixels as areas, so the borders of the image stay aligned.
     large = cv2.resize(seg[..., 1:3], (width, height), interpolation=cv2.INTER_LINEAR)
     mask = mask_from_alpha(large[..., 0])
     return np.where((large[..., 1] > 5) & (mask != OBJECT), np.uint8(UNKNOWN), mask)

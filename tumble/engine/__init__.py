@@ -1,6 +1,6 @@
-"""How a stage is trained and kept: the one training loop, Adam over named leaves, run directories.
+"""Training of stages: the training loop with checkpoints, Adam over named parameters, run directories.
 
-Knows stages, configurations and trees of tensors, and nothing of what they mean.
+It works on generic stages, configurations and trees of tensors.
 """
 
 from tumble.engine import loop, optim, run

@@ -1,11 +1,11 @@
-"""Trees of leaves under one Adam: rates by name, steps that refuse NaN, and rows that come and go while it runs.
+"""Adam over trees of named parameters, with parameters that change their shape during training.
 
-A *leaf* is a tensor that training changes; it has the dotted name of tumble.tree. The optimizer has one group per
-leaf: `group["name"]`, `group["base"]` (the rate given at the start) and `group["lr"]` (the rate now). A table of rates
-or factors is read by the longest key that is the leaf's name or a part of it up to a dot; the key "" fits all names.
+A *leaf* is a trainable tensor; it has the dotted name of `tumble.io.tree`. The optimizer has one group per leaf:
+`group["name"]`, `group["base"]` (initial learning rate) and `group["lr"]` (current learning rate). A table of rates or
+factors is read by the longest key that is the leaf's name or a prefix of it up to a dot; the key "" matches all names.
 The *moments* are Adam's running means of the gradient and of its square. *Regrowing* rebuilds leaves row by row
-(Gaussians are born and die), *resampling* rebuilds one leaf on another grid (the light map gets finer); both carry
-the moments along and hand back a new tree, whose leaves are the ones that the optimizer changes from then on.
+(densification and pruning of Gaussians); *resampling* moves one leaf to another grid (a finer environment map). Both
+transfer the moments and return a new tree, whose leaves replace the old ones in the optimizer.
 """
 
 from collections.abc import Callable, Iterable
@@ -21,23 +21,23 @@ from tumble.io import tree as trees
 T = TypeVar("T")
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-"""What torch's Adam calls the running means of the gradient and of its square."""
+"""Keys of the moments in the state of torch's Adam: running means of the gradient and of its square."""
 
 
 class NotFinite(ValueError):
-    """A NaN or an infinity, found before it could spread. The message names the tensor, the step and the state kept."""
+    """Error for a NaN or an infinity; the message holds the tensor, the step and the last valid checkpoint."""
 
     def __init__(self, name: str, step: int, *, part: str = "", state_file: Path | None = None) -> None:
         self.name, self.step, self.part, self.state_file = name, step, part, state_file
         message = f"{part + ' of ' if part else ''}{name} is not finite at step {step}"
-        super().__init__(message + (f"; the last good state is in {state_file}" if state_file else ""))
+        super().__init__(message + (f"; the last valid state is in {state_file}" if state_file else ""))
 
 
 def leaves(tree: T) -> T:
-    """A copy of a tree that can be trained: every float tensor is a leaf of its own, other tensors are plain copies."""
+    """A trainable copy of a tree: every float tensor becomes a leaf, other tensors are plain copies."""
 
     def leaf(x: Tensor) -> Tensor:
-        # Contiguous, so that an uninterrupted run and one restored from disk sum in the same order.
+        # Contiguous, so that a run restored from disk sums in the same order as an uninterrupted one.
         copy = x.detach().clone(memory_format=torch.contiguous_format)
         return copy.requires_grad_(copy.is_floating_point())
 
@@ -47,65 +47,68 @@ def leaves(tree: T) -> T:
 def adam(
     tree: object, rates: dict[str, float], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15
 ) -> torch.optim.Adam:
-    """Adam over the float leaves of a tree, one group each, fused where torch offers that for the device.
+    """Adam over the float leaves of a tree, one group each, with the fused kernel where torch has one for the device.
 
     Args:
-        tree: As `leaves` makes it. Leaves of rate 0 are frozen in place: they get no group and ask for no gradient.
-        rates: Learning rates by leaf name or name prefix, the longest wins.
+        tree: Result of `leaves`. Leaves with rate 0 are frozen in place: they have no group and require no gradient.
+        rates: Learning rates by leaf name or name prefix; the longest matching key counts.
+        betas: Decay rates of Adam's two moments.
+        eps: Adam's constant against division by zero.
 
     Raises:
-        ValueError: A leaf without a rate, a rate without a leaf, or nothing left to train.
+        ValueError: A leaf has no rate, a rate matches no leaf, or all rates are 0.
     """
     named = {name: x for name, x in trees.named_tensors(tree).items() if x.is_floating_point()}
-    found = {name: _longest(name, rates) for name in named}
-    if bare := [name for name, key in found.items() if key is None]:
-        raise ValueError(f"no learning rate for {', '.join(bare)}; there are rates for {', '.join(rates) or 'nothing'}")
-    if idle := [key for key in rates if not any(_fits(key, name) for name in named)]:
-        raise ValueError(f"a learning rate for {', '.join(idle)}, which is no leaf; there are {', '.join(named)}")
+    keys = {name: _longest_match(name, rates) for name in named}
+    if missing := [name for name, key in keys.items() if key is None]:
+        rule = f"no learning rate for {', '.join(missing)}; there are rates for {', '.join(rates) or 'nothing'}"
+        raise ValueError(rule)
+    if unused := [key for key in rates if not any(_matches(key, name) for name in named)]:
+        raise ValueError(f"a learning rate for {', '.join(unused)}, which is no leaf; leaves are {', '.join(named)}")
     groups = []
     for name, leaf in named.items():
-        rate = rates[found[name] or ""]
+        rate = rates[keys[name] or ""]
         leaf.requires_grad_(rate != 0)
         if rate != 0:
             groups.append({"params": [leaf], "lr": rate, "name": name, "base": rate})
     if not groups:
-        raise ValueError("every leaf has rate 0: there is nothing to train")
+        raise ValueError("every leaf has learning rate 0: there is nothing to train")
     try:
         return torch.optim.Adam(groups, betas=betas, eps=eps, fused=True)
-    except RuntimeError:  # This device has no fused kernel.
+    except RuntimeError:  # torch has no fused kernel for this device
         return torch.optim.Adam(groups, betas=betas, eps=eps)
 
 
 def anneal(optimizer: torch.optim.Adam, factor: dict[str, float] | float) -> None:
-    """Set rates to their base times a factor, for schedules. Leaves that no key fits keep the rate they have.
+    """Set learning rates to their initial value times a factor; leaves that match no key keep their current rate.
 
-    A rate of 0 leaves the values alone, but moments go on following the gradient.
+    A rate of 0 freezes the values, but their moments are still updated.
     """
     table = factor if isinstance(factor, dict) else {"": factor}
     for group in optimizer.param_groups:
-        key = _longest(group["name"], table)
+        key = _longest_match(group["name"], table)
         if key is not None:
             group["lr"] = group["base"] * table[key]
 
 
 def descend(loss: Float[Tensor, ""], optimizer: torch.optim.Adam, *, step: int) -> None:
-    """One step down the gradient of `loss`. A leaf that the loss does not reach keeps its value and its moments.
+    """One optimizer step on `loss`; leaves that the loss does not depend on keep their values and moments.
 
     Raises:
-        NotFinite: The loss or a gradient holds NaN or infinity; no leaf has changed.
+        NotFinite: The loss or a gradient holds NaN or infinity; no leaf was changed.
     """
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     gradients = {name: x.grad for name, x in _named_leaves(optimizer) if x.grad is not None}
-    # One number tells whether all is well, so that a device is waited for once per step.
-    size = torch.nn.utils.get_total_norm(list(gradients.values()))
-    if not bool(torch.isfinite(size + loss.detach())):
-        _blame(loss, gradients, step)
+    # One scalar covers all gradients, so that each step waits for the device only once.
+    norm = torch.nn.utils.get_total_norm(list(gradients.values()))
+    if not bool(torch.isfinite(norm + loss.detach())):
+        _raise_if_not_finite(loss, gradients, step)
     optimizer.step()
 
 
-def _blame(loss: Tensor, gradients: dict[str, Tensor], step: int) -> None:
-    """Name the tensor that is not finite; silent when only the norm overflowed."""
+def _raise_if_not_finite(loss: Tensor, gradients: dict[str, Tensor], step: int) -> None:
+    """Raise `NotFinite` for the first tensor that is not finite; there is none if only the norm overflowed."""
     if not torch.isfinite(loss):
         raise NotFinite("the loss", step)
     if name := first_not_finite(gradients.items()):
@@ -113,7 +116,7 @@ def _blame(loss: Tensor, gradients: dict[str, Tensor], step: int) -> None:
 
 
 def first_not_finite(named: Iterable[tuple[str, Tensor]]) -> str | None:
-    """Name of the first tensor that holds NaN or infinity; None when all are finite."""
+    """Name of the first tensor that holds NaN or infinity; None if all are finite."""
     return next((name for name, x in named if not bool(torch.isfinite(x).all())), None)
 
 
@@ -121,25 +124,29 @@ def first_not_finite(named: Iterable[tuple[str, Tensor]]) -> str | None:
 
 
 def regrow(tree: T, optimizer: torch.optim.Adam, index: Int64[Tensor, " m"], fresh: Bool[Tensor, " m"]) -> T:
-    """Gather rows of every leaf of a tree together with their moments: pruning, cloning and splitting in one.
+    """The tree with rows of every leaf gathered together with their moments, for pruning, cloning and splitting.
 
     The caller may edit fresh rows of the new leaves in place, under `torch.no_grad()`.
 
     Args:
-        tree: Leaves that share their first axis, such as Gaussians; may be a part of what the optimizer trains.
-        index: Row of the old leaves that each new row starts from; a row left out is pruned.
-        fresh: New rows that start with moments of zero.
+        tree: Leaves that share their first axis, such as Gaussians; may be a part of the optimizer's parameters.
+        optimizer: Optimizer of the leaves.
+        index: For each new row, the old row that it is copied from; old rows that do not occur are pruned.
+        fresh: New rows whose moments are reset to zero.
+
+    Raises:
+        ValueError: The leaves have different numbers of rows.
     """
     counts = {name: x.shape[0] if x.ndim else 0 for name, x in trees.named_tensors(tree).items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"leaves to regrow need the same number of rows, these have {counts}")
 
-    def gathered(moment: Tensor, which: str) -> Tensor:
+    def gather(moment: Tensor, key: str) -> Tensor:
         rows = moment[index]
         rows[fresh] = 0
         return rows
 
-    return trees.map(lambda leaf: _replaced(leaf, leaf.detach()[index], optimizer, gathered), tree)
+    return trees.map(lambda leaf: _replaced(leaf, leaf.detach()[index], optimizer, gather), tree)
 
 
 def resample(
@@ -150,49 +157,50 @@ def resample(
     *,
     moments: Callable[[Tensor], Tensor] | None = None,
 ) -> T:
-    """Put one leaf on another grid, with its moments; the step count goes on.
+    """The tree with one leaf and its moments moved to another grid; Adam's step count is kept.
 
-    A cell of a grid r times as fine gets 1/r of the gradient. The moments are scaled by that, or Adam would take steps
-    r times too short until it has forgotten the coarse grid, 1 / (1 - beta_2) steps later.
+    A cell of a grid with r times as many cells receives 1/r of the gradient. The moments are scaled accordingly;
+    otherwise Adam's steps would be r times too short for the next 1 / (1 - beta_2) steps.
 
     Args:
-        tree: Holds the leaf; may be a part of what the optimizer trains.
-        name: Of the leaf, in `tree`.
-        fn: From the old values to the new.
-        moments: The same for gradients, where `fn` is not linear.
+        tree: Tree with the leaf; may be a part of the optimizer's parameters.
+        optimizer: Optimizer of the leaf.
+        name: Name of the leaf in `tree`.
+        fn: Map from the old values to the new ones.
+        moments: Map from old gradients to new ones; required if `fn` is not linear.
 
     Raises:
         ValueError: There is no such leaf, or `fn` is not linear and `moments` is missing.
     """
     if name not in (named := trees.named_tensors(tree)):
-        raise ValueError(f"no leaf {name!r}; there are {', '.join(named)}")
+        raise ValueError(f"no leaf {name!r}; leaves are {', '.join(named)}")
     old = named[name]
     values = fn(old.detach()).contiguous()
     if moments is None and not _is_linear(fn, old):
-        raise ValueError(f"the map of {name} is not linear: say with `moments` how gradients move to the new grid")
-    resized, coarser = moments or fn, old.numel() / values.numel()
+        raise ValueError(f"the map of {name} is not linear: pass the map of its gradients as `moments`")
+    resample_moment, ratio = moments or fn, old.numel() / values.numel()
 
-    def carried(moment: Tensor, which: str) -> Tensor:
-        if which == "exp_avg":
-            return coarser * resized(moment).contiguous()
-        return coarser**2 * resized(moment).contiguous().clamp_min(0)  # a map with overshoots would make it negative
+    def transfer(moment: Tensor, key: str) -> Tensor:
+        if key == "exp_avg":
+            return ratio * resample_moment(moment).contiguous()
+        return ratio**2 * resample_moment(moment).contiguous().clamp_min(0)  # interpolation may overshoot below zero
 
-    return trees.map(lambda leaf: _replaced(leaf, values, optimizer, carried) if leaf is old else leaf, tree)
+    return trees.map(lambda leaf: _replaced(leaf, values, optimizer, transfer) if leaf is old else leaf, tree)
 
 
 def overwrite(tree: T, optimizer: torch.optim.Adam | None, values: dict[str, Tensor]) -> T:
-    """The tree with new leaves of the given values, whatever their shapes; moments are dropped (see `unpack`).
+    """The tree with new leaves of the given values and any shapes; moments are reset (see `unpack`).
 
     Raises:
         ValueError: The names of `values` are not those of the tree.
     """
     if (names := list(trees.named_tensors(tree))) != list(values):
-        raise ValueError(f"leaves {', '.join(values)} do not fit the tree of {', '.join(names)}")
-    following = iter(values.values())  # map_tree goes through a tree in the order of its names
+        raise ValueError(f"leaves {', '.join(values)} do not match the tree of {', '.join(names)}")
+    remaining = iter(values.values())  # `tree.map` visits tensors in the order of `tree.named_tensors`
 
     def new(leaf: Tensor) -> Tensor:
-        value = next(following).to(leaf.device, copy=True)
-        return _replaced(leaf, value, optimizer, lambda moment, which: torch.zeros_like(value))
+        value = next(remaining).to(leaf.device, copy=True)
+        return _replaced(leaf, value, optimizer, lambda moment, key: torch.zeros_like(value))
 
     return trees.map(new, tree)
 
@@ -201,23 +209,23 @@ def _replaced(
     leaf: Tensor,
     values: Tensor,
     optimizer: torch.optim.Adam | None,
-    carry: Callable[[Tensor, str], Tensor],
+    transfer: Callable[[Tensor, str], Tensor],
 ) -> Tensor:
-    """A new leaf in place of an old one; the optimizer lets go of the old one. `carry` maps its moments."""
+    """A new leaf that replaces an old one in the optimizer; `transfer` maps each moment, given with its key."""
     new = values.detach().requires_grad_(leaf.requires_grad)
     if optimizer is None or not leaf.requires_grad:
         return new
     group = next((group for group in optimizer.param_groups if group["params"][0] is leaf), None)
     if group is None:
-        raise ValueError("a leaf that the optimizer does not hold: was it replaced before?")
+        raise ValueError("the optimizer does not hold this leaf: pass the tree that the last replacement returned")
     group["params"] = [new]
-    if memory := optimizer.state.pop(leaf, {}):
-        optimizer.state[new] = {key: carry(x, key) if key in MOMENTS else x for key, x in memory.items()}
+    if state := optimizer.state.pop(leaf, {}):
+        optimizer.state[new] = {key: transfer(x, key) if key in MOMENTS else x for key, x in state.items()}
     return new
 
 
 def _is_linear(fn: Callable[[Tensor], Tensor], like: Tensor) -> bool:
-    """Whether twice the values give twice the result, on a ramp."""
+    """Whether `fn` maps twice a ramp to twice the result, a test of linearity."""
     ramp = torch.linspace(-1, 1, like.numel(), dtype=like.dtype, device=like.device).reshape(like.shape)
     return torch.allclose(fn(2 * ramp), 2 * fn(ramp), rtol=1e-4, atol=1e-4)
 
@@ -226,17 +234,17 @@ def _is_linear(fn: Callable[[Tensor], Tensor], like: Tensor) -> bool:
 
 
 def pack(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
-    """All that the optimizer remembers, as `name/exp_avg`, `name/exp_avg_sq`, `name/step` and `name/lr` (float64)."""
+    """The optimizer's state as tensors `name/exp_avg`, `name/exp_avg_sq`, `name/step` and `name/lr` (float64)."""
     packed: dict[str, Tensor] = {}
     for group in optimizer.param_groups:
-        name, memory = group["name"], optimizer.state.get(group["params"][0], {})
+        name, state = group["name"], optimizer.state.get(group["params"][0], {})
         packed[f"{name}/lr"] = torch.tensor(group["lr"], dtype=torch.float64)
-        packed |= {f"{name}/{key}": value for key, value in memory.items()}
+        packed |= {f"{name}/{key}": value for key, value in state.items()}
     return packed
 
 
 def unpack(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
-    """Put back what `pack` took, exactly. The leaves must have their shapes by then.
+    """Restore the state returned by `pack` exactly; the leaves must already have their shapes.
 
     Raises:
         ValueError: The tensors belong to an optimizer of other leaves.
@@ -246,28 +254,28 @@ def unpack(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
         name, _, part = key.rpartition("/")
         given.setdefault(name, {})[part] = value
     if set(given) != (known := {group["name"] for group in optimizer.param_groups}):
-        raise ValueError(f"moments of {', '.join(sorted(given))} do not fit the leaves {', '.join(sorted(known))}")
+        raise ValueError(f"moments of {', '.join(sorted(given))} do not match the leaves {', '.join(sorted(known))}")
     for group in optimizer.param_groups:
-        leaf, memory = group["params"][0], given[group["name"]]
-        group["lr"] = memory.pop("lr").item()
-        if wrong := [key for key in MOMENTS if key in memory and memory[key].shape != leaf.shape]:
-            shapes = f"{list(memory[wrong[0]].shape)}, not {list(leaf.shape)}"
+        leaf, state = group["params"][0], given[group["name"]]
+        group["lr"] = state.pop("lr").item()
+        if wrong := [key for key in MOMENTS if key in state and state[key].shape != leaf.shape]:
+            shapes = f"{list(state[wrong[0]].shape)}, not {list(leaf.shape)}"
             raise ValueError(f"{wrong[0]} of {group['name']} has the shape {shapes}")
-        # Without a fused kernel torch counts steps on the CPU.
-        home = {"step": leaf.device if group["fused"] else torch.device("cpu")}
+        # Without a fused kernel torch keeps the step count on the CPU.
+        devices = {"step": leaf.device if group["fused"] else torch.device("cpu")}
         optimizer.state.pop(leaf, None)
-        if memory:
-            optimizer.state[leaf] = {key: x.to(home.get(key, leaf.device), copy=True) for key, x in memory.items()}
+        if state:
+            optimizer.state[leaf] = {key: x.to(devices.get(key, leaf.device), copy=True) for key, x in state.items()}
 
 
 def _named_leaves(optimizer: torch.optim.Adam) -> list[tuple[str, Tensor]]:
     return [(group["name"], group["params"][0]) for group in optimizer.param_groups]
 
 
-def _fits(key: str, name: str) -> bool:
+def _matches(key: str, name: str) -> bool:
     return key in ("", name) or name.startswith(key + ".")
 
 
-def _longest(name: str, table: Iterable[str]) -> str | None:
-    """The longest key of a table that fits a name; None when no key does."""
-    return max((key for key in table if _fits(key, name)), key=len, default=None)
+def _longest_match(name: str, table: Iterable[str]) -> str | None:
+    """The longest key of a table that matches a name; None if no key does."""
+    return max((key for key in table if _matches(key, name)), key=len, default=None)

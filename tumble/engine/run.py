@@ -1,10 +1,10 @@
-"""A run directory: the recipe, the log, and one folder per stage with what it made.
+"""Run directories: the recipe, the log, and one folder per stage with its output.
 
-    runs/mug/  recipe.json  log.jsonl  1-track/  2-refine/  3-decompose/       while a process works in it: .lock
-    2-refine/  out.safetensors  stage.json                      while it trains: state.safetensors
+    runs/mug/  recipe.json  log.jsonl  1-track/  2-refine/  3-decompose/       while a process uses it: .lock
+    2-refine/  out.safetensors  stage.json                                     during training: state.safetensors
 
-A *key* is a hash of all that decides a result: the stage and its version, its settings, the seed, and the keys of what
-it reads. A stage whose result is there under its key is not run again. Truth never enters a key.
+The *key* of a result is a hash of everything that determines it: the stage and its version, its settings, the seed, and
+the keys of its inputs. A stage whose output is stored under its key is not run again. Ground truth never enters a key.
 """
 
 import contextlib
@@ -31,68 +31,93 @@ from tumble.io import BadFile, files, tree
 T = TypeVar("T")
 
 FORMAT = 2
-"""Of run directories; raised when an older one can no longer be read."""
-RECIPE, LOG, LOCK = "recipe.json", "log.jsonl", ".lock"
+"""Version of the layout of run directories; incremented when older ones can no longer be read."""
+RECIPE = "recipe.json"
+"""Settings of the run and the path of its capture."""
+LOG = "log.jsonl"
+"""Log of the run, one JSON document per line."""
+LOCK = ".lock"
+"""File that is locked while a process uses the run directory."""
 CAPTURE = "capture"
-"""The capture that a film became."""
-TRACK, REFINE, DECOMPOSE = "1-track", "2-refine", "3-decompose"
-"""Folders of the stages."""
-OUT, DONE, CHECKPOINT = "out.safetensors", "stage.json", "state.safetensors"
-"""In the folder of a stage: its output, what made it, and its state while it trains."""
-ASSET, POSES, LIGHT = "asset.safetensors", "poses.json", "light.exr"
-"""The outcome: asset, camera-to-object pose by name of the frame, recovered light."""
-REPORT, SCORES, PREDICTION, RELIT, EXPORT = "report.html", "report.json", "prediction", "relit", "export"
-"""What is made of a finished run."""
-NEUTRAL = tuple(f"{__name__.partition('.')[0]}.{room}" for room in ("engine", "io"))
-"""Rooms whose constants decide no result."""
-CHECKPOINTS = 20
-"""A stage saves at most about this often: one on a GPU makes hundreds of steps in the time a save takes."""
+"""Folder of the capture that was made from a video."""
+TRACK = "1-track"
+"""Folder of stage 1."""
+REFINE = "2-refine"
+"""Folder of stage 2."""
+DECOMPOSE = "3-decompose"
+"""Folder of stage 3."""
+OUT = "out.safetensors"
+"""Output of a stage, in its folder."""
+DONE = "stage.json"
+"""Key, settings and inputs of the output of a stage, in its folder."""
+CHECKPOINT = "state.safetensors"
+"""Checkpoint of a stage during training, in its folder."""
+ASSET = "asset.safetensors"
+"""The recovered asset."""
+POSES = "poses.json"
+"""The recovered camera-to-object poses by frame name."""
+LIGHT = "light.exr"
+"""The recovered environment map."""
+REPORT = "report.html"
+"""Report of a finished run."""
+SCORES = "report.json"
+"""Numbers of the report."""
+PREDICTION = "prediction"
+"""Folder of renderings for evaluation."""
+RELIT = "relit"
+"""Folder of relit renderings."""
+EXPORT = "export"
+"""Folder of exported files."""
+IGNORED_PACKAGES = tuple(f"{__name__.partition('.')[0]}.{name}" for name in ("engine", "io"))
+"""Subpackages whose constants affect no result, only timing and files."""
+MAX_CHECKPOINTS = 20
+"""Approximate maximum number of checkpoints per stage; on a GPU one save takes as long as hundreds of steps."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """An open run directory, or a run that keeps nothing."""
+    """An open run directory, or a run in memory."""
 
     path: Path | None
-    """None: stages are not kept, and cannot be taken up again."""
+    """The run directory; None stores nothing, and the run cannot be resumed."""
     recipe: Any
-    """A frozen dataclass of the stages' settings, with a `seed`."""
+    """A frozen dataclass with the settings of the stages and a `seed`."""
     report: Callable[[Progress], None] | None = None
-    """Called as the stages go on."""
+    """Called with the progress of the stages."""
 
 
 @contextlib.contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Work in a run directory in which no other process works; what a killed one left half-written is cleared away.
+def exclusive_access(path: Path) -> Iterator[None]:
+    """Context with exclusive access to a run directory; partial files of killed processes are removed first.
 
-    The lock is the system's, on a file in the directory: it ends with this process, however that ends.
+    The lock is a system lock on a file in the directory, so that it is released whenever the process ends.
 
     Raises:
-        BadFile: Another process works in it, or it holds something else.
+        BadFile: Another process uses the directory, or it holds something other than a run.
         OSError: The folder cannot be written.
     """
-    _refuse_other(path)
+    _require_run_folder(path)
     if os.name != "posix":
         yield  # other systems lack this kind of lock
         return
-    made = not path.exists()
-    handle = _locked(path)
+    is_new = not path.exists()
+    handle = _acquire_lock(path)
     try:
-        files.sweep(path)
+        files.remove_partial_files(path)
         yield
     finally:
         (path / LOCK).unlink(missing_ok=True)
         os.close(handle)
-        if made and not any(path.iterdir()):
+        if is_new and not any(path.iterdir()):
             path.rmdir()
 
 
-def _locked(path: Path) -> int:
-    """The handle of a run directory's lock, which is this process's alone."""
+def _acquire_lock(path: Path) -> int:
+    """Lock a run directory for this process; returns the handle of the lock file."""
     import fcntl
 
     while True:
-        with files.writing(path / LOCK):
+        with files.describe_write_errors(path / LOCK):
             path.mkdir(parents=True, exist_ok=True)
             handle = os.open(path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -101,12 +126,12 @@ def _locked(path: Path) -> int:
             owner = os.read(handle, 32).decode(errors="replace")
             os.close(handle)
             fix = "wait until it ends, or choose another folder with -o"
-            raise BadFile(path, f"is being worked in by another process, {owner}", fix) from None
+            raise BadFile(path, f"is in use by another process, {owner}", fix) from None
         except OSError:
             return handle  # a file system without locks
-        # The process before this one removes the file before it lets go of the lock.
+        # The previous owner removes the file before it releases the lock, so the lock may be on a removed file.
         if (path / LOCK).exists() and os.path.samestat(os.stat(path / LOCK), os.fstat(handle)):
-            # For people only; a full disk is told of when there is something to keep.
+            # The number only serves the error message above, so a full disk is not an error yet.
             with contextlib.suppress(OSError):
                 os.truncate(handle, 0)
                 os.write(handle, str(os.getpid()).encode())
@@ -122,84 +147,84 @@ def open(
     content: str = "",
     report: Callable[[Progress], None] | None = None,
 ) -> Run:
-    """Take a folder for a run, or go on with the run that is in it. One that has made nothing yet is another's to take.
+    """Create a run directory, or open it to continue the run in it. A run without any results yet is overwritten.
 
     Args:
-        path: The run directory; may exist if it is empty or holds this very run.
-        capture_path: Where the capture comes from.
+        path: The run directory; it may exist if it is empty or holds the same run.
+        capture_path: Path of the capture or video.
         recipe: A frozen dataclass of frozen dataclasses with a `seed`.
-        content: Hash of the capture. Where both runs have one it decides which captures are the same, so that a capture
-            may move; else the path does.
-        report: Called as the stages go on.
+        content: Hash of the capture. If both runs have one, captures are compared by it instead of by path, so that a
+            capture may be moved.
+        report: Called with the progress of the stages.
 
     Raises:
-        BadFile: The folder holds something else, a run of an older format, or one with another recipe or capture; says
-            what differs.
+        BadFile: The folder holds something else, a run of an older format, or a run with another recipe or capture; the
+            message lists the differences.
         OSError: The folder cannot be written.
     """
-    wanted = {
+    requested = {
         "tumble": __version__,
         "format": FORMAT,
         "capture": {"path": str(Path(capture_path).resolve()), "content": content},
         "recipe": _plain(recipe),
     }
     file = path / RECIPE
-    _refuse_other(path)
+    _require_run_folder(path)
     if not file.is_file():
-        files.write_json(file, wanted)
+        files.write_json(file, requested)
         return Run(path, recipe, report)
-    made = any(path.glob("[0-9]-*/*.safetensors"))
-    found = _document(path, of_any_format=not made)
-    compared = ["recipe", "capture.content" if content and _at(found, "capture.content") else "capture.path"]
-    different = [line for name in compared for line in differences(_at(found, name), _at(wanted, name), name)]
-    if different and made:
+    has_results = any(path.glob("[0-9]-*/*.safetensors"))
+    stored = _document(path, of_any_format=not has_results)
+    names = ["recipe", "capture.content" if content and _lookup(stored, "capture.content") else "capture.path"]
+    different = [line for name in names for line in differences(_lookup(stored, name), _lookup(requested, name), name)]
+    if different and has_results:
         rule = f"holds another run: {'; '.join(different)}"
         raise BadFile(path, rule, "choose another folder with -o, or remove this one")
-    if different or not made:
-        files.write_json(file, wanted)
+    if different or not has_results:
+        files.write_json(file, requested)
     return Run(path, recipe, report)
 
 
-def source(path: Path) -> Path:
-    """Where the capture of a run comes from.
+def capture_source(path: Path) -> Path:
+    """Path of the capture or video of a run.
 
     Raises:
-        BadFile: There is no run, or one of an older format.
+        BadFile: The folder holds no run, or a run of an older format.
     """
     return Path(_document(path)["capture"]["path"])
 
 
 def recipe(path: Path) -> dict[str, Any]:
-    """The settings of a run, as JSON has them.
+    """Settings of a run as a JSON document.
 
     Raises:
-        BadFile: There is no run, or one of an older format.
+        BadFile: The folder holds no run, or a run of an older format.
     """
     return _document(path)["recipe"]
 
 
 def _document(path: Path, *, of_any_format: bool = False) -> dict[str, Any]:
-    """What `recipe.json` of a run directory says."""
-    found = files.read_json(path / RECIPE)
-    if not isinstance(found, dict) or not {"capture", "recipe"} <= found.keys():
-        raise BadFile(path / RECIPE, "is no recipe of a run", "choose another folder with -o")
-    if found.get("format") != FORMAT and not of_any_format:
-        rule = f"is a run of format {found.get('format', 1)}, made by another version; this one reads {FORMAT}"
+    """The content of `recipe.json`."""
+    document = files.read_json(path / RECIPE)
+    if not isinstance(document, dict) or not {"capture", "recipe"} <= document.keys():
+        raise BadFile(path / RECIPE, "is not the recipe of a run", "choose another folder with -o")
+    if document.get("format") != FORMAT and not of_any_format:
+        rule = f"is a run of format {document.get('format', 1)}, made by another version; this version reads {FORMAT}"
         raise BadFile(path, rule, "run the capture again, into another folder with -o")
-    return found
+    return document
 
 
 def output(path: Path, folder: str, cls: type[T]) -> T | None:
-    """What a finished stage of a run put out, as a tree of class `cls`; None where it is not there."""
+    """The output of a finished stage as a tree of class `cls`; None if the stage is not finished."""
     file = path / folder / OUT
     return tree.load(cls, file) if file.is_file() else None
 
 
 def asset(path: Path, cls: type[T]) -> T:
-    """The asset of a finished run, as a tree of class `cls`.
+    """The asset of a finished run as a tree of class `cls`.
 
     Raises:
-        BadFile: The run is not finished, or of an older format.
+        BadFile: The run is not finished, or is of an older format.
     """
     if not (path / ASSET).is_file():
         raise BadFile(path, f"has no {ASSET}", "finish the run first: tumble run")
@@ -207,118 +232,121 @@ def asset(path: Path, cls: type[T]) -> T:
     return tree.load(cls, path / ASSET)
 
 
-def _refuse_other(path: Path) -> None:
+def _require_run_folder(path: Path) -> None:
+    """Raise `BadFile` if the path is a file, or a folder that holds something other than a run."""
     if not path.exists():
         return
     if not path.is_dir():
         raise BadFile(path, "is a file", "a run is a folder: choose another with -o")
-    others = [p for p in path.iterdir() if p.name not in (CAPTURE, LOCK) and not p.name.startswith(files.PARTIAL)]
+    names = [p.name for p in path.iterdir()]
+    others = [name for name in names if name not in (CAPTURE, LOCK) and not name.startswith(files.PARTIAL_PREFIX)]
     if others and not (path / RECIPE).is_file():
-        raise BadFile(path, "is there already and is no run", "choose another folder with -o")
+        raise BadFile(path, "exists and is not a run directory", "choose another folder with -o")
 
 
 def stage(
     run: Run, folder: str, stage: loop.Stage, cfg: Any, inputs: Any, input_keys: Sequence[str]
 ) -> tuple[Any, str]:
-    """The output of a stage, from its folder if it is there under its key, else made, stored and read back; its key.
+    """The output of a stage and its key; the stage is only run if no output is stored under its key.
 
-    An interrupted stage goes on from its checkpoint. What comes back was always read from disk, so that a run goes on
-    with the same bits whether it was stopped or not.
+    An interrupted stage is resumed from its checkpoint. The output is always read back from disk, so that interrupted
+    and uninterrupted runs continue with the same bits.
 
     Args:
-        run: Where the results are kept.
-        folder: Of the stage, as `2-refine`: the number orders, the name decides the seed with that of the recipe.
-        stage: The module. The return annotation of its `finish` is the class of the tree it puts out.
-        cfg: Its settings.
-        inputs: What it reads.
-        input_keys: Keys of what it reads: a hash of the capture, keys of earlier stages.
+        run: The run that stores the output.
+        folder: Folder of the stage, such as `2-refine`. Its name after the number and the recipe's seed determine the
+            seed of the stage.
+        stage: The stage module. The return annotation of its `finish` is the class of its output.
+        cfg: Settings of the stage.
+        inputs: Inputs of the stage.
+        input_keys: Keys of the inputs: the hash of the capture, keys of earlier stages.
 
     Raises:
-        NotFinite, BadFile, OSError, KeyboardInterrupt: As `loop.drive`; finished stages are kept.
+        NotFinite, BadFile, OSError, KeyboardInterrupt: See `loop.drive`; finished stages are kept.
     """
     name = folder.partition("-")[2]
     seed = stage_seed(run.recipe.seed, name)
     own_key = key(name, stage, cfg, [*input_keys, f"seed {seed}"])
     if run.path is None:
         return loop.drive(stage, cfg, inputs, seed=seed, report=run.report, name=name), own_key
-    place = run.path / folder
-    if not _is_done(place, own_key):
+    stage_path = run.path / folder
+    if not _is_done(stage_path, own_key):
         log(run, {"name": name, "event": "start", "key": own_key})
-        spent, since = 0.0, time.perf_counter()
+        seconds, since = 0.0, time.perf_counter()
 
         def report(progress: Progress) -> None:
-            nonlocal spent, since
+            nonlocal seconds, since
             log(run, dataclasses.asdict(progress))
-            spent, since = progress.seconds, time.perf_counter()
+            seconds, since = progress.seconds, time.perf_counter()
             if run.report is not None:
                 run.report(progress)
 
-        made = loop.drive(
+        result = loop.drive(
             stage,
             cfg,
             inputs,
             seed=seed,
-            checkpoint=place / CHECKPOINT,
-            every=max(500, stage.length(cfg, inputs) // CHECKPOINTS),
+            checkpoint=stage_path / CHECKPOINT,
+            every=max(500, stage.length(cfg, inputs) // MAX_CHECKPOINTS),
             report=report,
             name=name,
             key=own_key,
         )
         about = {"stage": name, "version": stage.VERSION, "seed": seed, "inputs": list(input_keys)}
-        _store(made, place, {"key": own_key, **about, "config": _plain(cfg)})
-        log(run, {"name": name, "event": "done", "seconds": round(spent + time.perf_counter() - since, 3)})
-    if (place / CHECKPOINT).exists():
-        (place / CHECKPOINT).unlink()  # of a process that was killed right after the last write
-    return tree.load(_output_class(stage), place / OUT, _device(inputs)), own_key
+        _store(result, stage_path, {"key": own_key, **about, "config": _plain(cfg)})
+        log(run, {"name": name, "event": "done", "seconds": round(seconds + time.perf_counter() - since, 3)})
+    if (stage_path / CHECKPOINT).exists():
+        (stage_path / CHECKPOINT).unlink()  # left by a process that was killed directly after `_store`
+    return tree.load(_output_class(stage), stage_path / OUT, _device(inputs)), own_key
 
 
 def key(name: str, stage: loop.Stage, cfg: Any, input_keys: Sequence[str]) -> str:
-    """What decides a stage's result, as a hash."""
+    """Hash of everything that determines the output of a stage."""
     return loop.fingerprint(name, stage.VERSION, cfg, constants(stage), list(input_keys))
 
 
 def constants(stage: Any) -> dict[str, Any]:
-    """The numbers in capitals of a stage's module and of all modules of its package that it leads to.
+    """Numeric constants, by dotted name, of the stage's module and of all modules of the package that it imports.
 
-    They are settings that nobody sets: a result that was made with others is another result. Those of the engine and
-    of what it imports are about time and files, and decide nothing.
+    They are part of the key because a change of any of them changes the result. Modules of `IGNORED_PACKAGES` do not
+    count.
     """
     first = stage if isinstance(stage, ModuleType) else sys.modules[stage.__module__]
     package = first.__name__.partition(".")[0] + "."
-    found: dict[str, Any] = {}
-    seen: set[str] = set()
-    todo = [first]
-    while todo:
-        module = todo.pop()
+    numbers: dict[str, Any] = {}
+    visited: set[str] = set()
+    queue = [first]
+    while queue:
+        module = queue.pop()
         name = module.__name__
-        if name in seen or not name.startswith(package) or name.startswith(NEUTRAL):
+        if name in visited or not name.startswith(package) or name.startswith(IGNORED_PACKAGES):
             continue
-        seen.add(name)
-        # Of a package, what it offers: which other modules of it are loaded is chance.
+        visited.add(name)
+        # Packages count with `__all__` only, because which of their submodules are loaded depends on other imports.
         names = getattr(module, "__all__", ()) if hasattr(module, "__path__") else vars(module)
         for name in names:
             value = vars(module)[name]
             if name.isupper() and _is_number(value):
-                found[f"{module.__name__}.{name}"] = value
+                numbers[f"{module.__name__}.{name}"] = value
             origin = (
                 value if isinstance(value, ModuleType) else sys.modules.get(getattr(value, "__module__", None) or "")
             )
-            todo += [origin] if origin is not None else []
-    return dict(sorted(found.items()))
+            queue += [origin] if origin is not None else []
+    return dict(sorted(numbers.items()))
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value is a number or a tuple of such."""
+    """Whether a value is a number or a (nested) tuple of numbers."""
     return isinstance(value, int | float) or (isinstance(value, tuple) and all(_is_number(part) for part in value))
 
 
 def stage_seed(seed: int, name: str) -> int:
-    """The seed of one stage of a run: stages draw independently, and adding one changes no other's."""
+    """Seed of one stage, derived from the seed of the run and the stage's name only, so that stages are independent."""
     return int.from_bytes(hashlib.sha256(f"{seed} {name}".encode()).digest()[:7], "big")
 
 
 def log(run: Run, record: dict[str, Any]) -> None:
-    """Append a JSON document to the run's log, if it keeps one, with the time.
+    """Append a JSON document with the current time to the log; runs in memory have no log.
 
     Raises:
         OSError: The log cannot be written.
@@ -326,27 +354,28 @@ def log(run: Run, record: dict[str, Any]) -> None:
     if run.path is None:
         return
     line = json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **record})
-    with files.writing(run.path / LOG), (run.path / LOG).open("ab+") as file:
-        # A killed process may have left half a line.
-        whole = not file.tell() or not file.seek(-1, os.SEEK_END) or file.read() == b"\n"
-        file.write(b"" if whole else b"\n")
+    with files.describe_write_errors(run.path / LOG), (run.path / LOG).open("ab+") as file:
+        # A killed process may have left an incomplete last line.
+        complete = not file.tell() or not file.seek(-1, os.SEEK_END) or file.read() == b"\n"
+        file.write(b"" if complete else b"\n")
         file.write(f"{line}\n".encode())
 
 
-def records(path: Path) -> list[dict[str, Any]]:
-    """What the log of a run directory holds; a line that a killed process left half-written does not count."""
+def log_records(path: Path) -> list[dict[str, Any]]:
+    """The records in the log of a run directory, without lines that a killed process left incomplete."""
     lines = (path / LOG).read_text("utf-8", errors="replace").splitlines() if (path / LOG).is_file() else []
-    found = []
+    records = []
     for line in lines:
         with contextlib.suppress(json.JSONDecodeError):
-            found.append(json.loads(line))
-    return [record for record in found if isinstance(record, dict)]
+            records.append(json.loads(line))
+    return [record for record in records if isinstance(record, dict)]
 
 
-# One stage's folder ---------------------------------------------------------------------------------------------------
+# Folder of a stage ----------------------------------------------------------------------------------------------------
 
 
 def _is_done(folder: Path, own_key: str) -> bool:
+    """Whether the folder of a stage holds an output with this key."""
     if not ((folder / OUT).is_file() and (folder / DONE).is_file()):
         return False
     about = files.read_json(folder / DONE)
@@ -354,8 +383,8 @@ def _is_done(folder: Path, own_key: str) -> bool:
 
 
 def _store(output: Any, folder: Path, about: dict[str, Any]) -> None:
-    """Write the output, then its key, then drop the checkpoint: a key never stands beside another's output."""
-    with files.writing(folder / OUT):
+    """Write the output of a stage, then its key, then remove the checkpoint, so that key and output always match."""
+    with files.describe_write_errors(folder / OUT):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DONE).unlink(missing_ok=True)
         tree.save(output, folder / OUT)
@@ -366,15 +395,17 @@ def _store(output: Any, folder: Path, about: dict[str, Any]) -> None:
 def _output_class(stage: loop.Stage) -> type:
     returned = getattr(stage.finish, "__annotations__", {}).get("return")
     if not dataclasses.is_dataclass(returned) or not isinstance(returned, type):
-        raise TypeError(f"finish needs a dataclass as its return annotation, not {returned!r}")
+        raise TypeError(f"the return annotation of `finish` must be a dataclass, not {returned!r}")
     return returned
 
 
 def _device(inputs: Any) -> torch.device:
+    """Device of the first tensor in the inputs; the CPU if there is none."""
     return next((x.device for x in _tensors(inputs)), torch.device("cpu"))
 
 
 def _tensors(inputs: Any) -> Iterator[Tensor]:
+    """All tensors in a tree or in nested tuples and lists of trees."""
     for part in inputs if isinstance(inputs, tuple | list) else [inputs]:
         yield from _tensors(part) if isinstance(part, tuple | list) else tree.named_tensors(part).values()
 
@@ -383,19 +414,20 @@ def _tensors(inputs: Any) -> Iterator[Tensor]:
 
 
 def _plain(recipe: Any) -> Any:
-    """A recipe as it comes back from JSON."""
-    # Infinity is null in a JSON file.
+    """A recipe as it is read back from JSON, where infinity is null."""
     return json.loads(json.dumps(dataclasses.asdict(recipe), default=str), parse_constant=lambda word: None)
 
 
-def _at(document: Any, name: str) -> Any:
+def _lookup(document: Any, name: str) -> Any:
+    """The value with a dotted name in a JSON document; None if there is none."""
     for part in name.split("."):
         document = document.get(part) if isinstance(document, dict) else None
     return document
 
 
-def differences(there: Any, here: Any, name: str) -> list[str]:
-    """One line for each value that differs between two documents, by its dotted name."""
-    if not (isinstance(there, dict) and isinstance(here, dict)):
-        return [] if there == here else [f"{name} is {there!r} there and {here!r} here"]
-    return [line for k in {**there, **here} for line in differences(there.get(k), here.get(k), f"{name}.{k}")]
+def differences(stored: Any, requested: Any, name: str) -> list[str]:
+    """One line of text, with the dotted name, for each value that differs between two JSON documents."""
+    if not (isinstance(stored, dict) and isinstance(requested, dict)):
+        return [] if stored == requested else [f"{name} is {stored!r} in the folder, {requested!r} was requested"]
+    keys = {**stored, **requested}
+    return [line for k in keys for line in differences(stored.get(k), requested.get(k), f"{name}.{k}")]

@@ -1,15 +1,15 @@
-"""How good a prediction is: metrics, the prediction of an asset, scores against truth, and a sheet of pictures."""
+"""Evaluation against ground truth: metrics, rendering of an asset's prediction folder, scores and a contact sheet."""
 
 from tumble.evaluation import metrics
-from tumble.evaluation.evaluate import Report, Subject, read_subject, score
+from tumble.evaluation.evaluate import CaptureWithTruth, Report, read_with_truth, score
 from tumble.evaluation.render_prediction import align_views, predict_views
 
 __all__ = [
+    "CaptureWithTruth",
     "Report",
-    "Subject",
     "align_views",
     "metrics",
     "predict_views",
-    "read_subject",
+    "read_with_truth",
     "score",
 ]

@@ -1,7 +1,7 @@
-"""A picture sheet: rows of small pictures under headings, with captions, a table above and wide strips below.
+"""Contact sheet: rows of small images with captions under column headings, a table above them, wide strips below.
 
-A *tile* is one picture with its caption; a *group* is a run of columns under one heading. All pictures are sRGB code
-values; everything is drawn with the font that comes with Pillow, so a sheet looks the same on every machine.
+A *tile* is one image with its caption; a *group* is a set of neighbouring columns under one heading. All images are
+8-bit sRGB. All text uses the font that comes with Pillow, so a sheet is the same on every machine.
 """
 
 from collections.abc import Sequence
@@ -12,100 +12,124 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-PAGE, PANEL, TEXT, FAINT = (22, 24, 29), (43, 46, 54), (236, 238, 242), (150, 156, 168)
-"""Colours of the page, of empty places, of words and of lesser words."""
-SIDE, GAP, CAPTION = 144, 4, 20
-"""Side of a tile, space between tiles, height of the caption under a tile [pixels]."""
-MARGIN, LABEL, GROUP_GAP, LINE, LEAST_WIDTH = 24, 104, 20, 24, 1200
-"""Space around the page, width of the row labels, space between groups, height of a line of words, and the width of
-a page with little on it [pixels]."""
+PAGE_COLOUR = (22, 24, 29)
+"""Background of the sheet [sRGB]."""
+PANEL_COLOUR = (43, 46, 54)
+"""Background of tiles without an image, and of error maps outside the mask [sRGB]."""
+TEXT_COLOUR = (236, 238, 242)
+"""Colour of titles, labels and values [sRGB]."""
+MUTED_COLOUR = (150, 156, 168)
+"""Colour of captions, column headings and notes [sRGB]."""
+TILE_SIDE = 144
+"""Side of a tile [pixels]."""
+TILE_GAP = 4
+"""Space between tiles [pixels]."""
+CAPTION_HEIGHT = 20
+"""Height of the caption under a tile [pixels]."""
+MARGIN = 24
+"""Space around the content of the sheet [pixels]."""
+LABEL_WIDTH = 104
+"""Width of the row labels, left of the first column [pixels]."""
+GROUP_GAP = 20
+"""Space between groups of columns [pixels]."""
+LINE_HEIGHT = 24
+"""Height of one line of text [pixels]."""
+MIN_WIDTH = 1200
+"""Minimum width of a sheet, so that the table fits even if there are few columns of tiles [pixels]."""
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture and what stands under it."""
+    """One image and the caption under it."""
 
     pixels: UInt8[np.ndarray, "h w 3"] | None
-    """None draws an empty place."""
+    """sRGB; None draws an empty tile labelled "absent"."""
     caption: str = ""
 
 
 @dataclass(frozen=True)
 class Group:
-    """A run of columns under one heading."""
+    """Neighbouring columns under one heading."""
 
     heading: str
     columns: tuple[str, ...]
-    scale: str = ""
-    """Where the colours of `heat` end, when the last column shows it: a colour bar from 0 to here is drawn."""
+    max_label: str = ""
+    """Text at the end of a colour bar from 0 to the maximum error, above the last column; "" draws no bar."""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a sheet shows, from top to bottom."""
+    """Content of a sheet, from top to bottom."""
 
     title: str
     subtitle: str
     table: Sequence[Sequence[str]]
-    """Rows of equal length; the first is the heading, the first column names the rows."""
+    """Rows of equal length. The first row is the heading, the first column holds the row names."""
     groups: Sequence[Group]
     rows: Sequence[tuple[str, Sequence[Tile]]]
-    """Each with its label, of which a line break makes two lines, and one tile per column."""
+    """Label (two lines if it contains a line break) and tiles, one per column."""
     strips: Sequence[Tile] = ()
-    """Wide pictures side by side under the rows, twice as wide as high."""
+    """Wide images side by side under the rows, twice as wide as high."""
     remarks: Sequence[str] = ()
-    """Lines to the right of the strips."""
+    """Lines of text to the right of the strips."""
     notes: Sequence[str] = ()
-    """Lines at the foot."""
+    """Lines of text at the bottom."""
 
 
-def heat(error: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], top: float) -> UInt8[np.ndarray, "h w 3"]:
-    """An error map from black (0) through red and yellow to near white (`top` and above); grey off the mask."""
+def heat_map(error: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], top: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Error map in colours: black (0), red, yellow, near white (`top` and above); `PANEL_COLOUR` outside the mask."""
     values = (np.clip(error / top, 0, 1) * 255).round().astype(np.uint8)
     colours = cv2.applyColorMap(values, cv2.COLORMAP_INFERNO)[..., ::-1]
-    return np.where(mask[..., None], colours, np.array(PANEL)).astype(np.uint8)
+    return np.where(mask[..., None], colours, np.array(PANEL_COLOUR)).astype(np.uint8)
 
 
 def draw(sheet: Sheet) -> UInt8[np.ndarray, "h w 3"]:
-    """The sheet as a picture."""
+    """The sheet as an sRGB image."""
     starts = _column_starts(sheet.groups)
-    strips_end = MARGIN + LABEL + len(sheet.strips) * (2 * SIDE + GROUP_GAP)
-    width = max(starts[-1] + SIDE if starts else 0, strips_end, LEAST_WIDTH)
-    tallest = (len(sheet.rows) + 2) * (SIDE + CAPTION + GAP) + (len(sheet.table) + len(sheet.notes) + 12) * LINE
-    page = Image.new("RGB", (width + MARGIN, tallest), PAGE)
+    strips_end = MARGIN + LABEL_WIDTH + len(sheet.strips) * (2 * TILE_SIDE + GROUP_GAP)
+    width = max(starts[-1] + TILE_SIDE if starts else 0, strips_end, MIN_WIDTH)
+    max_height = (len(sheet.rows) + 2) * (TILE_SIDE + CAPTION_HEIGHT + TILE_GAP) + (
+        len(sheet.table) + len(sheet.notes) + 12
+    ) * LINE_HEIGHT
+    page = Image.new("RGB", (width + MARGIN, max_height), PAGE_COLOUR)
     pen = ImageDraw.Draw(page)
     y = _draw_head(pen, sheet)
     y = _draw_table(pen, sheet.table, y, width)
     y = _draw_rows(page, pen, sheet, starts, y)
     y = _draw_foot(page, pen, sheet, y)
     for note in sheet.notes:
-        pen.text((MARGIN, y), note, FAINT, _font(14))
-        y += LINE
+        pen.text((MARGIN, y), note, MUTED_COLOUR, _font(14))
+        y += LINE_HEIGHT
     return np.asarray(page.crop((0, 0, page.width, y + MARGIN // 2)))
 
 
 def _column_starts(groups: Sequence[Group]) -> list[int]:
-    starts, x = [], MARGIN + LABEL
+    starts, x = [], MARGIN + LABEL_WIDTH
     for group in groups:
-        starts += [x + i * (SIDE + GAP) for i in range(len(group.columns))]
-        x += len(group.columns) * (SIDE + GAP) + GROUP_GAP
+        starts += [x + i * (TILE_SIDE + TILE_GAP) for i in range(len(group.columns))]
+        x += len(group.columns) * (TILE_SIDE + TILE_GAP) + GROUP_GAP
     return starts
 
 
 def _draw_head(pen: ImageDraw.ImageDraw, sheet: Sheet) -> int:
-    pen.text((MARGIN, MARGIN - 6), sheet.title, TEXT, _font(24))
-    pen.text((MARGIN, MARGIN + LINE + 6), sheet.subtitle, FAINT, _font(15))
-    return MARGIN + 2 * LINE + 20
+    pen.text((MARGIN, MARGIN - 6), sheet.title, TEXT_COLOUR, _font(24))
+    pen.text((MARGIN, MARGIN + LINE_HEIGHT + 6), sheet.subtitle, MUTED_COLOUR, _font(15))
+    return MARGIN + 2 * LINE_HEIGHT + 20
 
 
 def _draw_table(pen: ImageDraw.ImageDraw, table: Sequence[Sequence[str]], top: int, width: int) -> int:
     for number, row in enumerate(table):
-        step = min(220, (width - MARGIN - LABEL) // max(1, len(row) - 1))
-        for column, word in enumerate(row):
-            x = MARGIN if column == 0 else MARGIN + LABEL + (column - 1) * step
-            faint = number == 0 or column == 0
-            pen.text((x, top + number * LINE), word, FAINT if faint else TEXT, _font(14 if faint else 16))
-    return top + len(table) * LINE + 20
+        step = min(220, (width - MARGIN - LABEL_WIDTH) // max(1, len(row) - 1))
+        for column, cell in enumerate(row):
+            x = MARGIN if column == 0 else MARGIN + LABEL_WIDTH + (column - 1) * step
+            muted = number == 0 or column == 0
+            pen.text(
+                (x, top + number * LINE_HEIGHT),
+                cell,
+                MUTED_COLOUR if muted else TEXT_COLOUR,
+                _font(14 if muted else 16),
+            )
+    return top + len(table) * LINE_HEIGHT + 20
 
 
 def _draw_rows(page: Image.Image, pen: ImageDraw.ImageDraw, sheet: Sheet, starts: list[int], top: int) -> int:
@@ -113,56 +137,56 @@ def _draw_rows(page: Image.Image, pen: ImageDraw.ImageDraw, sheet: Sheet, starts
         return top
     column = 0
     for group in sheet.groups:
-        pen.text((starts[column], top), group.heading, TEXT, _font(17))
+        pen.text((starts[column], top), group.heading, TEXT_COLOUR, _font(17))
         for name in group.columns:
-            pen.text((starts[column], top + LINE), name, FAINT, _font(14))
+            pen.text((starts[column], top + LINE_HEIGHT), name, MUTED_COLOUR, _font(14))
             column += 1
-        if group.scale:
-            _draw_scale(page, pen, group.scale, (starts[column - 1], top + LINE))
-    top += 2 * LINE
+        if group.max_label:
+            _draw_colour_bar(page, pen, group.max_label, (starts[column - 1], top + LINE_HEIGHT))
+    top += 2 * LINE_HEIGHT
     for label, tiles in sheet.rows:
-        pen.multiline_text((MARGIN, top + SIDE // 2 - 18), label, TEXT, _font(15), spacing=6)
+        pen.multiline_text((MARGIN, top + TILE_SIDE // 2 - 18), label, TEXT_COLOUR, _font(15), spacing=6)
         for x, tile in zip(starts, tiles, strict=True):
-            _draw_tile(page, pen, tile, (x, top), (SIDE, SIDE))
-        top += SIDE + CAPTION + GAP
+            _draw_tile(page, pen, tile, (x, top), (TILE_SIDE, TILE_SIDE))
+        top += TILE_SIDE + CAPTION_HEIGHT + TILE_GAP
     return top + 12
 
 
-def _draw_scale(page: Image.Image, pen: ImageDraw.ImageDraw, end: str, corner: tuple[int, int]) -> None:
-    """The colour bar of `heat`, from 0 to `end`, at the right of a column's heading."""
+def _draw_colour_bar(page: Image.Image, pen: ImageDraw.ImageDraw, max_label: str, corner: tuple[int, int]) -> None:
+    """Draw the colour bar of `heat_map`, from 0 to `max_label`, to the right of a column's heading."""
     x, y = corner
-    left, right = x + 52, x + SIDE - 6 - int(pen.textlength(end, _font(13)))
+    left, right = x + 52, x + TILE_SIDE - 6 - int(pen.textlength(max_label, _font(13)))
     bar = np.tile(np.linspace(0, 1, right - left), (8, 1))
-    page.paste(Image.fromarray(heat(bar, np.full(bar.shape, True), 1.0)), (left, y + 6))
-    pen.text((left - 11, y + 1), "0", FAINT, _font(13))
-    pen.text((right + 4, y + 1), end, FAINT, _font(13))
+    page.paste(Image.fromarray(heat_map(bar, np.full(bar.shape, True), 1.0)), (left, y + 6))
+    pen.text((left - 11, y + 1), "0", MUTED_COLOUR, _font(13))
+    pen.text((right + 4, y + 1), max_label, MUTED_COLOUR, _font(13))
 
 
 def _draw_foot(page: Image.Image, pen: ImageDraw.ImageDraw, sheet: Sheet, top: int) -> int:
-    x = MARGIN + LABEL
+    x = MARGIN + LABEL_WIDTH
     for tile in sheet.strips:
-        _draw_tile(page, pen, tile, (x, top), (2 * SIDE, SIDE))
-        x += 2 * SIDE + GROUP_GAP
+        _draw_tile(page, pen, tile, (x, top), (2 * TILE_SIDE, TILE_SIDE))
+        x += 2 * TILE_SIDE + GROUP_GAP
     for number, remark in enumerate(sheet.remarks):
-        pen.text((x, top + number * LINE), remark, FAINT if number else TEXT, _font(15))
-    tallest = max(SIDE + CAPTION if sheet.strips else 0, len(sheet.remarks) * LINE)
-    return top + tallest + 16 if tallest else top
+        pen.text((x, top + number * LINE_HEIGHT), remark, MUTED_COLOUR if number else TEXT_COLOUR, _font(15))
+    height = max(TILE_SIDE + CAPTION_HEIGHT if sheet.strips else 0, len(sheet.remarks) * LINE_HEIGHT)
+    return top + height + 16 if height else top
 
 
 def _draw_tile(
     page: Image.Image, pen: ImageDraw.ImageDraw, tile: Tile, corner: tuple[int, int], size: tuple[int, int]
 ) -> None:
     x, y = corner
-    pen.rectangle((x, y, x + size[0] - 1, y + size[1] - 1), PANEL if tile.pixels is None else (0, 0, 0))
+    pen.rectangle((x, y, x + size[0] - 1, y + size[1] - 1), PANEL_COLOUR if tile.pixels is None else (0, 0, 0))
     if tile.pixels is None:
-        pen.text((x + size[0] // 2, y + size[1] // 2), "absent", FAINT, _font(14), anchor="mm")
+        pen.text((x + size[0] // 2, y + size[1] // 2), "absent", MUTED_COLOUR, _font(14), anchor="mm")
     else:
-        picture = Image.fromarray(tile.pixels)
-        factor = min(size[0] / picture.width, size[1] / picture.height)
-        fitted = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
-        how = Image.Resampling.LANCZOS if factor < 1 else Image.Resampling.NEAREST
-        page.paste(picture.resize(fitted, how), (x + (size[0] - fitted[0]) // 2, y + (size[1] - fitted[1]) // 2))
-    pen.text((x, y + size[1] + 2), tile.caption, FAINT, _font(13))
+        image = Image.fromarray(tile.pixels)
+        factor = min(size[0] / image.width, size[1] / image.height)
+        fitted = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
+        resampling = Image.Resampling.LANCZOS if factor < 1 else Image.Resampling.NEAREST
+        page.paste(image.resize(fitted, resampling), (x + (size[0] - fitted[0]) // 2, y + (size[1] - fitted[1]) // 2))
+    pen.text((x, y + size[1] + 2), tile.caption, MUTED_COLOUR, _font(13))
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

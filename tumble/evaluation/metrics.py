@@ -1,8 +1,8 @@
-"""How far a reconstruction is from the truth; docs/metrics.md says of each number how others measure it.
+"""Metrics of a reconstruction against ground truth; docs/metrics.md compares each with its published variants.
 
-*Foreground* pixels surely show the object; *counted* pixels are those a metric looks at, `UNKNOWN` ones never among
-them. *fg* in a metric's name: over the foreground of one view; *full*: over the whole picture; *crop*: over the
-foreground's bounding box. Pictures are in [0, 1]; "linear" and "srgb" say in which space they are compared.
+*Foreground* pixels show the object for certain. *Valid* pixels are those with a known mask, that is, all but `UNKNOWN`
+ones. In names of metrics, *fg* means over the foreground of one view, *full* over the whole image, and *crop* over the
+foreground's bounding box. Images are in [0, 1]; "linear" and "srgb" name the colour space of the comparison.
 """
 
 import math
@@ -30,71 +30,73 @@ from tumble.maths import (
 from tumble.maths import iou as mask_iou
 from tumble.scene import Environment, Trajectory
 
-BEST_PSNR = 100.0
-"""What equal pictures score [dB]: an infinite number has no mean and no place in JSON."""
-DARK_TRUTH, DARK_PREDICTION = 0.02, 1e-4
-"""Albedo under which a pixel says nothing about the scale: its ratio is noise, or has no denominator."""
+MAX_PSNR = 100.0
+"""PSNR of equal images [dB]: infinity has no mean and cannot be written as JSON."""
+MIN_TRUE_ALBEDO = 0.02
+"""True albedo below which a pixel is left out of the albedo scale [linear]: its ratio is mostly noise."""
+MIN_PREDICTED_ALBEDO = 1e-4
+"""Predicted albedo below which a pixel is left out of the albedo scale [linear]: it is the ratio's denominator."""
 CROP_MARGIN = 10
-"""Pixels around the foreground's bounding box: every window of SSIM (11 x 11) that touches the object is inside."""
-NO_NORMAL = 0.5
-"""Length under which a predicted normal is missing; it then counts as 90 degrees off, the mean of random guesses."""
+"""Margin around the foreground's bounding box [pixels]: contains every 11 x 11 window of SSIM that overlaps it."""
+MIN_NORMAL_LENGTH = 0.5
+"""Length below which a predicted normal counts as missing; its error is then 90 degrees, the mean of random normals."""
 LIGHT_GRID = (32, 64)
-"""Both light maps are compared on this grid, so that maps of different sizes have comparable errors."""
-BRIGHTEST = 10.0
-"""Radiance at which both lights are clipped: one lamp of a thousand must not be the whole error."""
+"""Rows and columns to which both light maps are resampled, so that errors of maps of any size are comparable."""
+MAX_RADIANCE = 10.0
+"""Radiance at which both light maps are clipped, so that one small bright lamp does not dominate the error."""
 LOG_FLOOR = 1e-3
-"""Share of the true light's mean luminance under which a texel counts as black in logarithms."""
-TRACKED = 10.0
-"""Rotation error under which a frame counts as tracked [degrees]."""
-LEAST_SPREAD = 0.01
-"""Second over first singular value of the camera positions under which they count as a line: errors of one percent of
-its length would turn the aligned path about it at will."""
-REWEIGHTED = 20
-"""Rounds of reweighting towards least absolute errors."""
-EXACT = 2e-3
-"""Error under which all frames count the same [radians, share of the distance]."""
+"""Floor of the luminance before the logarithm [fraction of the true light's mean luminance]."""
+TRACKED_DEGREES = 10.0
+"""Rotation error below which a frame counts as tracked [degrees]."""
+MIN_SPREAD = 0.01
+"""Minimum ratio of singular values for a determined alignment: below it camera positions count as collinear, and errors
+of one percent of the path's length would rotate the aligned path about that line arbitrarily."""
+IRLS_ROUNDS = 20
+"""Iterations of reweighted least squares towards a fit of least absolute errors."""
+IRLS_FLOOR = 2e-3
+"""Residual added in the weights of reweighted least squares [radians, or fraction of the mean distance]."""
 
 
-# Pictures -------------------------------------------------------------------------------------------------------------
+# Images ---------------------------------------------------------------------------------------------------------------
 
 
-def psnr(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"]) -> float:
-    """Peak signal-to-noise ratio over the counted pixels, for a peak of 1 [dB], at most `BEST_PSNR`.
+def psnr(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> float:
+    """Peak signal-to-noise ratio over the pixels of a mask, for a peak of 1 [dB], at most `MAX_PSNR`.
 
-    NaN where no pixel counts, or one that does is NaN.
+    NaN if the mask is empty or one of its pixels is NaN.
     """
-    error = float((x - y)[counted].square().mean())
-    return math.nan if math.isnan(error) else min(BEST_PSNR, -10 * math.log10(max(error, 1e-30)))
+    error = float((x - y)[mask].square().mean())
+    return math.nan if math.isnan(error) else min(MAX_PSNR, -10 * math.log10(max(error, 1e-30)))
 
 
-def rmse(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counted: Bool[Tensor, "h w"]) -> float:
-    """Root of the mean squared difference over the counted pixels."""
-    return float((x - y)[counted].square().mean().sqrt())
+def rmse(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]) -> float:
+    """Root mean square error over the pixels of a mask."""
+    return float((x - y)[mask].square().mean().sqrt())
 
 
-def iou(x: Bool[Tensor, "h w"], y: Bool[Tensor, "h w"], counted: Bool[Tensor, "h w"]) -> float:
-    """Intersection over union of two silhouettes, among the counted pixels; 1 when both are empty."""
-    return float(mask_iou(x, y, counted)) if bool(((x | y) & counted).any()) else 1.0
+def iou(x: Bool[Tensor, "h w"], y: Bool[Tensor, "h w"], valid: Bool[Tensor, "h w"]) -> float:
+    """Intersection over union of two silhouettes over the valid pixels; 1 if both are empty."""
+    return float(mask_iou(x, y, valid)) if bool(((x | y) & valid).any()) else 1.0
 
 
 def image_scores(
     x: Float[Tensor, "h w 3"],
     y: Float[Tensor, "h w 3"],
     foreground: Bool[Tensor, "h w"],
-    counted: Bool[Tensor, "h w"],
+    valid: Bool[Tensor, "h w"],
     networks: Sequence[lpips.Network],
 ) -> dict[str, float]:
-    """PSNR, SSIM and LPIPS of the picture `x` against the true `y`, both sRGB over black.
+    """PSNR, SSIM and LPIPS of the predicted image `x` against the true image `y`, both sRGB over black.
 
-    Pixels that are not counted are given the true colour before SSIM and LPIPS, which look at neighbourhoods.
+    Invalid pixels get the true colour before SSIM and LPIPS, whose value at a pixel depends on its neighbourhood.
 
     Raises:
-        ValueError: A picture smaller than SSIM's window of 11 x 11 pixels, or an empty foreground.
+        ValueError: An image smaller than SSIM's window of 11 x 11 pixels, or an empty foreground.
     """
-    same = torch.where(counted[..., None], x, y)
+    filled = torch.where(valid[..., None], x, y)
     box = crop_box(foreground, CROP_MARGIN)
-    pairs = {"full": (same, y), "crop": (crop(same, box), crop(y, box))}
-    scores = {"psnr_fg_srgb": psnr(x, y, foreground), "psnr_full_srgb": psnr(x, y, counted)}
+    pairs = {"full": (filled, y), "crop": (crop(filled, box), crop(y, box))}
+    scores = {"psnr_fg_srgb": psnr(x, y, foreground), "psnr_full_srgb": psnr(x, y, valid)}
     scores |= {f"ssim_{part}_srgb": float(ssim(*pair)) for part, pair in pairs.items()}
     for network in networks:
         for part, pair in pairs.items():
@@ -110,18 +112,18 @@ def albedo_scale(
 ) -> Float[Tensor, "3"]:
     """Per channel, the median of truth / prediction over the foreground of all evaluation views (linear albedo).
 
-    Multiply the predicted albedo by it before any metric and before relighting, and divide the light by it: the light's
-    strength and colour cannot be told from the albedo's. A channel in which every pixel is darker than `DARK_TRUTH` or
-    `DARK_PREDICTION` takes the geometric mean of the other channels.
+    Images determine the product of albedo and light only. So the predicted albedo is multiplied by this scale before
+    any metric and before relighting, and the predicted light is divided by it. A channel in which every pixel is below
+    `MIN_TRUE_ALBEDO` or `MIN_PREDICTED_ALBEDO` takes the geometric mean of the other channels.
 
     Raises:
-        ValueError: No pixel is bright enough in both, in any channel.
+        ValueError: No pixel of any channel reaches both limits.
     """
-    usable = mask[..., None] & (truth >= DARK_TRUTH) & (predicted >= DARK_PREDICTION)
+    usable = mask[..., None] & (truth >= MIN_TRUE_ALBEDO) & (predicted >= MIN_PREDICTED_ALBEDO)
     ratios = [(truth[..., c] / predicted[..., c])[usable[..., c]] for c in range(3)]
     if not any(len(r) for r in ratios):
-        raise ValueError("no foreground pixel has an albedo to compare: the prediction, or the truth, is black")
-    # torch.median takes the lower of two middle values; the mean of both treats prediction and truth alike.
+        raise ValueError("no foreground pixel has an albedo to compare: the prediction or the truth is black")
+    # torch.median returns the lower of two middle values; their mean treats prediction and truth alike.
     medians = [0.5 * (r.median() - (-r).median()) if len(r) else r.new_tensor(math.nan) for r in ratios]
     scale = torch.stack(medians)
     return scale.where(~scale.isnan(), scale[~scale.isnan()].log().mean().exp())
@@ -133,31 +135,31 @@ def albedo_scores(
     silhouette: Bool[Tensor, "h w"],
     scale: Float[Tensor, "3"],
     foreground: Bool[Tensor, "h w"],
-    counted: Bool[Tensor, "h w"],
+    valid: Bool[Tensor, "h w"],
     networks: Sequence[lpips.Network],
 ) -> dict[str, float]:
     """Scores of a linear albedo map, multiplied by `scale` and clipped to [0, 1], in linear values and as sRGB.
 
-    Over the foreground the map counts as it is, elsewhere as a picture within the predicted `silhouette`. A map that
-    ends with the silhouette would pay for every pixel that this one misses with a black albedo: of the bottle of the
-    benchmark one in a thousand, as much as all other errors together; the silhouette has a score of its own.
+    Foreground metrics use the map as it is; all others use it masked by the predicted `silhouette`. If foreground
+    metrics used the masked map too, every pixel missing from the silhouette would count as black albedo; the
+    silhouette has a metric of its own.
     """
     scaled, unscaled, truth = (a.clamp(0, 1) for a in (predicted * scale, predicted, truth))
-    shown = scaled * silhouette[..., None]
+    masked = scaled * silhouette[..., None]
     return {
-        **image_scores(srgb_from_linear(shown), srgb_from_linear(truth), foreground, counted, networks),
+        **image_scores(srgb_from_linear(masked), srgb_from_linear(truth), foreground, valid, networks),
         "psnr_fg_srgb": psnr(srgb_from_linear(scaled), srgb_from_linear(truth), foreground),
         "psnr_fg_linear": psnr(scaled, truth, foreground),
-        "psnr_full_linear": psnr(shown, truth, counted),
+        "psnr_full_linear": psnr(masked, truth, valid),
         "psnr_fg_linear_unscaled": psnr(unscaled, truth, foreground),
     }
 
 
 def normal_angles(predicted: Float[Tensor, "*b 3"], truth: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Angles between normals of any length [degrees]; 90 where the predicted one is shorter than `NO_NORMAL`."""
+    """Angles between normals of any length [degrees]; 90 where the predicted one is under `MIN_NORMAL_LENGTH`."""
     sine = torch.linalg.vector_norm(torch.linalg.cross(predicted, truth), dim=-1)
     angles = torch.rad2deg(torch.atan2(sine, (predicted * truth).sum(-1)))
-    missing = torch.linalg.vector_norm(predicted, dim=-1) < NO_NORMAL
+    missing = torch.linalg.vector_norm(predicted, dim=-1) < MIN_NORMAL_LENGTH
     return angles.masked_fill(missing, 90.0)
 
 
@@ -165,15 +167,15 @@ def normal_scores(
     predicted: Float[Tensor, "h w 3"],
     truth: Float[Tensor, "h w 3"],
     foreground: Bool[Tensor, "h w"],
-    counted: Bool[Tensor, "h w"],
+    valid: Bool[Tensor, "h w"],
 ) -> dict[str, float]:
-    """Mean and median angle over the foreground, and the mean over all counted pixels with 0 on the background."""
-    known = foreground & (torch.linalg.vector_norm(truth, dim=-1) > NO_NORMAL)
+    """Mean and median angle over the foreground, and the mean over all valid pixels with 0 for the background."""
+    known = foreground & (torch.linalg.vector_norm(truth, dim=-1) > MIN_NORMAL_LENGTH)
     angles = normal_angles(predicted, truth)[known]
     return {
         "mean_fg_degrees": float(angles.mean()),
         "median_fg_degrees": float(angles.quantile(0.5)),
-        "mean_all_degrees": float(angles.sum() / counted.sum()),
+        "mean_all_degrees": float(angles.sum() / valid.sum()),
     }
 
 
@@ -181,15 +183,15 @@ def normal_scores(
 
 
 def light_scores(predicted: Environment, truth: Environment, scale: Float[Tensor, "3"]) -> dict[str, float | None]:
-    """Errors of a light map after division by the albedo's `scale`, on a grid of `LIGHT_GRID`; both in one frame.
+    """Errors of a light map, divided by the albedo `scale` and resampled to `LIGHT_GRID`; both maps in one frame.
 
-    The root mean square is over radiance clipped at `BRIGHTEST`, weighted by solid angle, and once unweighted. The
-    correlation is of the logarithms of unclipped luminance, weighted by solid angle; None when a light is uniform.
+    Root mean square error of radiance clipped at `MAX_RADIANCE`, weighted by solid angle and unweighted, and the
+    Pearson correlation of log luminance, unclipped and weighted by solid angle; None if one of the lights is uniform.
     """
     x = predicted.resampled(*LIGHT_GRID).radiance / scale
     y = truth.resampled(*LIGHT_GRID).radiance.to(x)
     weight = texel_solid_angles(*LIGHT_GRID).to(x) / (4 * math.pi)
-    squared = (x.clamp_max(BRIGHTEST) - y.clamp_max(BRIGHTEST)).square().mean(-1)
+    squared = (x.clamp_max(MAX_RADIANCE) - y.clamp_max(MAX_RADIANCE)).square().mean(-1)
     luminance = x.new_tensor([0.2126, 0.7152, 0.0722])
     floor = LOG_FLOOR * float((weight * (y @ luminance)).sum())
     log_x, log_y = ((light @ luminance).clamp_min(floor).log() for light in (x, y))
@@ -201,7 +203,7 @@ def light_scores(predicted: Environment, truth: Environment, scale: Float[Tensor
 
 
 def _correlation(x: Tensor, y: Tensor, weight: Tensor) -> float | None:
-    """Pearson's coefficient under weights that sum to 1; None when one of the two does not vary."""
+    """Pearson correlation coefficient under weights with sum 1; None if `x` or `y` is constant."""
     x, y = x - (weight * x).sum(), y - (weight * y).sum()
     spread = ((weight * x * x).sum() * (weight * y * y).sum()).sqrt()
     return float((weight * x * y).sum() / spread) if spread > 1e-8 else None
@@ -212,36 +214,36 @@ def _correlation(x: Tensor, y: Tensor, weight: Tensor) -> float | None:
 
 @dataclass(frozen=True)
 class Similarity:
-    """How the true object frame relates to the predicted one: `x_true = scale R_true_pred x_pred + shift`."""
+    """Similarity transform from the predicted to the true object frame: `x_true = scale R_true_pred x_pred + shift`."""
 
     scale: Float[Tensor, ""]
     """True units per predicted unit."""
     R_true_pred: SO3
     shift: Float[Tensor, "3"]
-    """Where the predicted origin lies in the true object frame [true units]."""
+    """Predicted origin in the true object frame [true units]."""
 
     def to_truth(self, predicted: Trajectory) -> Trajectory:
-        """Predicted poses, in the true object frame and unit."""
+        """Predicted poses, expressed in the true object frame and unit."""
         R_cam_true = predicted.T_cam_obj.rotation @ self.R_true_pred.inverse()
         xyz = self.scale * predicted.T_cam_obj.xyz - R_cam_true @ self.shift
         return Trajectory(SE3(R_cam_true.wxyz, xyz), predicted.light)
 
     def to_prediction(self, truth: Trajectory) -> Trajectory:
-        """True poses, in the predicted object frame and unit: render a reconstruction from these to see true views."""
+        """True poses, expressed in the predicted object frame and unit: those at which a reconstruction is rendered."""
         R_cam_pred = truth.T_cam_obj.rotation @ self.R_true_pred
         xyz = (truth.T_cam_obj.rotation @ self.shift + truth.T_cam_obj.xyz) / self.scale
         return Trajectory(SE3(R_cam_pred.wxyz, xyz), truth.light)
 
 
 def align(predicted: Trajectory, truth: Trajectory) -> Similarity:
-    """The similarity that brings the predicted camera positions closest to the true ones (Umeyama 1991).
+    """The similarity that best maps the predicted camera positions to the true ones (Umeyama 1991).
 
     Raises:
-        ValueError: The positions do not determine it; the message says why.
+        ValueError: The positions do not determine the similarity; the message gives the reason.
     """
     centres = truth.camera_positions
     spread = torch.linalg.svdvals(centres - centres.mean(0))
-    if len(truth) < 3 or spread[1] <= LEAST_SPREAD * spread[0]:
+    if len(truth) < 3 or spread[1] <= MIN_SPREAD * spread[0]:
         raise ValueError("the true camera positions lie nearly on a line (or are fewer than three)")
     try:
         return Similarity(*umeyama(predicted.camera_positions, centres))
@@ -250,37 +252,37 @@ def align(predicted: Trajectory, truth: Trajectory) -> Similarity:
 
 
 def register(predicted: Trajectory, truth: Trajectory) -> Similarity:
-    """The similarity to show true views of a reconstruction with: it fits what cameras see, not where they stand.
+    """The similarity for rendering true views of a reconstruction, fitted to object poses in the camera frame.
 
-    First the rotation, alone; scale and shift then bring the point that the cameras look at nearest to its true place
-    before them. `align` pays for errors of orientation with scale and shift. Both are fits of least absolute errors
-    (reweighted least squares): one frame that looks at the end of a bottle may be wrong by ten degrees, and among sixty
-    shifts a mean by a third of a pixel.
+    The rotation is fitted first and alone. Scale and shift are then fitted so that the point at which the cameras look
+    comes closest to its true position in the camera frame. (`align` fits camera positions and compensates errors of
+    orientation by scale and shift.) Both fits minimise absolute errors, by iteratively reweighted least squares, so
+    that a few wrong frames do not shift all views.
 
     Raises:
-        ValueError: The poses do not determine it: the object hardly turns.
+        ValueError: The object hardly rotates, so that the poses do not determine the similarity.
     """
     R_cam_true, R_cam_pred = truth.T_cam_obj.rotation.matrix(), predicted.T_cam_obj.rotation.matrix()
     relative = truth.T_cam_obj.rotation.inverse() @ predicted.T_cam_obj.rotation
     R_true_pred = mean_rotation(relative)
-    for _ in range(REWEIGHTED):
-        R_true_pred = mean_rotation(relative, 1 / (angle_between(relative, R_true_pred) + EXACT))
-    # Nearest to all optical axes: an error of orientation moves no other point less.
-    across, off = R_cam_pred[:, :2].flatten(0, 1), predicted.T_cam_obj.xyz[:, :2].flatten()
-    x_pred = torch.linalg.lstsq(across, -off[:, None]).solution[:, 0]
+    for _ in range(IRLS_ROUNDS):
+        R_true_pred = mean_rotation(relative, 1 / (angle_between(relative, R_true_pred) + IRLS_FLOOR))
+    # The point nearest to all optical axes: errors of orientation move it least.
+    across, offset = R_cam_pred[:, :2].flatten(0, 1), predicted.T_cam_obj.xyz[:, :2].flatten()
+    x_pred = torch.linalg.lstsq(across, -offset[:, None]).solution[:, 0]
     x_cam = predicted.T_cam_obj @ x_pred
     unit = torch.linalg.vector_norm(x_cam, dim=-1).mean()
-    # scale x_cam = R_cam_true x_true + xyz, in every frame.
+    # Solve scale x_cam = R_cam_true x_true + xyz over all frames.
     columns = torch.cat([x_cam[..., None] / unit, -R_cam_true], -1).flatten(0, 1)
     spread = torch.linalg.svdvals(columns)
-    if spread[3] <= LEAST_SPREAD * spread[0]:
-        raise ValueError("the object hardly turns: its size and its distance cannot be told apart")
-    columns, goal = columns.unflatten(0, (-1, 3)), truth.T_cam_obj.xyz[..., None]
+    if spread[3] <= MIN_SPREAD * spread[0]:
+        raise ValueError("the object hardly rotates, so its size and its distance cannot be separated")
+    columns, target = columns.unflatten(0, (-1, 3)), truth.T_cam_obj.xyz[..., None]
     weight, solution = columns.new_ones(len(columns), 1, 1), columns.new_zeros(4, 1)
-    for _ in range(REWEIGHTED):
-        solution = torch.linalg.lstsq((weight * columns).flatten(0, 1), (weight * goal).flatten(0, 1)).solution
-        off = torch.linalg.vector_norm(columns @ solution - goal, dim=1, keepdim=True)
-        weight = (off / goal.norm(dim=1).mean() + EXACT).rsqrt()
+    for _ in range(IRLS_ROUNDS):
+        solution = torch.linalg.lstsq((weight * columns).flatten(0, 1), (weight * target).flatten(0, 1)).solution
+        residual = torch.linalg.vector_norm(columns @ solution - target, dim=1, keepdim=True)
+        weight = (residual / target.norm(dim=1).mean() + IRLS_FLOOR).rsqrt()
     solution = solution[:, 0]
     scale, x_true = solution[0] / unit, solution[1:]
     return Similarity(scale, R_true_pred, x_true - scale * (R_true_pred @ x_pred))
@@ -290,13 +292,13 @@ def position_scores(aligned: Trajectory, truth: Trajectory, *, tolerance: float,
     """Errors of camera positions in the true object frame, after alignment.
 
     Args:
-        aligned: Predicted poses in the true frame, one for each of `truth`.
-        tolerance: Error at which a frame is worth nothing to the AUC [true units].
-        lost: Frames without a predicted pose; the AUC counts them as worth nothing.
+        aligned: Predicted poses in the true object frame, one for each pose of `truth`.
+        tolerance: Error up to which the recall curve of the AUC is integrated [true units].
+        lost: Number of frames without a predicted pose; each contributes 0 to the AUC.
     """
     errors = torch.linalg.vector_norm(aligned.camera_positions - truth.camera_positions, dim=-1)
-    worth = (1 - errors / tolerance).clamp_min(0).sum() / (len(truth) + lost)
-    return {"ate": float(errors.square().mean().sqrt()), "auc_percent": 100 * float(worth)}
+    auc = (1 - errors / tolerance).clamp_min(0).sum() / (len(truth) + lost)
+    return {"ate": float(errors.square().mean().sqrt()), "auc_percent": 100 * float(auc)}
 
 
 def rotation_scores(
@@ -305,8 +307,8 @@ def rotation_scores(
     """Errors of orientations after a rotation of the object frame alone (chordal mean) [degrees].
 
     Args:
-        frames: Numbers of the poses' frames among those that have a true pose, rising; from 0 when left out.
-        lost: Frames without a predicted pose; the percentages, which are of all frames, count them as wrong.
+        frames: Index of each pose's frame among the frames with a true pose, increasing; by default 0, 1, ...
+        lost: Number of frames without a predicted pose; the percentages are of all frames and count these as wrong.
     """
     R_pred_cam, R_true_cam = (t.T_cam_obj.rotation.inverse() for t in (predicted, truth))
     R_true_pred = mean_rotation(R_true_cam @ R_pred_cam.inverse())
@@ -316,16 +318,16 @@ def rotation_scores(
         "rotation_mean_degrees": float(errors.mean()),
         "rotation_median_degrees": float(errors.quantile(0.5)),
         **{f"rotation_below_{d}_percent": percent * int((errors < d).sum()) for d in (2, 5, 10)},
-        "rotation_longest_run_percent": percent * _longest_run(frames or range(len(truth)), errors < TRACKED),
+        "rotation_longest_run_percent": percent * _longest_run(frames or range(len(truth)), errors < TRACKED_DEGREES),
     }
 
 
-def _longest_run(frames: Sequence[int], good: Bool[Tensor, " n"]) -> int:
-    """Most good frames in a row, neighbours 1 apart."""
+def _longest_run(frames: Sequence[int], tracked: Bool[Tensor, " n"]) -> int:
+    """Maximum number of consecutive tracked frames, whose indices differ by 1."""
     longest = run = 0
     last = -1
-    for number, fine in zip(frames, good.tolist(), strict=True):
-        run = 0 if not fine else run + 1 if number == last + 1 else 1
+    for number, good in zip(frames, tracked.tolist(), strict=True):
+        run = 0 if not good else run + 1 if number == last + 1 else 1
         longest, last = max(longest, run), number
     return longest
 
@@ -336,9 +338,9 @@ def relative_scores(
     """Mean error of the motion between consecutive frames: translation [true units] and rotation [degrees].
 
     Args:
-        frames: Numbers of the poses' frames among those that have a true pose, rising; only neighbours 1 apart are
-            compared. A frame that nobody annotated is no gap, one that the tracker lost is.
-        scale: True units per predicted unit, from `align`; None when unknown, and so is the translation's error.
+        frames: Index of each pose's frame among the frames with a true pose, increasing. Only frames whose indices
+            differ by 1 are compared: a frame without a true pose leaves no gap, a frame without a predicted pose does.
+        scale: True units per predicted unit, from `align`; None if unknown, and then no translation error is given.
     """
     first = [i for i, (a, b) in enumerate(pairwise(frames)) if b == a + 1]
     if not first:

@@ -1,7 +1,7 @@
-"""What a method says about a capture, as a folder that `tumble evaluate` scores; the contract is docs/prediction.md.
+"""Prediction folder: a method's result for a capture, the input of `tumble evaluate` (docs/prediction.md).
 
-A *view* is an evaluation view of the capture, in the order of its transforms.json; files are numbered by it: the
-fourth view's albedo is albedo/0003.exr. Every part is optional. Maps are of the capture's size and 0 off the object.
+A *view* is an evaluation view of the capture, in the order of its transforms.json. Files are numbered by view: the
+fourth view's albedo is albedo/0003.exr. Every part is optional. Maps have the capture's size and are 0 off the object.
 """
 
 import shutil
@@ -21,27 +21,28 @@ from tumble.io import BadFile, files
 from tumble.scene import Capture, Environment, Trajectory, Truth
 
 PARTS = ("albedo", "normal", "roughness", "mask", "image", "relit", "light.exr", "poses.json")
-"""Everything that a prediction folder may hold under a name of ours."""
+"""Files and folders of a prediction; any others in the folder are ignored."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """One method's answer for one capture; None, or empty, where it has none."""
+    """One method's result for one capture; absent parts are None or empty."""
 
     albedo: Float[Tensor, "v h w 3"] | None = None
-    """Linear base colour as estimated: not multiplied by the scale that evaluation finds."""
+    """Linear base colour as estimated, not multiplied by the albedo scale of the evaluation."""
     normals: Float[Tensor, "v h w 3"] | None = None
     """Shading normals, true object frame."""
     roughness: Float[Tensor, "v h w"] | None = None
     """Perceptual roughness."""
     masks: Bool[Tensor, "v h w"] | None = None
-    """Silhouettes; without them, where the albedo is not black."""
+    """Silhouettes; if None, the pixels whose albedo is not black."""
     images: UInt8[Tensor, "v h w 3"] | None = None
     """The views under the capture's own light, sRGB code values over black."""
     relit: dict[str, UInt8[Tensor, "v h w 3"]] = field(default_factory=dict)
-    """The views under other lights, by the light's name, from the scaled albedo; sRGB code values over black."""
+    """The views under other lights, rendered with the scaled albedo, by the light's name; sRGB code values over
+    black."""
     light: Environment | None = None
-    """The light of the capture, env frame of the capture, not divided by the albedo's scale."""
+    """Light of the capture, env frame of the capture, not divided by the albedo scale."""
     poses: Trajectory | None = None
     """Estimated poses of training frames, in any object frame and unit."""
     pose_names: tuple[str, ...] = ()
@@ -50,20 +51,20 @@ class Prediction:
     def __post_init__(self) -> None:
         views = [self.albedo, self.normals, self.roughness, self.masks, self.images, *self.relit.values()]
         shapes = {tuple(view.shape[:3]) for view in views if view is not None}
-        assert len(shapes) <= 1, f"all parts have the same views, of the same size, not {shapes}"
+        assert len(shapes) <= 1, f"all parts need the same number and size of views, not {shapes}"
         assert len(self.pose_names) == (0 if self.poses is None else len(self.poses)), "one name per pose"
 
     @property
     def silhouettes(self) -> Bool[Tensor, "v h w"] | None:
-        """Where the method says that the object is."""
+        """Predicted silhouettes, from `masks` or else from the albedo; None without both."""
         if self.masks is not None or self.albedo is None:
             return self.masks
         return (self.albedo > 0).any(-1)
 
     def write(self, path: Path) -> None:
-        """The prediction as a folder; parts of an earlier one there are replaced, or removed when absent here.
+        """Write the prediction as a folder, replacing all parts of an earlier prediction there.
 
-        Each part is written beside its place first, so that none is ever half there; other files are left alone.
+        All parts are written to a temporary folder first, so that no part is ever incomplete. Other files stay.
         """
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=path) as partial:
@@ -76,7 +77,7 @@ class Prediction:
 
     @staticmethod
     def read(path: Path, capture: Capture, truth: Truth) -> "Prediction":
-        """The prediction in a folder, for a capture and its evaluation views.
+        """Read a prediction folder for a capture and its evaluation views.
 
         Raises:
             BadFile: The folder breaks a rule of docs/prediction.md.
@@ -85,19 +86,19 @@ class Prediction:
             raise BadFile(path, "is not a folder", "a prediction is a folder, see docs/prediction.md")
         if not any((path / part).exists() for part in PARTS):
             raise BadFile(path, f"holds no part of a prediction, none of: {', '.join(PARTS)}")
-        views = _Views(len(truth), capture.camera.height, capture.camera.width)
-        roughness = views.read(path / "roughness", ".exr", _roughness)
-        masks = views.read(path / "mask", ".png", _mask)
+        views = _ViewReader(len(truth), capture.camera.height, capture.camera.width)
+        roughness = views.read(path / "roughness", ".exr", _read_roughness)
+        masks = views.read(path / "mask", ".png", _read_mask)
         names, poses = _read_poses(path / "poses.json", capture)
         relit = sorted(p for p in (path / "relit").iterdir() if p.is_dir()) if (path / "relit").is_dir() else []
         return Prediction(
-            albedo=views.read(path / "albedo", ".exr", _albedo),
-            normals=views.read(path / "normal", ".exr", _normal),
+            albedo=views.read(path / "albedo", ".exr", _read_albedo),
+            normals=views.read(path / "normal", ".exr", _read_normal),
             roughness=None if roughness is None else roughness[..., 0],
             masks=None if masks is None else masks[..., 0] >= 128,
-            images=views.read(path / "image", ".png", _picture),
+            images=views.read(path / "image", ".png", _read_image),
             relit={
-                light.name: pixels for light in relit if (pixels := views.read(light, ".png", _picture)) is not None
+                light.name: pixels for light in relit if (pixels := views.read(light, ".png", _read_image)) is not None
             },
             light=Environment.read(path / "light.exr") if (path / "light.exr").exists() else None,
             poses=poses,
@@ -109,7 +110,7 @@ class Prediction:
 
 
 def _write_parts(prediction: Prediction, root: Path) -> None:
-    for path, pixels in _maps(prediction):
+    for path, pixels in _view_files(prediction):
         write = files.write_png if path.suffix == ".png" else files.write_exr
         write(root / path, pixels)
     if prediction.light is not None:
@@ -119,8 +120,8 @@ def _write_parts(prediction: Prediction, root: Path) -> None:
         files.write_json(root / "poses.json", dict(zip(prediction.pose_names, matrices, strict=True)))
 
 
-def _maps(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
-    """Every picture of a prediction with the file it belongs to."""
+def _view_files(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
+    """Relative path and pixels of every view of every part."""
     masks, roughness = prediction.masks, prediction.roughness
     parts = {
         ("albedo", "exr"): prediction.albedo,
@@ -139,63 +140,65 @@ def _maps(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
 
 
 @dataclass(frozen=True)
-class _Views:
-    """How many pictures a part has, and of which size."""
+class _ViewReader:
+    """Reads the views of one part and checks their number and size [pixels]."""
 
     count: int
     height: int
     width: int
 
     def read(self, folder: Path, ending: str, read: Callable[[Path], np.ndarray]) -> Tensor | None:
-        """All views of a part, `[v h w c]`; None when the folder is not there."""
+        """All views of a part, `[v h w c]`; None if the folder is missing."""
         if not folder.exists():
             return None
-        wanted = [folder / f"{i:04}{ending}" for i in range(self.count)]
-        if surplus := sorted(set(folder.glob(f"*{ending}")) - set(wanted)):
-            rule = f"is not one of the {self.count} evaluation views"
-            raise BadFile(surplus[0], rule, f"files are numbered from 0000{ending} in the capture's order")
-        if not wanted:
+        expected = [folder / f"{i:04}{ending}" for i in range(self.count)]
+        if surplus := sorted(set(folder.glob(f"*{ending}")) - set(expected)):
+            problem = f"is not one of the {self.count} evaluation views"
+            raise BadFile(surplus[0], problem, f"files are numbered from 0000{ending} in the capture's order")
+        if not expected:
             return None
-        return torch.from_numpy(np.stack([self._sized(path, read(path)) for path in wanted]))
+        return torch.from_numpy(np.stack([self._check_size(path, read(path)) for path in expected]))
 
-    def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
+    def _check_size(self, path: Path, pixels: np.ndarray) -> np.ndarray:
         if pixels.shape[:2] != (self.height, self.width):
-            found = f"{pixels.shape[1]} x {pixels.shape[0]}"
-            raise BadFile(path, f"is {found} pixels, the capture is {self.width} x {self.height}")
+            size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+            raise BadFile(path, f"is {size} pixels, the capture is {self.width} x {self.height}")
         return pixels
 
 
-def _channels(path: Path, pixels: np.ndarray, wanted: int) -> np.ndarray:
-    if pixels.shape[2] != wanted:
-        raise BadFile(path, f"has {pixels.shape[2]} channels, {path.parent.name} has {wanted}")
+def _check_channels(path: Path, pixels: np.ndarray, expected: int) -> np.ndarray:
+    if pixels.shape[2] != expected:
+        raise BadFile(path, f"has {pixels.shape[2]} channels, {path.parent.name} needs {expected}")
     return pixels
 
 
-def _albedo(path: Path) -> np.ndarray:
-    pixels = _channels(path, files.read_radiance(path), 3)
+def _read_albedo(path: Path) -> np.ndarray:
+    pixels = _check_channels(path, files.read_radiance(path), 3)
     if pixels.min() < 0:
-        raise BadFile(path, f"holds a negative albedo, {pixels.min():.3g}", "linear albedo is 0 or more: clamp it")
+        raise BadFile(
+            path, f"holds a negative albedo, {pixels.min():.3g}", "linear albedo must not be negative: clamp it at 0"
+        )
     return pixels
 
 
-def _normal(path: Path) -> np.ndarray:
-    return _channels(path, files.read_radiance(path), 3)
+def _read_normal(path: Path) -> np.ndarray:
+    return _check_channels(path, files.read_radiance(path), 3)
 
 
-def _roughness(path: Path) -> np.ndarray:
-    pixels = _channels(path, files.read_radiance(path), 1)
-    # Half floats round 1 to 1, but a sum of blending weights may pass it by a few units in the last place.
+def _read_roughness(path: Path) -> np.ndarray:
+    pixels = _check_channels(path, files.read_radiance(path), 1)
+    # Rounding in the blending of roughness may exceed 1 by a few units in the last place.
     if pixels.min() < 0 or pixels.max() > 1.001:
-        raise BadFile(path, f"holds roughness from {pixels.min():.3g} to {pixels.max():.3g}", "it lies in [0, 1]")
+        raise BadFile(path, f"holds roughness from {pixels.min():.3g} to {pixels.max():.3g}", "it must lie in [0, 1]")
     return pixels
 
 
-def _mask(path: Path) -> np.ndarray:
-    return _channels(path, files.read_image(path), 1)
+def _read_mask(path: Path) -> np.ndarray:
+    return _check_channels(path, files.read_image(path), 1)
 
 
-def _picture(path: Path) -> np.ndarray:
-    return _channels(path, files.read_image(path), 3)
+def _read_image(path: Path) -> np.ndarray:
+    return _check_channels(path, files.read_image(path), 3)
 
 
 def _read_poses(path: Path, capture: Capture) -> tuple[tuple[str, ...], Trajectory | None]:

@@ -1,4 +1,4 @@
-"""What a decomposed asset says about a capture's evaluation views: the prediction folder of docs/prediction.md."""
+"""Prediction of a decomposed asset: a capture's evaluation views, rendered at the true poses (docs/prediction.md)."""
 
 import math
 from dataclasses import replace
@@ -12,13 +12,12 @@ from tumble.evaluation import metrics
 from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
 from tumble.maths import SO3, to_srgb8
-from tumble.rendering import antialiased, relight
+from tumble.rendering import antialiased_gbuffer, relight
 from tumble.scene import Asset, Capture, Environment, Trajectory, Truth
 
-SILHOUETTE = 0.55
-"""Coverage from which a pixel counts as object. Edges fade more slowly inwards than outwards, so half is too little: of
-ten thousand pixels of the chess knight it misses 17 and claims 57 too many, 0.55 32 and 38; mustard bottle 5 and 53,
-13 and 31."""
+MIN_OBJECT_COVERAGE = 0.55
+"""Coverage from which a pixel belongs to the silhouette: coverage falls off more slowly inside an edge than outside, so
+one half would make silhouettes slightly too large."""
 
 
 @torch.no_grad()
@@ -31,83 +30,91 @@ def predict_views(
     *,
     names: tuple[str, ...],
 ) -> Prediction:
-    """Render a capture's evaluation views from an asset, under its own light and under those of the truth.
+    """Render a capture's evaluation views from an asset, under the asset's own light and under the truth's lights.
 
-    The truth gives the views, the lights of relit pictures and the albedo's scale; nothing of it changes the asset.
+    The truth provides the views, the lights for relighting and the albedo scale. It does not change the asset.
 
     Args:
-        alignment: From `aligned`. Without one, or without evaluation views, the prediction is one of poses and, where
-            its frame is known, of light.
-        names: Training frames that the asset's trajectory belongs to.
+        alignment: From `align_views`. If None, or without evaluation views, the prediction has only poses and, where
+            the light's frame is known, light.
+        names: Names of the training frames of the asset's trajectory.
     """
-    own = asset.environment
-    posed = Prediction(poses=asset.trajectory, pose_names=names)
+    estimated_light = asset.environment
+    prediction = Prediction(poses=asset.trajectory, pose_names=names)
     if asset.trajectory.light == "camera":
-        posed = replace(posed, light=own)
+        prediction = replace(prediction, light=estimated_light)
     elif alignment is not None:
-        posed = replace(posed, light=own.rotated(alignment.R_true_pred.matrix()))
+        prediction = replace(prediction, light=estimated_light.rotated(alignment.R_true_pred.matrix()))
     if alignment is None or truth.trajectory is None or not len(truth):
-        return posed
+        return prediction
     views = alignment.to_prediction(truth.trajectory)
-    buffers = [antialiased(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
+    buffers = [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
     coverage = torch.stack([view.alpha for view in buffers])
-    # Maps reach as far as anything is known; where the object ends, the masks say.
+    # Maps extend beyond the silhouette to all pixels with a usable value; `masks` holds the silhouette.
     known = coverage >= cfg.alpha_min
     albedo = torch.stack([view.features["albedo"] for view in buffers]) * known[..., None]
     normals = torch.stack([normalize(view.normal, dim=-1) for view in buffers]) * known[..., None]
     return replace(
-        posed,
+        prediction,
         albedo=albedo,
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
-        masks=coverage >= SILHOUETTE,
-        images=_pictures(cfg, asset, own, views, capture),
-        relit=_relit(cfg, asset, albedo, alignment, capture, truth),
+        masks=coverage >= MIN_OBJECT_COVERAGE,
+        images=_rendered_views(cfg, asset, estimated_light, views, capture),
+        relit=_relit_views(cfg, asset, albedo, alignment, capture, truth),
     )
 
 
 def align_views(
-    estimated: Trajectory, names: tuple[str, ...], capture: Capture, truth: Truth, *, given: bool, lens: float = 1.0
+    estimated: Trajectory,
+    names: tuple[str, ...],
+    capture: Capture,
+    truth: Truth,
+    *,
+    known_poses: bool,
+    focal_ratio: float = 1.0,
 ) -> tuple[Similarity | None, str]:
-    """How the true object frame relates to the asset's, from training frames alone, and that in words.
+    """The similarity from the asset's to the true object frame, from training poses alone, and a note for the report.
+
+    The similarity is None where the poses do not determine it; the note gives the reason.
 
     Args:
         estimated: The asset's trajectory.
-        names: Its frames.
-        given: Whether the run took the capture's poses: nothing is aligned then.
-        lens: The capture's focal length over the run's. Views are seen through the capture's camera: distances along
-            its axis change by as much, so that the object is seen as large as the run saw it.
+        names: Names of its frames.
+        known_poses: Whether the run used the capture's own poses; the similarity is then the identity.
+        focal_ratio: The capture's focal length over the run's. Views are rendered with the capture's camera, so depths
+            are multiplied by this ratio to keep the object's size in the image.
     """
-    if given:
+    if known_poses:
         xyz = estimated.T_cam_obj.xyz
-        same = Similarity(xyz.new_ones(()), SO3.identity(dtype=xyz.dtype, device=xyz.device), xyz.new_zeros(3))
-        return same, "views: rendered in the capture's own object frame, for its poses were given"
-    places = truth.posed(capture)
-    shared = [i for i, name in enumerate(names) if name in places]
+        identity = Similarity(xyz.new_ones(()), SO3.identity(dtype=xyz.dtype, device=xyz.device), xyz.new_zeros(3))
+        return identity, "views: rendered in the capture's object frame without alignment, because its poses were given"
+    true_index = truth.pose_indices(capture)
+    shared = [i for i, name in enumerate(names) if name in true_index]
     if truth.poses is None or len(shared) < 2:
-        return None, "views: not rendered, for without true poses of training frames the object frame is unknown"
-    true = truth.poses.select([places[names[i]] for i in shared])
+        return None, "views: not rendered, because without true poses of training frames the object frame is unknown"
+    true = truth.poses.select([true_index[names[i]] for i in shared])
     try:
-        found = metrics.register(_through(lens, estimated.select(shared)), true)
+        alignment = metrics.register(_with_scaled_depths(focal_ratio, estimated.select(shared)), true)
     except ValueError as reason:
         return None, f"views: not rendered; {reason}"
-    angle = math.degrees(float(found.R_true_pred.angle()))
-    seen = "" if lens == 1 else f"depths times {lens:.4g}, the true focal length over the run's; "
-    return found, (
-        f"views: rendered at the true poses, brought into the run's object frame by what aligns its {len(shared)} "
-        f"training poses: rotation alone ({angle:.1f} degrees), then scale ({float(found.scale):.4g}) and shift; "
-        f"{seen}normals and light turned back by it"
+    angle = math.degrees(float(alignment.R_true_pred.angle()))
+    depths = "" if focal_ratio == 1 else f"depths times {focal_ratio:.4g}, the true focal length over the run's; "
+    return alignment, (
+        f"views: rendered at the true poses, transformed to the run's object frame by a similarity fitted to "
+        f"{len(shared)} training poses: first the rotation ({angle:.1f} degrees), then scale "
+        f"({float(alignment.scale):.4g}) and shift; {depths}normals and light rotated back to the true frame"
     )
 
 
-def _through(lens: float, trajectory: Trajectory) -> Trajectory:
-    """The poses at which a lens of another focal length sees the object in the same place, as large."""
+def _with_scaled_depths(focal_ratio: float, trajectory: Trajectory) -> Trajectory:
+    """The poses at which a camera of another focal length shows the object at the same place and size in the image."""
     T_cam_obj = trajectory.T_cam_obj
-    xyz = T_cam_obj.xyz * T_cam_obj.xyz.new_tensor([1.0, 1.0, lens])
-    return trajectory if lens == 1 else replace(trajectory, T_cam_obj=replace(T_cam_obj, xyz=xyz))
+    xyz = T_cam_obj.xyz * T_cam_obj.xyz.new_tensor([1.0, 1.0, focal_ratio])
+    return trajectory if focal_ratio == 1 else replace(trajectory, T_cam_obj=replace(T_cam_obj, xyz=xyz))
 
 
-def _relit(
+def _relit_views(
     cfg: relight.Config,
     asset: Asset,
     albedo: Float[Tensor, "v h w 3"],
@@ -115,18 +122,19 @@ def _relit(
     capture: Capture,
     truth: Truth,
 ) -> dict[str, UInt8[Tensor, "v h w 3"]]:
-    """The views under the truth's lights, from the scaled albedo. Those lights stand in the true object frame."""
+    """The views under the truth's lights (true object frame), rendered with the scaled albedo."""
     if truth.albedo is None or truth.trajectory is None:
         return {}
-    scaled = relight.scaled(asset, metrics.albedo_scale(albedo, truth.albedo, truth.foreground))
-    still = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
+    scaled = relight.scale_albedo(asset, metrics.albedo_scale(albedo, truth.albedo, truth.foreground))
+    views = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     return {
-        name: _pictures(cfg, scaled, light.rotated(R_pred_true), still, capture) for name, light in truth.lights.items()
+        name: _rendered_views(cfg, scaled, light.rotated(R_pred_true), views, capture)
+        for name, light in truth.lights.items()
     }
 
 
-def _pictures(
+def _rendered_views(
     cfg: relight.Config, asset: Asset, light: Environment, views: Trajectory, capture: Capture
 ) -> UInt8[Tensor, "v h w 3"]:
     linear = torch.stack(list(relight.relight(cfg, asset, light, views, capture.camera)))

@@ -1,11 +1,11 @@
-"""An asset for other programs: textured mesh as GLB, Gaussians as PLY, light, poses; and how sure its material is."""
+"""Export for other programs: textured mesh (GLB), Gaussians (PLY), light, poses, and a confidence of the material."""
 
 from tumble.export.asset import Preset, PresetName, extract_mesh, write_asset, write_textured_mesh
-from tumble.export.confidence import LAMPS, Confidence, confidence_of
+from tumble.export.confidence import N_LIGHTS, Confidence, confidence_of
 
 __all__ = [
     "Confidence",
-    "LAMPS",
+    "N_LIGHTS",
     "Preset",
     "PresetName",
     "confidence_of",

@@ -1,7 +1,7 @@
-"""What other programs open: a textured GLB, two PLYs of the Gaussians, the light, the poses.
+"""Export folder of an asset: a textured GLB, two PLYs of the Gaussians, the light, the poses (docs/export.md).
 
-The GLB's frame is the object's: +y up, where up means something, as glTF has it. All files of one export share one
-length of the object radius in metres: 1 without a scale.
+All files use the object frame, which has +y up as in glTF (if the object has an up direction), and one unit: metres if
+the object's size is given, else the object radius.
 """
 
 from dataclasses import dataclass
@@ -10,29 +10,30 @@ from typing import Literal
 
 from tumble import __version__
 from tumble.export import bake, confidence, gltf, mesh, ply
-from tumble.export.depth_fusion import REACH, distances
+from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
 from tumble.io import files
 from tumble.scene import Asset
 
-PADDING = 8
-"""Least number of texels between charts."""
+CHART_PADDING = 8
+"""Minimum gap between charts of the texture atlas [texels]."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """How fine a mesh is made."""
+    """Resolution of an exported mesh and its textures."""
 
     triangles: int
+    """Maximum number of triangles."""
     texture: int
     """Side of the textures [texels]."""
     cells: int
-    """Of the grid, per side."""
+    """Cells per side of the signed distance grid; a multiple of 4."""
     views: int = 64
-    """Depth maps that are fused; three quarters of them for the textures."""
+    """Number of depth maps that are fused; the textures use three quarters as many views."""
     pixels: int = 768
-    """Side of the rendered maps."""
+    """Side of the rendered maps [pixels]."""
 
 
 PresetName = Literal["web", "game", "film", "splat"]
@@ -42,74 +43,83 @@ PRESETS: dict[str, Preset | None] = {
     "film": Preset(triangles=50_000, texture=4096, cells=384, views=96, pixels=1024),
     "splat": None,
 }
-"""web: up to 10 MB; splat: no mesh at all."""
-CONFIDENCE = "confidence.png"
-COARSE = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
-"""Enough to measure a size."""
+"""Settings by name. "web" stays below 10 MB; "splat" has no mesh."""
+CONFIDENCE_FILE = "confidence.png"
+"""Confidence of the material as a texture, beside the GLB."""
+SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
+"""Settings of the mesh that is extracted only to measure the object's size."""
 
 
 def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, scale_mm: float | None = None) -> None:
     """Write a folder: `asset.glb` and `confidence.png` (not for "splat"), both PLYs, `light.*`, `poses*`, `bop/`.
 
     Args:
-        names: Of the frames, in the order of the trajectory.
-        scale_mm: Largest distance between two points of the object, as a ruler finds it [mm].
+        names: Names of the frames, in the order of the trajectory.
+        scale_mm: Largest distance between two points of the object, measured with a ruler [mm].
+
+    Raises:
+        ValueError: A mesh is needed, but the Gaussians have no surface.
     """
-    chosen = PRESETS[preset]
-    shape = extract_mesh(asset, chosen) if chosen else extract_mesh(asset, COARSE) if scale_mm else None
+    settings = PRESETS[preset]
+    shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
     metres = 1.0 if scale_mm is None or shape is None else scale_mm / 1000 / mesh.diameter(shape.vertices)
-    if chosen and shape:
-        write_textured_mesh(asset, shape, chosen, metres, out / "asset.glb")
-    ply.write_ply(out / "asset.ply", ply.splats(asset, metres))
-    ply.write_ply(out / "asset_material.ply", ply.splats(asset, metres) | ply.material_columns(asset))
+    if settings and shape:
+        write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
+    ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
+    ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
     _write_light(asset, out)
     write_poses(asset, names, metres, out)
-    about = {
+    facts = {
         "preset": preset,
         "metres_per_object_radius": metres,
         "scale_mm": scale_mm,
         "frame": "x right, y up, z to the viewer; the same for GLB, PLYs and poses",
-        "units": "metres" if scale_mm else "object radius (written where metres stand)",
+        "units": "metres" if scale_mm else "object radius (in place of metres)",
         "f0": float(asset.material.f0),
         "tumble": __version__,
     }
-    files.write_json(out / "export.json", about)
+    files.write_json(out / "export.json", facts)
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
-    """The object's triangles, object frame.
+    """The surface of the Gaussians as a triangle mesh, object frame.
 
     Raises:
-        ValueError: The Gaussians show no surface.
+        ValueError: The Gaussians have no surface.
     """
-    values = distances(asset.gaussians, asset.gamma, cells=preset.cells, views=preset.views, pixels=preset.pixels)
+    values = signed_distances(
+        asset.gaussians, asset.gamma, cells=preset.cells, views=preset.views, pixels=preset.pixels
+    )
     if values.min() >= 0:
-        raise ValueError("the Gaussians show no surface: nothing to make triangles of; try --preset splat")
-    return mesh.simplified(
-        mesh.without_floaters(mesh.march(values, -REACH, 2 * REACH / preset.cells)), preset.triangles
+        raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
+    return mesh.simplify(
+        mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)),
+        preset.triangles,
     )
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
-    """Unwrap, bake and write the GLB, and beside it how sure its material is, over the same coordinates."""
-    flat = mesh.unwrapped(shape, preset.texture, PADDING)
+    """Unwrap the mesh, bake its textures, write the GLB, and beside it the confidence texture over the same UVs."""
+    flat = mesh.unwrap(shape, preset.texture, CHART_PADDING)
     textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
-    assert asset.material is not None, "an asset with material"
+    assert asset.material is not None, "the asset has no material"
     score = confidence.confidence_of(asset, asset.camera).score
-    files.write_png(path.parent / CONFIDENCE, bake.spread(score, asset, flat, resolution=512)[..., None])
+    files.write_png(
+        path.parent / CONFIDENCE_FILE, bake.nearest_gaussian_texture(score, asset, flat, resolution=512)[..., None]
+    )
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 
 def _write_light(asset: Asset, out: Path) -> None:
-    """`light.exr`, `light.hdr`, and `light.json`, which says how they lie."""
+    """Write `light.exr`, `light.hdr`, and `light.json`, which documents their projection and frame."""
     environment, trajectory = asset.environment, asset.trajectory
     environment.write(out / "light.exr")
     environment.write(out / "light.hdr")
     frames = {
-        "camera": "the camera's, OpenGL axes (x right, y up, z to the viewer): the light stood still with the camera",
-        "object": "the object's, that of the GLB: the light stood still with the object",
+        "camera": "camera frame, OpenGL axes (x right, y up, z to the viewer): the light was fixed to the camera",
+        "object": "object frame, that of the GLB: the light was fixed to the object",
     }
-    about = {
+    facts = {
         "projection": "equirectangular",
         "radiance": "linear RGB, primaries of sRGB, up to one factor",
         "frame": frames[trajectory.light],
@@ -119,4 +129,4 @@ def _write_light(asset: Asset, out: Path) -> None:
         "v": "acos(y) / pi, from the top",
         "R_light_object_of_first_frame": trajectory.R_env_obj[0].tolist(),
     }
-    files.write_json(out / "light.json", about)
+    files.write_json(out / "light.json", facts)

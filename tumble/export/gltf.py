@@ -1,4 +1,4 @@
-"""A textured mesh as a GLB: glTF 2.0 binary, one JSON document and one buffer, written by hand."""
+"""GLB writer for a textured mesh: glTF 2.0 binary with one JSON chunk and one binary chunk."""
 
 import io
 import json
@@ -14,62 +14,75 @@ from PIL import Image
 
 from tumble import __version__
 from tumble.export.bake import Textures
-from tumble.export.mesh import Unwrapped
+from tumble.export.mesh import UnwrappedMesh
 from tumble.io import files
 from tumble.scene import DIELECTRIC
 
-FLOAT, SHORT, INT = 5126, 5123, 5125
-ARRAY, ELEMENTS = 34962, 34963
-"""Numbers of glTF 2.0, sections 3.6.2 and 5.11."""
+FLOAT = 5126
+"""Component type of 32-bit floats (glTF 2.0, section 3.6.2)."""
+UNSIGNED_SHORT = 5123
+"""Component type of 16-bit indices."""
+UNSIGNED_INT = 5125
+"""Component type of 32-bit indices."""
+ARRAY_BUFFER = 34962
+"""Target of buffer views with vertex attributes (glTF 2.0, section 5.11)."""
+ELEMENT_ARRAY_BUFFER = 34963
+"""Target of buffer views with vertex indices."""
 
 
 @dataclass(frozen=True)
 class _Buffer:
-    """The binary chunk as it grows, and the views and accessors into it."""
+    """Binary chunk under construction, with its buffer views and accessors; its methods append to it."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
 
-    def view(self, values: bytes, **more: int) -> int:
+    def view(self, values: bytes, **properties: int) -> int:
+        """Append bytes, aligned to 4; returns the index of their buffer view."""
         self.data.extend(b"\0" * (-len(self.data) % 4))
-        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(values), **more})
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(values), **properties})
         self.data.extend(values)
         return len(self.views) - 1
 
     def accessor(self, values: np.ndarray, kind: str, component: int, *, target: int, bounds: bool = False) -> int:
-        about = {"componentType": component, "count": len(values), "type": kind}
+        """Append an array, one element per row; returns the index of its accessor."""
+        properties = {"componentType": component, "count": len(values), "type": kind}
         if bounds:
-            about |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
-        self.accessors.append({"bufferView": self.view(values.tobytes(), target=target), **about})
+            properties |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        self.accessors.append({"bufferView": self.view(values.tobytes(), target=target), **properties})
         return len(self.accessors) - 1
 
     def png(self, values: UInt8[np.ndarray, "h w *c"]) -> dict[str, Any]:
+        """Append an image as PNG; returns its entry for `images`."""
         file = io.BytesIO()
         Image.fromarray(values).save(file, "PNG", optimize=False, compress_level=9)
         return {"bufferView": self.view(file.getvalue()), "mimeType": "image/png"}
 
 
-def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, metres: float) -> None:
-    """A glTF 2.0 binary with one mesh and one dielectric metallic-roughness material.
+def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float, metres: float) -> None:
+    """Write a GLB with one mesh and one dielectric metallic-roughness material.
 
-    Reflectance at normal incidence goes into KHR_materials_ior, below 0.04 into KHR_materials_specular; viewers without
-    them show 0.04.
-    Tangents are those that the normal map was baked with.
+    The tangents are those that the normal map was baked with.
+
+    Args:
+        f0: Reflectance at normal incidence; if not 0.04, it is written as an extension (`reflectance_extension`), which
+            some viewers ignore.
+        metres: Object radius in the file's unit.
     """
     buffer = _Buffer()
     rough = textures.roughness
     red, blue = np.full_like(rough, 255), np.zeros_like(rough)
     images = [buffer.png(x) for x in (textures.base_color, np.stack([red, rough, blue], -1), textures.normal)]
     vertices = (flat.vertices * metres).astype(np.float32)
-    few = len(vertices) < 65535
+    short_indices = len(vertices) < 65535
     attributes = {
-        "POSITION": buffer.accessor(vertices, "VEC3", FLOAT, target=ARRAY, bounds=True),
-        "NORMAL": buffer.accessor(_unit32(flat.normals), "VEC3", FLOAT, target=ARRAY),
-        "TANGENT": buffer.accessor(_tangents32(flat.tangents), "VEC4", FLOAT, target=ARRAY),
-        "TEXCOORD_0": buffer.accessor(flat.uv.astype(np.float32), "VEC2", FLOAT, target=ARRAY),
+        "POSITION": buffer.accessor(vertices, "VEC3", FLOAT, target=ARRAY_BUFFER, bounds=True),
+        "NORMAL": buffer.accessor(_unit32(flat.normals), "VEC3", FLOAT, target=ARRAY_BUFFER),
+        "TANGENT": buffer.accessor(_tangents32(flat.tangents), "VEC4", FLOAT, target=ARRAY_BUFFER),
+        "TEXCOORD_0": buffer.accessor(flat.uv.astype(np.float32), "VEC2", FLOAT, target=ARRAY_BUFFER),
     }
-    indices = flat.faces.astype(np.uint16 if few else np.uint32).reshape(-1, 1)
+    indices = flat.faces.astype(np.uint16 if short_indices else np.uint32).reshape(-1, 1)
     material: dict[str, Any] = {
         "name": "object",
         "pbrMetallicRoughness": {
@@ -92,10 +105,10 @@ def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, met
         "images": images,
     }
     document["meshes"][0]["primitives"][0]["indices"] = buffer.accessor(
-        indices, "SCALAR", SHORT if few else INT, target=ELEMENTS
+        indices, "SCALAR", UNSIGNED_SHORT if short_indices else UNSIGNED_INT, target=ELEMENT_ARRAY_BUFFER
     )
     if abs(f0 - DIELECTRIC) > 1e-4:
-        name, value = specular(f0)
+        name, value = reflectance_extension(f0)
         material["extensions"], document["extensionsUsed"] = {name: value}, [name]
     document |= {"bufferViews": buffer.views, "accessors": buffer.accessors, "buffers": [{}]}
     binary = bytes(buffer.data) + b"\0" * (-len(buffer.data) % 4)
@@ -103,15 +116,16 @@ def write_glb(path: Path, flat: Unwrapped, textures: Textures, *, f0: float, met
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
-    whole = (
-        header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    )
-    files.write_whole(path, lambda partial: partial.write_bytes(whole))
+    data = header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    files.write_atomically(path, lambda partial: partial.write_bytes(data))
 
 
-def specular(f0: float) -> tuple[str, dict[str, float]]:
-    """What glTF says for a reflectance at normal incidence: below glass a dimmed highlight (as `brdf.fresnel` has it,
-    grazing angles too), above it an index."""
+def reflectance_extension(f0: float) -> tuple[str, dict[str, float]]:
+    """Name and value of the glTF extension for a reflectance at normal incidence other than 0.04.
+
+    Below 0.04 a factor scales the specular lobe at all angles, as `brdf.fresnel` does; above 0.04 the index of
+    refraction is given.
+    """
     if f0 < DIELECTRIC:
         return "KHR_materials_specular", {"specularFactor": f0 / DIELECTRIC}
     return "KHR_materials_ior", {"ior": (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))}

@@ -1,7 +1,7 @@
-"""Triangles from Gaussians: depth maps from all around, fused into a signed distance, marched, thinned and unwrapped.
+"""Triangle meshes: extraction from a signed distance grid, removal of floaters, simplification, and UV unwrapping.
 
-Object frame, object radius = 1, faces counterclockwise from outside. A *cell* is a cube of the grid, whose corners hold
-the *values*: signed distances to the surface, positive outside, in units of a cell and clamped to `BAND`.
+Object frame, object radius = 1, faces counterclockwise from outside. A *cell* is a cube of the grid; its corners hold
+the *values*: signed distances to the surface, positive outside, in any unit (`depth_fusion` computes them).
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 
 from tumble.maths import fibonacci_sphere, local_frame
 
-SMALL = 0.02
-"""Share of the largest component's triangles below which another one is dropped as a floater."""
+MIN_COMPONENT_FRACTION = 0.02
+"""Size below which a connected component is removed as a floater [fraction of the largest component's triangles]."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class Mesh:
 
 
 @dataclass(frozen=True)
-class Unwrapped:
-    """A mesh with texture coordinates; vertices on a seam are there more than once."""
+class UnwrappedMesh:
+    """A triangle mesh with texture coordinates; vertices on a seam of the atlas are duplicated."""
 
     vertices: Float[np.ndarray, "v 3"]
     normals: Float[np.ndarray, "v 3"]
-    """Unit; the same on both sides of a seam."""
+    """Unit length, equal on both sides of a seam."""
     tangents: Float[np.ndarray, "v 4"]
-    """Unit direction of growing u, and the sign w with bitangent = w cross(normal, tangent) towards smaller v."""
+    """Unit direction of increasing u, and the sign w in bitangent = w cross(normal, tangent), towards smaller v."""
     uv: Float[np.ndarray, "v 2"]
     """glTF texture coordinates: the origin is the top left corner of the texture."""
     faces: Int[np.ndarray, "f 3"]
@@ -43,13 +43,13 @@ class Unwrapped:
 # Marching -------------------------------------------------------------------------------------------------------------
 
 
-def march(values: Float[np.ndarray, "a b c"], origin: float, cell: float) -> Mesh:
-    """The surface where the values change sign, by marching tetrahedra: closed and manifold off the grid's faces.
+def marching_tetrahedra(values: Float[np.ndarray, "a b c"], origin: float, cell: float) -> Mesh:
+    """The zero level set of the values, by marching tetrahedra: closed and manifold except at the grid's boundary.
 
     Args:
-        values: Positive outside.
-        origin: All three coordinates of the first corner [object radius].
-        cell: Width of a cell [object radius].
+        values: Signed distances in any unit, positive outside.
+        origin: Coordinate of the grid's first corner, the same on all three axes [object radius].
+        cell: Side of a cell [object radius].
     """
     inside = values < 0
     shape, strides = np.array(values.shape), np.array([values.shape[1] * values.shape[2], values.shape[2], 1])
@@ -68,22 +68,22 @@ def march(values: Float[np.ndarray, "a b c"], origin: float, cell: float) -> Mes
     unique, faces = np.unique(ends[:, 0] * values.size + ends[:, 1], return_inverse=True)
     a, b = unique // values.size, unique % values.size
     value_a, value_b = values.ravel()[a].astype(np.float64), values.ravel()[b].astype(np.float64)
-    share = (value_a / (value_a - value_b))[:, None]
+    fraction = (value_a / (value_a - value_b))[:, None]
     at_a, at_b = (np.stack(np.unravel_index(i, values.shape), -1) for i in (a, b))
-    return Mesh(origin + cell * (at_a + share * (at_b - at_a)), faces.reshape(-1, 3))
+    return Mesh(origin + cell * (at_a + fraction * (at_b - at_a)), faces.reshape(-1, 3))
 
 
 def _tetrahedra() -> Int[np.ndarray, "6 4 3"]:
-    """Corners of the six tetrahedra of a cell, one per way from (0, 0, 0) to (1, 1, 1) (Kuhn), right-handed."""
-    found = []
+    """Corners of the six tetrahedra of a cell, one per edge path from (0, 0, 0) to (1, 1, 1) (Kuhn), right-handed."""
+    tetrahedra = []
     for order in permutations(range(3)):
         path = np.concatenate([np.zeros((1, 3), int), np.cumsum(np.eye(3, dtype=int)[list(order)], 0)])
-        found.append(path if np.linalg.det(path[1:]) > 0 else path[[0, 2, 1, 3]])
-    return np.stack(found)
+        tetrahedra.append(path if np.linalg.det(path[1:]) > 0 else path[[0, 2, 1, 3]])
+    return np.stack(tetrahedra)
 
 
 def _triangles(code: int) -> list[list[list[int]]]:
-    """Triangles in a tetrahedron by which corners are inside; each point lies on an edge between two corners."""
+    """Triangles in a tetrahedron whose inside corners are the bits of `code`; a vertex is an edge (pair of corners)."""
     inside = [i for i in range(4) if code >> i & 1]
     a, b, c, d = next(p for p in permutations(range(4)) if set(p[: len(inside)]) == set(inside) and _is_even(p))
     if len(inside) == 1:
@@ -100,15 +100,15 @@ def _is_even(order: tuple[int, ...]) -> bool:
 # Triangles ------------------------------------------------------------------------------------------------------------
 
 
-def without_floaters(mesh: Mesh) -> Mesh:
-    """The largest component, and every other with at least `SMALL` of its triangles."""
+def remove_floaters(mesh: Mesh) -> Mesh:
+    """The mesh without connected components that are smaller than `MIN_COMPONENT_FRACTION` of the largest."""
     label = _components(len(mesh.vertices), mesh.faces)[mesh.faces[:, 0]]
     names, counts = np.unique(label, return_counts=True)
-    return _compact(mesh.vertices, mesh.faces[np.isin(label, names[counts >= SMALL * counts.max()])])
+    return _compact(mesh.vertices, mesh.faces[np.isin(label, names[counts >= MIN_COMPONENT_FRACTION * counts.max()])])
 
 
 def _components(n: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " n"]:
-    """A number for each vertex, the same for all that hang together: the smallest one spreads, in leaps."""
+    """Label of the connected component of each vertex, by propagation of minimum labels with pointer jumping."""
     label = np.arange(n)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     while True:
@@ -122,29 +122,29 @@ def _components(n: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " n"]:
 
 
 def _compact(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Mesh:
-    """Without the vertices that no face has."""
+    """The mesh without unused vertices."""
     used, index = np.unique(faces, return_inverse=True)
     return Mesh(vertices[used], index.reshape(-1, 3))
 
 
-def simplified(mesh: Mesh, triangles: int) -> Mesh:
-    """About the same surface of at most `triangles`, by quadric edge collapse (Garland and Heckbert 1997)."""
+def simplify(mesh: Mesh, triangles: int) -> Mesh:
+    """The mesh reduced to at most `triangles`, if possible, by quadric edge collapse (Garland and Heckbert 1997)."""
     import fast_simplification
 
     vertices, faces = mesh.vertices, mesh.faces
     for aggressiveness in (3.0, 5.0, 7.0, 9.0):
         if len(faces) <= triangles:
             break
-        # It stops early where the errors allowed by its schedule are used up.
+        # A run may stop early, at the error limit of its schedule; the next one is more aggressive.
         vertices, faces = fast_simplification.simplify(
             vertices.astype(np.float64), faces.astype(np.int32), target_count=triangles, agg=aggressiveness
         )[:2]
-    # Triangles without area stay: without them the surface has cracks.
+    # Triangles without area are kept, because removing them would open cracks.
     return _compact(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
 
 
 def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Unit normals, faces weighted by their area."""
+    """Unit normals of vertices: area-weighted means over the adjacent faces."""
     corners = mesh.vertices[mesh.faces]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(mesh.vertices)
@@ -154,7 +154,7 @@ def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
 
 
 def diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
-    """The largest distance between two vertices: among the extreme ones in 4096 directions."""
+    """Largest distance between two vertices, among those that are extreme in one of 4096 directions."""
     directions = fibonacci_sphere(4096, dtype=torch.float64).numpy()
     extreme = np.unique(np.concatenate([(vertices @ rows.T).argmax(0) for rows in np.split(directions, 16)]))
     corners = torch.from_numpy(np.ascontiguousarray(vertices[extreme], np.float64))
@@ -164,12 +164,12 @@ def diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
 # The atlas ------------------------------------------------------------------------------------------------------------
 
 
-def unwrapped(mesh: Mesh, resolution: int, padding: int) -> Unwrapped:
-    """One set of texture coordinates without overlaps, by xatlas.
+def unwrap(mesh: Mesh, resolution: int, padding: int) -> UnwrappedMesh:
+    """The mesh with one set of texture coordinates without overlaps, by xatlas.
 
     Args:
         resolution: Side of the texture [texels].
-        padding: Texels left free around every chart.
+        padding: Empty border around every chart [texels].
     """
     import xatlas
 
@@ -179,14 +179,14 @@ def unwrapped(mesh: Mesh, resolution: int, padding: int) -> Unwrapped:
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_iterations = 1
     packing.resolution, packing.padding, packing.bilinear = resolution, padding, True
-    # xatlas turns charts by swapping u and v: a mirrored one is one more thing that a viewer can get wrong.
+    # xatlas rotates charts by swapping u and v, which mirrors them; some viewers handle mirrored charts wrongly.
     charts.fix_winding, packing.rotate_charts = True, False
     atlas.generate(charts, packing)
     origin, faces, uv = atlas[0]
-    # Its v runs upwards, for its charts are counterclockwise.
+    # The v of xatlas points up (its charts are counterclockwise), that of glTF down.
     faces, uv = faces.astype(np.int64).reshape(-1, 3), np.stack([uv[:, 0], 1 - uv[:, 1]], 1).astype(np.float64)
     vertices, normals = mesh.vertices[origin], normals[origin]
-    return Unwrapped(vertices, normals, _tangents(vertices, normals, uv, faces), uv, faces)
+    return UnwrappedMesh(vertices, normals, _tangents(vertices, normals, uv, faces), uv, faces)
 
 
 def _tangents(
@@ -195,10 +195,12 @@ def _tangents(
     uv: Float[np.ndarray, "v 2"],
     faces: Int[np.ndarray, "f 3"],
 ) -> Float[np.ndarray, "v 4"]:
-    """Directions of growing u, mean over the faces of a vertex, at right angles to its normal."""
-    corners, places = vertices[faces], uv[faces]
-    (x1, x2), (p1, p2) = ((values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]) for values in (corners, places))
-    # Twice the area on the texture, negative where u, v turn like x, y on paper seen from outside: v runs down.
+    """Tangents of vertices: directions of increasing u, averaged over the adjacent faces, orthogonal to the normals."""
+    corners, corners_uv = vertices[faces], uv[faces]
+    (x1, x2), (p1, p2) = (
+        (values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]) for values in (corners, corners_uv)
+    )
+    # Twice the signed area in the texture: negative for charts that are not mirrored, because v points down.
     area = (p1[:, 0] * p2[:, 1] - p1[:, 1] * p2[:, 0])[:, None]
     along = (x1 * p2[:, 1:] - x2 * p1[:, 1:]) * np.sign(area)
     total, sign = np.zeros_like(vertices), np.zeros(len(vertices))
@@ -206,12 +208,12 @@ def _tangents(
         np.add.at(total, faces[:, corner], along)
         np.add.at(sign, faces[:, corner], -area[:, 0])
     total -= normals * (total * normals).sum(1, keepdims=True)
-    spare = local_frame(torch.from_numpy(np.ascontiguousarray(normals, np.float64)))[..., 0].numpy()
-    total = np.where(np.linalg.norm(total, axis=1, keepdims=True) > 1e-12, total, spare)
+    fallback = local_frame(torch.from_numpy(np.ascontiguousarray(normals, np.float64)))[..., 0].numpy()
+    total = np.where(np.linalg.norm(total, axis=1, keepdims=True) > 1e-12, total, fallback)
     return np.concatenate([_unit(total), np.where(sign < 0, -1.0, 1.0)[:, None]], 1)
 
 
 def _unit(x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Rows of length 1; +z for a row of zeros."""
+    """Rows normalised to length 1; a row of zeros becomes +z."""
     length = np.linalg.norm(x, axis=1, keepdims=True)
     return np.where(length > 1e-20, x / length.clip(1e-20), np.array([0.0, 0.0, 1.0]))

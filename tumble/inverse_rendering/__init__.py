@@ -1,6 +1,7 @@
-"""Stages 2 and 3: Gaussians, poses and a coarse light from the frames; then albedo, roughness and the light.
+"""Inverse rendering: stage 2 (`refine`) and stage 3 (`decompose`) with their losses and densification.
 
-With their losses, densification, and the baseline that needs no inverse rendering.
+`refine` optimises Gaussians, poses and a low-order light; `decompose` then optimises albedo, roughness and an
+environment map. `mean_colour_baseline` takes the place of stage 3 as a baseline without inverse rendering.
 """
 
 from tumble.inverse_rendering import decompose, densify, losses, mean_colour_baseline, refine, sh_lighting, specular_fit

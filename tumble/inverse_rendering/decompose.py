@@ -1,8 +1,8 @@
-"""Stage 3: albedo, roughness and light, by physically based deferred shading of the refined Gaussians (section 4.3).
+"""Stage 3: albedo, roughness and light by physically based deferred shading (paper section 4.3).
 
-Every step shades some pixels of one frame: the light of that frame is the environment seen through `R_env_obj`, and
-so is the light that other parts of the object send on (the paper averages that over frames; it changes with the pose).
-Visibility is cached per Gaussian over several turned sets of shared directions.
+Every step shades some pixels of one frame. Direct and indirect light are those of the frame's pose, since the light is
+fixed in the env frame; the paper averages indirect light over all frames. Visibility is cached per Gaussian, for
+several rotated sets of directions that all Gaussians share.
 """
 
 import math
@@ -25,10 +25,10 @@ from tumble.rendering import (
     Buffers,
     Surface,
     Visibility,
-    buffers_of,
-    build,
+    build_tracer,
     displacement,
     prefilter,
+    render_gbuffer,
     shade_split,
     surface,
     surface_points,
@@ -51,178 +51,198 @@ from tumble.scene import (
 )
 
 VERSION = 14
-LOOK_EVERY = 100
-"""Steps between two looks at how far geometry has moved."""
-FAINT = 0.2
-"""Share of a dielectric's highlight below which it hardly counts as one."""
-ALBEDO = (0.003, 0.98)
-"""At the start. Printed red has a green of 0.004: a start well above it costs 0.6 dB, for the logit has far to go."""
-FITTED, FITTED_PIXELS = 64, 2
-"""Frames from which the highlight is found at the start, and pixels of each, in those of a step. With a quarter of them
-chance decides between the two best widths of the cracker box indoors, a question of 4 dB of albedo."""
-MOVED = 0.3
-"""Of `trace.moved`, beyond which visibility is traced anew."""
+DISPLACEMENT_CHECK_EVERY = 100
+"""Steps between two measurements of the displacement of the geometry."""
+PENALTY_SCALE = 0.2
+"""Specular scale at which the penalty on the specular lobe reaches 63 % of its maximum."""
+ALBEDO_RANGE = (0.003, 0.98)
+"""Range of the initial albedo. The lower limit is that of saturated colours: logits would need long to reach it."""
+FIT_FRAMES = 64
+"""Maximum number of frames in the grid search of the specular lobe."""
+FIT_PIXELS = 2
+"""Pixels per frame in the grid search of the specular lobe, as a multiple of the pixels of a step."""
+MAX_DISPLACEMENT = 0.3
+"""Displacement of the Gaussians (`trace.displacement`) above which visibility is traced again."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Eq. 14; values from appendix A, stage 3."""
+    """Weights of the loss terms (eq. 14); values from appendix A, stage 3."""
 
     light: float = 0.05
-    """Squared differences of neighbouring texels."""
+    """Weight of the smoothness of the environment map."""
     material: float = 0.25
-    """Edge-aware smoothness of albedo and roughness."""
+    """Weight of the edge-aware smoothness of albedo and roughness."""
     mask: float = 0.0
-    """Squared difference of coverage and mask, as in stage 2. Without it, once geometry joins, what is darker than its
-    light lets shine becomes translucent, as do the grooves of a chess knight."""
-    highlight: float = 0.01
-    """Price of a highlight, whatever its strength, unless a trial found one.
-
-    On a Lambertian bottle a third of one stands in for a sun that the map blurs: it lowers the photometric term by 3 %
-    and costs 2 dB of albedo. A real one lowers that term by half; the one that a trial found on the chess knight
-    indoors fell into the price and vanished, which cost 3 dB of relighting.
-    """
+    """Weight of the silhouette term, as in stage 2. Without it, dark grooves become translucent while geometry is
+    optimised."""
+    specular: float = 0.01
+    """Weight of the penalty on the specular lobe, which hardly depends on the lobe's scale. It keeps a Lambertian
+    object from a lobe that compensates for errors of the light, and is 0 if the grid search has found a lobe."""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates; material and light from appendix A."""
+    """Adam's learning rates; material and light from appendix A. For geometry the paper refers to SVG-IR."""
 
     albedo: float = 0.025
+    """Learning rate of the albedo logits."""
     roughness: float = 0.025
+    """Learning rate of the roughness logits."""
     normal: float = 1e-3
-    tint: float = 0.0
-    """Of the highlight against the diffuse light; the paper fixes it."""
+    """Learning rate of the normal offsets."""
+    specular_scale: float = 0.0
+    """Learning rate of the logarithmic specular scale, which the paper fixes."""
     light: float = 0.01
+    """Learning rate of the logarithmic radiance of the environment map."""
     means: float = 1.6e-5
-    """Geometry joins after the warm-up, slower than in stage 2 but for `sdf`. The paper: "from SVG-IR"."""
+    """Learning rate of the centres after the warm-up [object radius]."""
     quats: float = 1e-4
+    """Learning rate of the rotations after the warm-up."""
     log_scales: float = 5e-4
+    """Learning rate of the logarithmic scales after the warm-up."""
     sdf: float = 5e-3
+    """Learning rate of the signed distances after the warm-up [object radius]."""
     poses: float = 0.0
-    """0 leaves the poses of stage 2."""
+    """Learning rate of the tangents of all poses after the warm-up; 0 keeps the poses of stage 2."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Paper values where it states them; where it is silent, what measured best."""
+    """Settings of stage 3: the paper's values where it states them, otherwise those with the best results."""
 
     steps: int = 150_000
-    """Appendix A."""
+    """Number of optimisation steps (appendix A)."""
     warmup: int = 5_000
-    """Steps before geometry joins (appendix A)."""
+    """Steps before geometry is optimised, too (appendix A)."""
     directions: int = 512
-    """Shared directions of the diffuse light (appendix A)."""
+    """Number of shared directions over which light is integrated (appendix A)."""
     sets: int = 8
-    """Turned sets of directions, taken in turn: more leave less of their pattern in the albedo."""
+    """Number of rotated sets of directions, used alternately, which reduces banding in the albedo."""
     pixels: int = 1024
     """Pixels shaded per step."""
     rows: int = 16
-    """Of the light map at the start (appendix A)."""
+    """Initial number of rows of the environment map (appendix A)."""
     doublings: int = 6
-    """Of the light map, spread evenly over the run (appendix A: up to 1024 rows)."""
+    """How often the environment map's resolution is doubled, at even intervals (appendix A: up to 1024 rows)."""
     roughness: float = 0.4
-    """At the start. The data hardly say: a light too blurred under a lobe too narrow fits as well."""
-    fitted: bool = False
-    """Whether the highlight's width and strength are found at the start by trying them (`highlight.fit`)."""
-    brightness: float = 0.8
-    """Brightest albedo at the start (95 %); the light takes up the rest. Their product is all that stage 2 knows."""
+    """Initial roughness. It is only weakly determined: a narrower lobe under a blurrier light fits nearly as well."""
+    fit_specular: bool = False
+    """Whether roughness and specular scale are initialised by a grid search (`specular_fit.fit`)."""
+    initial_albedo: float = 0.8
+    """95 % quantile of the initial albedo. The factor goes into the light, since stage 2 determines only the product of
+    albedo and light."""
     visibility: bool = True
-    """Whether the object shadows itself."""
+    """Whether the object casts shadows on itself."""
     bounce: Literal["none", "average", "frame"] = "frame"
-    """How the object lights itself: with its mean colour over all frames, as in the paper, or as the frame is lit."""
+    """Indirect light. average: from the mean radiance over all frames, as in the paper. frame: from the radiance under
+    the light of the frame."""
     corners: bool = True
-    """Whether material varies within a Gaussian, between its corners."""
+    """Whether the material varies between the corners of a Gaussian."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
 
 
 @dataclass(frozen=True)
 class Params:
-    """What stage 3 trains."""
+    """Parameters of stage 3."""
 
     gaussians: Gaussians
     gamma: Float[Tensor, ""]
+    """Sharpness of the opacity [1 / object radius]."""
     material: Material
     environment: Environment
     poses: Float[Tensor, "t 6"]
-    log_tint: Float[Tensor, "3"]
-    """How much brighter the highlight is than light and f0 as they stand make it: what says how the product of albedo
-    and light, which the diffuse lobe shows, is shared out. A descent texel by texel hardly moves along that valley."""
+    """Tangents of the pose corrections: `T_cam_obj = exp(poses) @ base`."""
+    log_specular_scale: Float[Tensor, "3"]
+    """Natural logarithm of the specular lobe's scale per channel. The diffuse lobe determines only the product of
+    albedo and light; the specular lobe depends on the light alone and so resolves the ambiguity. As one parameter per
+    channel it converges faster than the texels of the light would."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """A capture and what stage 2 made of it."""
+    """Inputs of stage 3: a capture and the result of stage 2."""
 
     capture: Capture
     refined: Refined
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
+    """Number of steps."""
     return cfg.steps
 
 
 @threads_for_kernels()
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
-    """Materials and light as stage 2 found them; visibility traced."""
+    """The initial state: material and light of stage 2, with traced visibility."""
     refined = inputs.refined
-    # One factor for all channels: a saturated object has a channel that is dark for good reason.
-    share = cfg.brightness / refined.albedo.amax(-1).quantile(0.95)
-    albedo = (refined.albedo * share).clamp(*ALBEDO)
+    # One factor for all channels, since a channel of a saturated object is rightly dark.
+    factor = cfg.initial_albedo / refined.albedo.amax(-1).quantile(0.95)
+    albedo = (refined.albedo * factor).clamp(*ALBEDO_RANGE)
     light = sh_lighting.environment(refined.light, cfg.rows)
     material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
     params = Params(
         gaussians=refined.gaussians,
         gamma=refined.gamma,
         material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
-        environment=Environment.from_radiance(light.radiance / share),
+        environment=Environment.from_radiance(light.radiance / factor),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
-        log_tint=(refined.light.log_highlight + share.log()).repeat(3),
+        log_specular_scale=(refined.light.log_specular_scale + factor.log()).repeat(3),
     )
     params = optim.leaves(params)
-    turns = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
-    memory = {"directions": torch.stack(turns), "price": cfg.weights.highlight * torch.ones_like(params.gamma)}
+    sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
+    memory = {
+        "directions": torch.stack(sets),
+        "specular_penalty": cfg.weights.specular * torch.ones_like(params.gamma),
+    }
     state = State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
-    _look_around(cfg, inputs, state)
-    if cfg.fitted and refined.light.log_highlight.exp() > specular_fit.SURE:
-        fit_highlight(cfg, inputs, state)
+    _trace_visibility(cfg, inputs, state)
+    if cfg.fit_specular and refined.light.log_specular_scale.exp() > specular_fit.MIN_REFINED_SCALE:
+        fit_specular(cfg, inputs, state)
     return state
 
 
 @torch.no_grad()
-def fit_highlight(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Bring the highlight to the width and strength that fit best under the light as it is, and the albedos with it."""
+def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Set roughness, specular scale and albedos to the best fit under the current light, and remove the penalty.
+
+    Leaves the state unchanged if no fit is clearly better than the current one (`specular_fit.fit`).
+    """
     params, capture, parts = state.params, inputs.capture, []
-    widths = sorted({cfg.roughness, *specular_fit.ROUGHNESS})
-    for number in range(0, len(capture), -(-len(capture) // FITTED)):
-        T_cam_obj = pose(params, inputs, number)
-        view = buffers_of(params, T_cam_obj, capture.camera)
-        truth = target_view(capture, number, view.alpha)
-        inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # the outermost pixels mix in the background
-        pixels = _draw(FITTED_PIXELS * cfg.pixels, view, inner, state.rng)
+    roughnesses = sorted({cfg.roughness, *specular_fit.ROUGHNESSES})
+    for frame in range(0, len(capture), -(-len(capture) // FIT_FRAMES)):
+        T_cam_obj = pose(params, inputs, frame)
+        view = render_gbuffer(params, T_cam_obj, capture.camera)
+        truth = target_view(capture, frame, view.alpha)
+        inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
+        pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view, inner, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
         R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
-        shades = [(view, white, 0.0)]
-        for width in widths:
-            rough = {"roughness": torch.full_like(view.features["roughness"], width)}
-            shades.append((replace(view, features=view.features | rough), 0 * white, DIELECTRIC))
-        diffuse, *specular = (_shaded(cfg, state, params, v, points, R_env_obj, a, f0) for v, a, f0 in shades)
-        parts.append((_shown(view, points), diffuse, torch.stack(specular), points.sample(truth.image)))
-    gaussian, diffuse, specular, photograph = zip(*parts, strict=True)
-    samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photograph)))
-    tint, start, n = params.log_tint.exp(), widths.index(cfg.roughness), len(params.gaussians.means)
-    if (found := specular_fit.fit(specular_fit.Samples(*samples), n, start, float(tint.mean()))) is None:
+        lobes = [(view, white, 0.0)]
+        for roughness in roughnesses:
+            rough = {"roughness": torch.full_like(view.features["roughness"], roughness)}
+            lobes.append((replace(view, features=view.features | rough), 0 * white, DIELECTRIC))
+        diffuse, *specular = (_shade(cfg, state, params, v, points, R_env_obj, a, f0) for v, a, f0 in lobes)
+        parts.append((_dominant_gaussian(view, points), diffuse, torch.stack(specular), points.sample(truth.image)))
+    gaussian, diffuse, specular, photo = zip(*parts, strict=True)
+    samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photo)))
+    scale, initial, n = params.log_specular_scale.exp(), roughnesses.index(cfg.roughness), len(params.gaussians.means)
+    best = specular_fit.fit(specular_fit.Samples(*samples), n, initial, float(scale.mean()))
+    if best is None:
         return
-    before, after = tint * found.slope[start], found.slope[found.which]
-    albedo = params.material.albedo + (before - found.strength * after)[:, None]
-    params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*ALBEDO)))
-    params.material.roughness_logits.fill_(TEMPERATURE * torch.logit(torch.tensor(widths[found.which])))
-    params.log_tint.fill_(math.log(found.strength))
-    state.memory["price"] = torch.zeros_like(params.gamma)
+    before = scale * best.albedo_per_scale[initial]
+    after = best.albedo_per_scale[best.roughness_index]
+    albedo = params.material.albedo + (before - best.specular_scale * after)[:, None]
+    roughness = torch.tensor(roughnesses[best.roughness_index])
+    params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*ALBEDO_RANGE)))
+    params.material.roughness_logits.fill_(TEMPERATURE * torch.logit(roughness))
+    params.log_specular_scale.fill_(math.log(best.specular_scale))
+    state.memory["specular_penalty"] = torch.zeros_like(params.gamma)
 
 
 def _rates(cfg: Config) -> dict[str, float]:
+    """Learning rates by name prefix of the parameters."""
     rates = cfg.rates
     return {
         "material.albedo_logits": rates.albedo,
@@ -237,47 +257,47 @@ def _rates(cfg: Config) -> dict[str, float]:
         "gaussians.sh": 0.0,
         "gamma": 0.0,
         "poses": rates.poses,
-        "log_tint": rates.tint,
+        "log_specular_scale": rates.specular_scale,
     }
 
 
 @torch.no_grad()
-def _look_around(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Trace what every Gaussian sees, from the surface that it stands for."""
+def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Trace the visibility of all Gaussians from their surface points and store it, with the geometry, in the state."""
     if not cfg.visibility:
         return
     params, gaussians = state.params, state.params.gaussians
-    poses = [pose(params, inputs, number) for number in range(len(inputs.capture))]
+    poses = [pose(params, inputs, frame) for frame in range(len(inputs.capture))]
     points = surface_points(gaussians, params.gamma, poses, inputs.capture.camera)
-    tracer = build(gaussians, params.gamma)
-    seen = [
+    tracer = build_tracer(gaussians, params.gamma)
+    traced = [
         visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce != "none")
         for directions in state.memory["directions"]
     ]
-    state.memory["bits"] = torch.stack([v.bits for v in seen])
+    state.memory["bits"] = torch.stack([v.bits for v in traced])
     state.memory |= {f"traced.{name}": x.detach().clone() for name, x in tree.named_tensors(gaussians).items()}
     if cfg.bounce != "none":
-        state.memory["transfer"] = transfer(seen, gaussians.normals)
-        state.memory["blocker"] = torch.stack([v.blocker for v in seen if v.blocker is not None])
+        state.memory["transfer"] = transfer(traced, gaussians.normals)
+        state.memory["blocker"] = torch.stack([v.blocker for v in traced if v.blocker is not None])
 
 
-def _look_again(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Trace anew when geometry has moved by about the width of a shadow's edge since the last time."""
-    if not cfg.visibility or state.step < cfg.warmup or state.step % LOOK_EVERY:
+def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Trace visibility again when geometry has moved by about the width of a shadow's edge since the last time."""
+    if not cfg.visibility or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
         return
     traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
-    if displacement(traced, state.params.gaussians) > MOVED:
-        _look_around(cfg, inputs, state)
+    if displacement(traced, state.params.gaussians) > MAX_DISPLACEMENT:
+        _trace_visibility(cfg, inputs, state)
 
 
-def pose(params: Params, inputs: Inputs, number: int) -> SE3:
+def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
     """`T_cam_obj` of one frame."""
-    base = inputs.refined.trajectory.T_cam_obj[number]
-    return SE3.exp(params.poses[number]) @ base if params.poses.requires_grad else base
+    base = inputs.refined.trajectory.T_cam_obj[frame]
+    return SE3.exp(params.poses[frame]) @ base if params.poses.requires_grad else base
 
 
-def uncornered(params: Params) -> Params:
-    """The same with one material per Gaussian, the mean of its corners."""
+def without_corners(params: Params) -> Params:
+    """The parameters with one material per Gaussian: the mean of its corners."""
 
     def mean(x: Tensor) -> Tensor:
         return x.mean(1, keepdim=True).expand_as(x)
@@ -289,45 +309,48 @@ def uncornered(params: Params) -> Params:
 
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+    """One optimisation step on random pixels of a random frame; the weighted loss terms."""
     assert state.optimizer is not None, "init makes one"
-    _grow_light(cfg, state)
-    _look_again(cfg, inputs, state)
+    _upsample_light(cfg, state)
+    _retrace_if_moved(cfg, inputs, state)
     params, capture = state.params, inputs.capture
     if state.step < cfg.warmup:
-        # Not yet trained: half of the rasterizer's backward pass is for nobody.
+        # Geometry and poses are fixed; this saves half of the rasterizer's backward pass.
         params = replace(params, gaussians=tree.detach(params.gaussians), poses=params.poses.detach())
-    number = int(torch.randint(len(capture), (1,), generator=state.rng))
-    T_cam_obj = pose(params, inputs, number)
-    view = buffers_of(params if cfg.corners else uncornered(params), T_cam_obj, capture.camera)
-    truth = target_view(capture, number, view.alpha)
-    points = surface(view, T_cam_obj, capture.camera, pixels=_draw(cfg.pixels, view, truth.mask, state.rng))
-    R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_tint.exp()
-    shaded = _shaded(cfg, state, params, view, points, R_env_obj, points.sample(view.features["albedo"]), f0)
-    rendered, photograph = (shaded * points.sample(view.alpha[..., None]))[None], points.sample(truth.image)[None]
+    frame = int(torch.randint(len(capture), (1,), generator=state.rng))
+    T_cam_obj = pose(params, inputs, frame)
+    view = render_gbuffer(params if cfg.corners else without_corners(params), T_cam_obj, capture.camera)
+    truth = target_view(capture, frame, view.alpha)
+    points = surface(view, T_cam_obj, capture.camera, pixels=_sample_pixels(cfg.pixels, view, truth.mask, state.rng))
+    R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_specular_scale.exp()
+    shaded = _shade(cfg, state, params, view, points, R_env_obj, points.sample(view.features["albedo"]), f0)
+    rendered, photo = (shaded * points.sample(view.alpha[..., None]))[None], points.sample(truth.image)[None]
+    difference = (losses.srgb_as_captured(rendered, photo) - photo).abs().sum()
     terms = {
-        # A frame may show no pixel of the object for sure.
-        "render": (losses.developed(rendered, photograph) - photograph).abs().sum() / (3 * max(1, len(points.pixels))),
-        "light": cfg.weights.light * losses.unevenness(params.environment.radiance),
+        # A frame may have no pixel that certainly shows the object.
+        "render": difference / (3 * max(1, len(points.pixels))),
+        "light": cfg.weights.light * losses.light_smoothness(params.environment.radiance),
         "mask": cfg.weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
-        "material": cfg.weights.material * losses.material(view, truth.mask, truth.image),
-        "highlight": state.memory["price"] * (1 - (-params.log_tint.exp().mean() / FAINT).exp()),
+        "material": cfg.weights.material * losses.material_smoothness(view, truth.mask, truth.image),
+        "specular": state.memory["specular_penalty"]
+        * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
     }
-    slow = 0.1 ** (state.step / cfg.steps)
-    joined = slow * (state.step >= cfg.warmup)
-    optim.anneal(state.optimizer, {"": slow, "gaussians": joined, "poses": joined})
+    decayed = 0.1 ** (state.step / cfg.steps)
+    after_warmup = decayed * (state.step >= cfg.warmup)
+    optim.anneal(state.optimizer, {"": decayed, "gaussians": after_warmup, "poses": after_warmup})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
 
 
-def _draw(n: int, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
-    """Some pixels that show the object for sure."""
+def _sample_pixels(n: int, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
+    """`n` random pixels that certainly show the object, counted row by row; none if there are no such pixels."""
     solid = torch.where(((view.alpha > 0.5) & (mask > 0.5)).flatten())[0]
     if not len(solid):
         return solid
     return solid[torch.randint(len(solid), (n,), generator=rng).to(solid.device)]
 
 
-def _shaded(
+def _shade(
     cfg: Config,
     state: State,
     params: Params,
@@ -337,24 +360,26 @@ def _shaded(
     albedo: Float[Tensor, "p 3"],
     f0: float | Tensor,
 ) -> Float[Tensor, "p 3"]:
+    """Reflected radiance of surface points under the current light, with cached visibility."""
     return shade_split(
         points,
         albedo,
         points.sample(view.features["roughness"]),
         prefilter(params.environment),
         R_env_obj,
-        _seen(cfg, state, _shown(view, points)),
+        _pixel_visibility(cfg, state, _dominant_gaussian(view, points)),
         f0=f0,
         bounce=_bounce(cfg, state, params),
     )
 
 
-def _shown(view: Buffers, points: Surface) -> Tensor:
-    """The Gaussian that counts most at each point."""
+def _dominant_gaussian(view: Buffers, points: Surface) -> Tensor:
+    """Index of the Gaussian with the largest blending weight at each point."""
     return view.dominant.flatten()[points.pixels].clamp_min(0).long()
 
 
 def _bounce(cfg: Config, state: State, params: Params) -> Bounce | AveragedBounce | None:
+    """Indirect light as chosen by the settings, None for none."""
     if cfg.bounce == "none" or not cfg.visibility:
         return None
     if cfg.bounce == "average":
@@ -362,18 +387,18 @@ def _bounce(cfg: Config, state: State, params: Params) -> Bounce | AveragedBounc
     return Bounce(params.material.albedo.mean(1), state.memory["transfer"])
 
 
-def _seen(cfg: Config, state: State, index: Tensor) -> Visibility:
-    """What pixels see under this step's set of directions: the same as the Gaussians `index` that they show."""
-    memory, which = state.memory, state.step % cfg.sets
-    directions = memory["directions"][which]
+def _pixel_visibility(cfg: Config, state: State, index: Tensor) -> Visibility:
+    """Visibility of pixels for this step's set of directions: that of the Gaussians `index` that they show."""
+    memory, current = state.memory, state.step % cfg.sets
+    directions = memory["directions"][current]
     if not cfg.visibility:
         return unoccluded(directions, len(index))
-    blocker = memory["blocker"][which] if cfg.bounce != "none" else None
-    return Visibility(directions, memory["bits"][which], blocker).gather(index)
+    blocker = memory["blocker"][current] if cfg.bounce != "none" else None
+    return Visibility(directions, memory["bits"][current], blocker).gather(index)
 
 
-def _grow_light(cfg: Config, state: State) -> None:
-    """Double the light map at even intervals; the optimizer goes on."""
+def _upsample_light(cfg: Config, state: State) -> None:
+    """Double the environment map's resolution when it is due, and the optimizer's moments with it."""
     done = round(math.log2(state.params.environment.log_radiance.shape[0] / cfg.rows))
     due = min(cfg.doublings, state.step * (cfg.doublings + 1) // cfg.steps)
     if done >= due:
@@ -393,17 +418,17 @@ def _grow_light(cfg: Config, state: State) -> None:
     state.params = replace(state.params, environment=environment)
 
 
-def shared_out(params: Params) -> Params:
-    """The same with the tint of the highlight moved where it belongs: `highlight.shared_out`."""
-    material, log_tint = specular_fit.shared_out(params.material, params.log_tint)
-    environment = Environment(params.environment.log_radiance + log_tint)
-    return replace(params, material=material, environment=environment, log_tint=torch.zeros_like(log_tint))
+def absorb_specular_scale(params: Params) -> Params:
+    """Equivalent parameters with a specular scale of 1, see `specular_fit.absorb_specular_scale`."""
+    material, log_gain = specular_fit.absorb_specular_scale(params.material, params.log_specular_scale)
+    environment = Environment(params.environment.log_radiance + log_gain)
+    return replace(params, material=material, environment=environment, log_specular_scale=torch.zeros_like(log_gain))
 
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
-    """The relightable object."""
-    params = shared_out(state.params if cfg.corners else uncornered(state.params))
+    """The relightable asset."""
+    params = absorb_specular_scale(state.params if cfg.corners else without_corners(state.params))
     T_cam_obj = SE3.exp(params.poses) @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,

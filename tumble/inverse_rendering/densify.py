@@ -1,7 +1,8 @@
-"""Where Gaussians are added and dropped: decisions only, as a gather (`optim.regrow` carries them out).
+"""Densification and pruning: decides which Gaussians are split and removed; `optim.regrow` applies the decision.
 
-A *plan* lists the rows of the next generation: rows that stay appear once, rows that split appear twice, dropped rows
-not at all. The score is FastGS's: how many badly rendered pixels a Gaussian touches, over several views at once.
+A *plan* lists the parent row of every Gaussian afterwards: kept rows appear once, split rows twice, pruned rows not at
+all. The score of a Gaussian is that of FastGS: the number of badly rendered pixels that it contributes to, as a mean
+over several views.
 """
 
 import math
@@ -16,67 +17,70 @@ from tumble.scene import Gaussians
 
 @dataclass(frozen=True)
 class Config:
-    """When Gaussians are added and dropped; names are those of 3D Gaussian splatting, the score is FastGS's."""
+    """Settings of densification and pruning, named as in 3D Gaussian splatting."""
 
     refine_every: int = 500
     """Steps between densifications (FastGS)."""
     refine_stop: float = 0.7
-    """Share of the run after which the number of Gaussians stays."""
+    """Fraction of the run after which the number of Gaussians is constant."""
     max_gaussians: int = 100_000
+    """Upper limit of the number of Gaussians."""
     score_views: int = 10
     """Views that are scored at each densification (FastGS)."""
-    bad_share: float = 0.1
-    """Share of a view's largest error from which a pixel counts as bad (FastGS)."""
-    bad_floor: float = 0.02
-    """Least error of a bad pixel, sRGB."""
+    bad_fraction: float = 0.1
+    """Fraction of a view's largest error above which a pixel counts as bad (FastGS)."""
+    bad_min_error: float = 0.02
+    """Minimum error of a bad pixel [sRGB]."""
     grow_score: float = 2.0
-    """Bad pixels that a Gaussian touches, mean over views, from which it splits."""
-    grow_share: float = 0.12
-    """Largest share of the Gaussians that splits at once."""
+    """Score above which a Gaussian is split [bad pixels per view]."""
+    grow_fraction: float = 0.12
+    """Maximum fraction of the Gaussians that is split at once."""
     prune_opacity: float = 0.05
-    """Opacity below which a Gaussian is dropped."""
+    """Opacity below which a Gaussian is removed."""
     prune_weight: float = 0.05
-    """Blending weight that a Gaussian must reach in some view since the last densification, else it lies inside and is
-    dropped [pixels]."""
+    """Blending weight [pixels] that a Gaussian must reach in some view since the last densification; otherwise it is
+    removed, since it lies inside the object."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The next generation."""
+    """The Gaussians after a densification, as indices of the Gaussians before it."""
 
     index: Int[Tensor, " m"]
-    """Row of the parent of every Gaussian."""
+    """Parent row of every Gaussian."""
     fresh: Bool[Tensor, " m"]
-    """Children of a split: they start with empty optimizer moments."""
+    """Whether a Gaussian is the child of a split; its optimizer moments start at zero."""
     n_kept: int
-    """Rows that stay; behind them come first all first children, then all second ones."""
+    """Number of kept rows, which come first; then follow all first children, then all second children."""
 
 
 def bad_pixels(cfg: Config, error: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """1 where the rendering is bad: above a share of the view's largest error on the object, and above a floor.
+    """1 where the rendering error on the object exceeds both thresholds (relative and absolute), 0 elsewhere.
 
-    The floor keeps a nearly perfect picture from being split for its noise; the background does not set the scale.
+    The absolute threshold avoids splits for the noise of a nearly perfect rendering. The background does not enter the
+    largest error.
     """
     error = error * mask
-    return ((error > cfg.bad_share * error.max()) & (error > cfg.bad_floor)).to(error.dtype)
+    return ((error > cfg.bad_fraction * error.max()) & (error > cfg.bad_min_error)).to(error.dtype)
 
 
-def plan(cfg: Config, score: Float[Tensor, " n"], drop: Bool[Tensor, " n"]) -> Plan:
-    """Split the Gaussians of the highest scores, drop the useless.
+def plan(cfg: Config, score: Float[Tensor, " n"], prune: Bool[Tensor, " n"]) -> Plan:
+    """Split the Gaussians with the highest scores, within the limits of the settings, and remove pruned ones.
 
     Args:
-        score: Bad pixels touched, mean over views.
-        drop: Rows to leave out.
+        cfg: Settings.
+        score: Number of bad pixels each Gaussian contributes to, mean over views.
+        prune: Gaussians to remove.
     """
     n = len(score)
-    room = max(0, cfg.max_gaussians - (n - int(drop.sum())))
-    most = min(room, math.ceil(cfg.grow_share * n))
-    candidates = torch.where(drop, -1.0, score)
-    order = candidates.argsort(descending=True, stable=True)[:most]
+    capacity = max(0, cfg.max_gaussians - (n - int(prune.sum())))
+    max_splits = min(capacity, math.ceil(cfg.grow_fraction * n))
+    candidates = torch.where(prune, -1.0, score)
+    order = candidates.argsort(descending=True, stable=True)[:max_splits]
     split = order[candidates[order] > cfg.grow_score]
-    stays = ~drop
-    stays[split] = False
-    kept = torch.where(stays)[0]
+    keep = ~prune
+    keep[split] = False
+    kept = torch.where(keep)[0]
     index = torch.cat([kept, split, split])
     fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
     fresh[len(kept) :] = True
@@ -85,9 +89,9 @@ def plan(cfg: Config, score: Float[Tensor, " n"], drop: Bool[Tensor, " n"]) -> P
 
 @torch.no_grad()
 def place_children(gaussians: Gaussians, plan: Plan) -> None:
-    """Move the children of every split apart along their longer tangential axis and shrink them, in place.
+    """Move the two children of every split apart along their longer tangential axis and shrink them, in place.
 
-    Two half-covering children at +-0.5 sigma with 1/1.6 of the width repeat their parent's footprint closely.
+    Children at +-0.5 sigma with 1/1.6 of the parent's width together cover nearly the parent's footprint.
     """
     children = torch.where(plan.fresh)[0]
     if not len(children):

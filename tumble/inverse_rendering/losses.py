@@ -1,7 +1,7 @@
-"""The terms of the paper's objectives (eq. 11, 14). Each is a scalar; none knows a model.
+"""Terms of the paper's objectives (eq. 11, 14), each a scalar.
 
-Pictures are sRGB in [0, 1], channels last. `valid` is 1 where the mask is known and 0 where it is not: unknown pixels
-enter no term.
+Images are sRGB in [0, 1], channels last. `photo` is the input image. `valid` is 1 where the mask is known and 0
+elsewhere; pixels with an unknown mask do not contribute.
 """
 
 import torch
@@ -14,49 +14,53 @@ from tumble.rendering import Buffers
 from tumble.scene import Camera, Gaussians
 
 SSIM_MARGIN = 10
-"""Pixels by which the window of `images.ssim_map` reaches beyond one of its pixels, both sides together."""
+"""Width of the window of `images.ssim_map` minus one [pixels]."""
 SATURATED = 254 / 255
-"""Code value from which a photograph only says "at least this bright"."""
+"""Value of the input image from which a pixel counts as saturated [sRGB]."""
 
 
-def developed(linear: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """A rendering as the camera would store it, for comparison with a photograph.
+def srgb_as_captured(linear: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """A linear rendering in sRGB, clipped to the input image where the input image is saturated.
 
-    The sRGB curve goes on beyond 1, so that a pixel rendered too bright has a gradient; only where the photograph is
-    saturated itself does a brighter rendering count as equal.
+    Elsewhere values above 1 are not clipped, so that a pixel rendered too bright has a gradient.
     """
     srgb = srgb_from_linear(linear)
-    return torch.where((photograph >= SATURATED) & (srgb > photograph), photograph, srgb)
+    return torch.where((photo >= SATURATED) & (srgb > photo), photo, srgb)
 
 
 def photometric(
     rendered: Float[Tensor, "h w 3"],
-    photograph: Float[Tensor, "h w 3"],
+    photo: Float[Tensor, "h w 3"],
     valid: Float[Tensor, "h w 1"],
     *,
     ssim_weight: float,
     size: tuple[int, int] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) L1 + w (1 - SSIM) over the picture (L_render, eq. 11).
+    """(1 - w) L1 + w (1 - SSIM), averaged over the image, with w = `ssim_weight` (L_render, eq. 11).
 
     Args:
-        size: Height and width of the picture where only a window of it is given, outside of which both are black, as
-            is a margin of `SSIM_MARGIN` inside unless the picture ends there: the result is that of the whole picture.
+        rendered: Rendered image, or a window of it.
+        photo: Input image, or the same window of it.
+        valid: Validity of the pixels.
+        ssim_weight: Weight of the SSIM term, 0 to 1.
+        size: Height and width of the whole image if a window is given; the result is that of the whole image. Both
+            images must be black outside of the window, and in a margin of `SSIM_MARGIN` inside of it except at the
+            borders of the image.
     """
     height, width = size or rendered.shape[:2]
-    rendered, photograph = rendered * valid, photograph * valid
-    difference = (rendered - photograph).abs().sum() / (3 * height * width)
-    unlike = (1 - ssim_map(rendered, photograph)).sum() / (3 * (height - SSIM_MARGIN) * (width - SSIM_MARGIN))
-    return (1 - ssim_weight) * difference + ssim_weight * unlike
+    rendered, photo = rendered * valid, photo * valid
+    l1 = (rendered - photo).abs().sum() / (3 * height * width)
+    dissimilarity = (1 - ssim_map(rendered, photo)).sum() / (3 * (height - SSIM_MARGIN) * (width - SSIM_MARGIN))
+    return (1 - ssim_weight) * l1 + ssim_weight * dissimilarity
 
 
 def silhouette(
     alpha: Float[Tensor, "h w"], mask: Float[Tensor, "h w"], valid: Float[Tensor, "h w 1"]
 ) -> Float[Tensor, ""]:
-    """Squared difference between coverage and mask.
+    """Mean squared difference between coverage and mask.
 
-    The relatives take binary cross entropy; a pixel that the object covers by half has a hard mask all the same, and
-    cross entropy pays without bound for admitting it.
+    Related methods use binary cross entropy, which is unbounded: it would penalise the correct coverage of half-covered
+    pixels, whose mask is 0 or 1, without limit.
     """
     return ((alpha - mask) ** 2 * valid[..., 0]).mean()
 
@@ -64,10 +68,11 @@ def silhouette(
 def surface_normals(
     depth: Float[Tensor, "h w"], covered: Bool[Tensor, "h w"], camera: Camera, T_cam_obj: SE3
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Normals of the depth map by central differences, object frame, and where all four neighbours are covered.
+    """Unit normals of a depth map by central differences, object frame, and the mask of pixels where they are defined.
 
-    With x = z (X, Y, 1) on the ray through a pixel, the cross product of the differences along both axes of the image
-    is a positive multiple of (p, q, -1 - p X - q Y), where p = fx (z_right - z_left) / (z_right + z_left) and q alike.
+    A normal is defined where a pixel and its four neighbours are covered. With points x = z (X, Y, 1) on the rays
+    through the pixels, the cross product of the differences along both image axes is a positive multiple of
+    (p, q, -1 - p X - q Y), where p = fx (z_right - z_left) / (z_right + z_left), and likewise q along the columns.
     """
     inner = covered[1:-1, 1:-1] & covered[1:-1, 2:] & covered[1:-1, :-2] & covered[2:, 1:-1] & covered[:-2, 1:-1]
     known = pad(inner, (1, 1, 1, 1))
@@ -91,38 +96,46 @@ def normal_consistency(
     *,
     crease: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """x = 1 - cosine between rendered normals and those of the depth (L_normal, eq. 11), averaged over the picture.
+    """1 - cosine between rendered normals and normals of the depth map, averaged over the image (L_normal, eq. 11).
 
     Args:
-        crease: With c above 0, x / (1 + c x): differences beyond 1 / c are an edge or a groove, which smoothing would
-            round off or fill.
+        normal: Rendered normals, object frame, of any length.
+        from_depth: Unit normals of the depth map, object frame.
+        known: Where `from_depth` is defined.
+        crease: If c > 0, the difference x becomes x / (1 + c x), which saturates beyond 1 / c: large differences are
+            edges or grooves, which the term would otherwise round off or fill.
     """
     # One plane per axis: sums over short rows are slow.
     a, b = channels_first(normal), channels_first(from_depth)
     cosine = (a * b).sum(0) / a.square().sum(0).clamp_min(1e-24).sqrt()
-    apart = 1 - cosine
-    return (apart / (1 + crease * apart) * known).mean()
+    difference = 1 - cosine
+    return (difference / (1 + crease * difference) * known).mean()
 
 
 def variance(depth_var: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Standard deviation of depth along each ray (L_variance, eq. 11)."""
+    """Mean standard deviation of the depth along each ray (L_variance, eq. 11)."""
     return (depth_var.clamp_min(0) + 1e-6).sqrt().mean() - 1e-3
 
 
 def effective_rank(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Penalty on needles: 0 for discs and balls (L_rank, eq. 11), and the mean thickness, which is what flattens."""
+    """Penalty on needle-shaped Gaussians plus mean thickness (L_rank, eq. 11).
+
+    The penalty is 0 for discs and spheres; the thickness term flattens all Gaussians.
+    """
     # Three long rows: softmax over many short ones takes most of a millisecond.
-    log_share = (2 * log_scales.mT.contiguous()).log_softmax(0)
-    entropy = -(log_share.exp() * log_share).sum(0)
+    log_fraction = (2 * log_scales.mT.contiguous()).log_softmax(0)
+    entropy = -(log_fraction.exp() * log_fraction).sum(0)
     needle = (-(entropy.exp() - 1).clamp_min(1e-4).log()).clamp_min(0)
     return needle.mean() + log_scales[:, 2].exp().mean()
 
 
 def sharpness(sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""], *, floor: float) -> Float[Tensor, ""]:
-    """How far gamma is below the value at which the median Gaussian is half opaque (L_gamma).
+    """Difference by which gamma is below the value at which the median Gaussian has an opacity of 1/2 (L_gamma).
 
     Args:
-        floor: Median distance under which gamma is not pushed further [object radius].
+        sdf: Signed distances of the Gaussians [object radius].
+        gamma: Sharpness of the opacity [1 / object radius].
+        floor: Lower limit of the median distance, which limits gamma [object radius].
     """
     median = sdf.detach().abs().median().clamp_min(floor)
     return (1.762747 / median - gamma).clamp_min(0)
@@ -130,19 +143,24 @@ def sharpness(sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""], *, floor: floa
 
 def projection(
     gaussians: Gaussians,
-    seen: Bool[Tensor, " n"],
+    visible: Bool[Tensor, " n"],
     depth: Float[Tensor, "h w"],
     camera: Camera,
     T_cam_obj: SE3,
     *,
     reach: float,
 ) -> Float[Tensor, ""]:
-    """Centres moved to the surface by their own signed distance should meet the rendered depth (L_proj).
+    """Mean absolute difference between rendered depth and the Gaussians' projected surface points (L_proj).
+
+    The surface point of a Gaussian is its centre, moved along the normal by its signed distance.
 
     Args:
-        seen: Gaussians that the view shows.
-        depth: Rendered depth; no gradient flows to it.
-        reach: Differences beyond this are another surface and do not count [object radius].
+        gaussians: All Gaussians.
+        visible: Gaussians that the view shows, over which the mean is taken.
+        depth: Rendered depth [object radius]; no gradient flows to it.
+        camera: Intrinsics of the view.
+        T_cam_obj: Pose of the view.
+        reach: Differences above this belong to another surface and count as 0 [object radius].
     """
     offset = gaussians.sdf[:, None] * gaussians.normals
     R_cam_obj = T_cam_obj.rotation.matrix()
@@ -153,22 +171,22 @@ def projection(
         at = (uv / uv.new_tensor([camera.width, camera.height]) * 2 - 1)[None, None]
         surface = grid_sample(depth[None, None], at, align_corners=False)[0, 0, 0]
         error = surface - z
-        counts = seen & (error.abs() < reach) & (surface > 0)
-        share = torch.where(counts, error.sign(), 0.0) / seen.sum().clamp_min(1)
-        surface = torch.where(counts, surface, 0.0)
-    return (share * (surface - z)).sum()
+        inlier = visible & (error.abs() < reach) & (surface > 0)
+        weight = torch.where(inlier, error.sign(), 0.0) / visible.sum().clamp_min(1)
+        surface = torch.where(inlier, surface, 0.0)
+    return (weight * (surface - z)).sum()
 
 
-def unevenness(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Mean squared difference between neighbouring texels of a light map, around the seam too (L_light, eq. 14)."""
+def light_smoothness(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean squared difference of neighbouring texels of an environment map, also across its seam (L_light, eq. 14)."""
     down, across = radiance[1:] - radiance[:-1], radiance.roll(-1, 1) - radiance
     return (down**2).mean() + (across**2).mean()
 
 
-def material(view: Buffers, mask: Float[Tensor, "h w"], photograph: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Edge-aware smoothness of albedo and roughness, which count as 0 beyond the outline (L_material, eq. 14).
+def material_smoothness(view: Buffers, mask: Float[Tensor, "h w"], photo: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Edge-aware smoothness of albedo and roughness (L_material, eq. 14; Relightable 3D Gaussian).
 
-    So it was published (Relightable 3D Gaussian). At the weights of STANDARD a torus loses nothing by it.
+    Outside of the silhouette both are 0, as published, so that the term also acts at the contour.
     """
     inside = (mask * (view.alpha > 0.5))[..., None]
-    return edge_aware(torch.cat([view.features["albedo"], view.features["roughness"]], -1) * inside, photograph)
+    return edge_aware(torch.cat([view.features["albedo"], view.features["roughness"]], -1) * inside, photo)

@@ -1,7 +1,7 @@
-"""Stage 2: geometry, poses and a first guess of albedo and light, by fitting Gaussians to the frames (section 4.2).
+"""Stage 2: joint optimisation of Gaussians and poses, with initial albedo and light (paper section 4.2).
 
-The Gaussians start on the visual hull of the masks. Their colour is the rotation-aware one of `coarse_light`; the
-paper's static colour per Gaussian is an ablation (`Config.colour`).
+The Gaussians are initialised on the visual hull of the masks. Their colour is shaded by one spherical-harmonic light
+(`sh_lighting`); the paper's static radiance per Gaussian is an ablation (`Config.colour`).
 """
 
 from dataclasses import dataclass, field, replace
@@ -15,9 +15,9 @@ from torch.nn.functional import normalize
 
 from tumble.engine import State, optim
 from tumble.inverse_rendering import densify, losses, sh_lighting
-from tumble.inverse_rendering.photometric_alignment import realign
-from tumble.inverse_rendering.self_shadowing import Sky, look_around
-from tumble.inverse_rendering.sh_lighting import CoarseLight
+from tumble.inverse_rendering.photometric_alignment import align_pose
+from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
+from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.maths import SE3, channels_first, crop, crop_box
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
@@ -28,141 +28,159 @@ from tumble.scene import (
     Trajectory,
     constant_sh,
     env_from_obj,
-    facing,
     opacity,
+    quats_from_normals,
     sdf_from_opacity,
     target_view,
     visual_hull,
 )
 
 VERSION = 9
-SEEN_FROM = 16  # frames, in tracing what Gaussians see
-HINT = 0.3
-"""Share of the gradient of colours that turns normals: the light is too coarse to be trusted. Hand-held, all of it
-leaves the knight's normals at 8.2 degrees, this share or none at 7.3; the bottle's are 3.8 with it, 4.0 without."""
-OUTLINE = 0.3
-"""Weight of coverage against colours where poses are realigned."""
+VISIBILITY_VIEWS = 16
+"""Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
+NORMAL_GRADIENT = 0.3
+"""Factor of the gradient from shading to the normals: the low-order light causes errors in the full gradient."""
+COVERAGE_WEIGHT = 0.3
+"""Weight of coverage residuals relative to colour residuals in photometric alignment."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Eq. 11; values from appendix A, stage 2. A hundredth of `gamma` counts; its rate moves gamma whatever that is,
-    for nothing else pulls at it and Adam knows no scale."""
+    """Weights of the loss terms (eq. 11); values from appendix A, stage 2."""
 
     mask: float = 1.0
+    """Weight of the silhouette term."""
     normal: float = 0.05
+    """Weight of the consistency of normals and depth."""
     variance: float = 1.0
+    """Weight of the standard deviation of depth along the rays."""
     rank: float = 0.1
+    """Weight of the penalty on needle-shaped Gaussians."""
     gamma: float = 5.0
+    """Weight of the sharpness term, divided by 100 in the sum. Its value hardly matters: no other term has a strong
+    gradient to gamma, and Adam is invariant to the scale of the gradient."""
     proj: float = 1.0
-    highlight: float = 0.0
-    """Of an object whose highlight is not that of glass. It saturates: noise in normals and light alone pulls the
-    highlight down by a third, and a third too faint puts the rest into the albedo; a Lambertian object pays it.
-    """
+    """Weight of the projection term."""
+    specular: float = 0.0
+    """Weight of the penalty on specular scales other than 1. It saturates, so that a Lambertian object can still reach
+    a scale near 0; without it, noise of normals and light lowers the scale."""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates. The paper takes those of 3DGS; ours suit a start on the hull and a few thousand steps."""
+    """Adam's learning rates, for an initial visual hull and a few thousand steps; the paper takes those of 3DGS."""
 
     means: float = 1e-3
-    """[object radius]; decays to `decay` of it."""
+    """Learning rate of the centres [object radius]; decays exponentially by the factor `decay`."""
     quats: float = 4e-3
+    """Learning rate of the rotations."""
     log_scales: float = 8e-3
+    """Learning rate of the logarithmic scales."""
     sdf: float = 2e-3
+    """Learning rate of the signed distances [object radius]."""
     gamma: float = 0.05
+    """Learning rate of the sharpness of the opacity [1 / object radius]; constant."""
     albedo: float = 2e-2
+    """Learning rate of the albedo logits."""
     light: float = 2e-2
-    highlight: float = 0.0
-    """Of the strength of the highlight; 0 leaves it that of glass."""
+    """Learning rate of the coefficients of the light."""
+    specular_scale: float = 0.0
+    """Learning rate of the logarithmic specular scale; 0 fixes the scale at 1."""
     sh: float = 1e-2
+    """Learning rate of the static radiance, if `Config.colour` is "sh"."""
     poses: float = 0.0
-    """Of the tangents of all poses."""
+    """Learning rate of the tangents of all poses."""
     decay: float = 0.05
+    """Factor by which the learning rate of the centres decays over the run."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Paper values where it states them; where it is silent, what measured best."""
+    """Settings of stage 2: the paper's values where it states them, otherwise those with the best results."""
 
     steps: int = 150_000
-    """Appendix A."""
+    """Number of optimisation steps (appendix A)."""
     colour: Literal["light", "sh"] = "light"
-    """light: rotation-aware; sh: the paper's static radiance per Gaussian, degree 3."""
+    """light: shading by one light for all Gaussians. sh: the paper's static radiance per Gaussian, degree 3."""
     points: int = 20_000
-    """Gaussians at the start. Not stated in the paper."""
+    """Initial number of Gaussians; not stated in the paper."""
     hull: int = 128
-    """Cells per side of the carved grid."""
+    """Cells per side of the visual hull's grid."""
     opacity: float = 0.9
-    """At the start."""
+    """Initial opacity."""
     gamma: float = 30.0
-    """Sharpness at the start [1 / object radius]."""
+    """Initial sharpness of the opacity [1 / object radius]."""
     gamma_floor: float = 0.02
-    """Median distance under which gamma is not pushed further (L_gamma) [object radius]."""
+    """Lower limit of the median distance in the gamma term (L_gamma), which limits gamma [object radius]."""
     ssim: float = 0.2
-    """Share of 1 - SSIM in the photometric term."""
+    """Weight of 1 - SSIM in the photometric term."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
     crease: float = 0.0
-    """Of the normal term (`losses.normal_consistency`); 0 as in the paper."""
+    """Saturation of the normal term (`losses.normal_consistency`); 0 as in the paper."""
     ramp: float = 0.1
-    """Share of the run over which normal and variance terms come in."""
+    """Fraction of the run over which the weights of the normal and variance terms rise to their full values."""
     densification: densify.Config = field(default_factory=densify.Config)
-    shaded: float = 0.2
-    """Share of the run from which the object stands in its own shade (`shadow`); before, it is too coarse."""
+    shadow_start: float = 0.2
+    """Fraction of the run after which self-shadowing is applied; before, the geometry is too coarse."""
     realignments: int = 0
-    """How often, at even intervals, each pose is brought in line with its own frame (`realign`)."""
+    """Number of photometric alignments of every pose (`photometric_alignment`), at even intervals."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """All that there is one row of per Gaussian."""
+    """Parameters with one row per Gaussian, which densification gathers together."""
 
     gaussians: Gaussians
     albedo_logits: Float[Tensor, "n 3"]
+    """Linear albedo before the sigmoid."""
 
 
 @dataclass(frozen=True)
 class Params:
-    """What stage 2 trains."""
+    """Parameters of stage 2."""
 
     points: Points
     gamma: Float[Tensor, ""]
-    light: CoarseLight
+    """Sharpness of the opacity [1 / object radius]."""
+    light: SHLight
     poses: Float[Tensor, "t 6"]
-    """Tangents: `T_cam_obj = exp(poses) @ base`."""
+    """Tangents of the pose corrections: `T_cam_obj = exp(poses) @ base`."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """The outcome of stage 2."""
+    """Result of stage 2."""
 
     gaussians: Gaussians
     gamma: Float[Tensor, ""]
+    """Sharpness of the opacity [1 / object radius]."""
     albedo: Float[Tensor, "n 3"]
-    """Linear, up to one factor per channel that the light takes up."""
-    light: CoarseLight
+    """Linear albedo, known only up to one factor per channel, whose inverse is in the light."""
+    light: SHLight
     trajectory: Trajectory
+    """Refined poses."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """A capture and its poses."""
+    """Inputs of stage 2: a capture and its initial poses."""
 
     capture: Capture
     trajectory: Trajectory
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
+    """Number of steps."""
     return cfg.steps
 
 
 @threads_for_kernels()
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
-    """Gaussians on the visual hull, grey, under a uniform light."""
+    """The initial state: grey Gaussians on the visual hull, under a uniform light."""
     like = inputs.trajectory.T_cam_obj.xyz
     cells = visual_hull.carve(inputs.capture, inputs.trajectory, resolution=cfg.hull)
-    start = visual_hull.surface(cells, cfg.points, rng)
+    start = visual_hull.sample_surface(cells, cfg.points, rng)
     n = len(start.positions)
     scale = (0.7 * start.spacing).clamp(1e-3, 0.2)
     gamma = torch.tensor(cfg.gamma).to(like)
@@ -170,7 +188,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     k = 1 if cfg.colour == "light" else 16
     gaussians = Gaussians(
         means=start.positions,
-        quats=facing(start.normals),
+        quats=quats_from_normals(start.normals),
         log_scales=torch.stack([scale, scale, 0.1 * scale], -1).log(),
         sdf=sdf,
         sh=torch.cat([constant_sh(torch.full_like(start.positions, 0.2)), start.positions.new_zeros(n, k - 1, 3)], 1),
@@ -178,15 +196,16 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     params = Params(
         points=Points(gaussians, torch.full_like(start.positions, -0.4)),
         gamma=gamma,
-        light=CoarseLight.constant(0.4, like),
+        light=SHLight.constant(0.4, like),
         poses=like.new_zeros(len(inputs.trajectory), 6),
     )
     params = optim.leaves(params)
-    memory = {"order": torch.zeros(0, dtype=torch.long), "shown": torch.zeros_like(scale)}
+    memory = {"order": torch.zeros(0, dtype=torch.long), "max_weight": torch.zeros_like(scale)}
     return State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
 
 
 def _rates(cfg: Config) -> dict[str, float]:
+    """Learning rates by name of the parameters; 0 for those that the colour model does not use."""
     rates, light = cfg.rates, cfg.colour == "light"
     return {
         "points.gaussians.means": rates.means,
@@ -196,40 +215,51 @@ def _rates(cfg: Config) -> dict[str, float]:
         "points.gaussians.sh": 0.0 if light else rates.sh,
         "points.albedo_logits": rates.albedo if light else 0.0,
         "light.coefficients": rates.light if light else 0.0,
-        "light.log_highlight": rates.highlight if light else 0.0,
+        "light.log_specular_scale": rates.specular_scale if light else 0.0,
         "gamma": rates.gamma,
         "poses": rates.poses,
     }
 
 
-def pose(params: Params, inputs: Inputs, number: int) -> SE3:
+def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
     """`T_cam_obj` of one frame."""
-    base = inputs.trajectory.T_cam_obj[number]
-    # Poses that are left as given have tangents of 0, which take a hundred small tensors to say nothing.
-    free = params.poses.requires_grad or bool(params.poses[number].any())
-    return SE3.exp(params.poses[number]) @ base if free else base
+    base = inputs.trajectory.T_cam_obj[frame]
+    # Fixed poses have zero tangents; the exponential map, some hundred small operations, is skipped for speed.
+    corrected = params.poses.requires_grad or bool(params.poses[frame].any())
+    return SE3.exp(params.poses[frame]) @ base if corrected else base
 
 
 def render(
     points: Points,
     gamma: Tensor,
-    light: CoarseLight,
+    light: SHLight,
     T_cam_obj: SE3,
     trajectory: Trajectory,
     camera: Camera,
     mask: Tensor | None = None,
     *,
-    sky: Sky | None = None,
+    visibility: VisibilityTransfer | None = None,
 ) -> Buffers:
-    """One view with stage 2's colour, linear radiance; without a sky nothing shadows anything."""
+    """One view with stage 2's colour model, in linear radiance.
+
+    Args:
+        points: Gaussians and albedo.
+        gamma: Sharpness of the opacity [1 / object radius].
+        light: Light in the env frame.
+        T_cam_obj: Pose of the view.
+        trajectory: Defines the env frame; its poses are not used.
+        camera: Intrinsics of the view.
+        mask: Pixels that count in `Buffers.touched`; all when None.
+        visibility: For self-shadowing; no self-shadowing when None.
+    """
     gaussians = points.gaussians
     if gaussians.sh.shape[1] == 1:
         R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
         view = normalize(T_cam_obj.inverse().xyz - gaussians.means, dim=-1)
         albedo = torch.sigmoid(points.albedo_logits)
-        if sky is not None:
-            albedo = albedo * sky.share(light, albedo, R_env_obj)
-        normals = torch.lerp(gaussians.normals.detach(), gaussians.normals, HINT)
+        if visibility is not None:
+            albedo = albedo * visibility.irradiance_ratio(light, albedo, R_env_obj)
+        normals = torch.lerp(gaussians.normals.detach(), gaussians.normals, NORMAL_GRADIENT)
         colour = sh_lighting.radiance(light, albedo, normals, view, R_env_obj)
         gaussians = replace(gaussians, sh=constant_sh(colour))
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
@@ -237,21 +267,23 @@ def render(
 
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
+    """One optimisation step on one frame, preceded by densification, visibility and alignment where they are due."""
     assert state.optimizer is not None, "init makes one"
     progress, every = state.step / cfg.steps, cfg.densification.refine_every
     if state.step and state.step % every == 0 and progress < cfg.densification.refine_stop:
         _densify(cfg, inputs, state)
-    if state.step % every == 0 and progress >= cfg.shaded and cfg.colour == "light":
-        _look_around(inputs, state)
-    if state.step in _realignments(cfg):
-        _realign(inputs, state)
+    if state.step % every == 0 and progress >= cfg.shadow_start and cfg.colour == "light":
+        _trace_visibility(inputs, state)
+    if state.step in _alignment_steps(cfg):
+        _align_poses(inputs, state)
     params, camera = state.params, inputs.capture.camera
-    number = _draw(state, len(inputs.capture))
-    T_cam_obj = pose(params, inputs, number)
-    view = render(params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera, sky=sky(state))
-    state.memory["shown"] = torch.maximum(state.memory["shown"], view.weight.detach())
-    terms = _terms(cfg, params, view, target_view(inputs.capture, number, view.alpha), camera, T_cam_obj, progress)
-    optim.anneal(state.optimizer, _annealed(cfg, progress))
+    frame = _next_frame(state, len(inputs.capture))
+    T_cam_obj = pose(params, inputs, frame)
+    arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+    view = render(*arguments, visibility=cached_visibility(state))
+    state.memory["max_weight"] = torch.maximum(state.memory["max_weight"], view.weight.detach())
+    terms = _terms(cfg, params, view, target_view(inputs.capture, frame, view.alpha), camera, T_cam_obj, progress)
+    optim.anneal(state.optimizer, _rate_factors(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()} | {
         "gaussians": float(len(params.points.albedo_logits))
@@ -259,125 +291,133 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 
 
 @torch.no_grad()
-def _look_around(inputs: Inputs, state: State) -> None:
+def _trace_visibility(inputs: Inputs, state: State) -> None:
+    """Trace the visibility of all Gaussians and store it in the state."""
     params, n = state.params, len(inputs.capture)
-    poses = [pose(params, inputs, number) for number in range(0, n, -(-n // SEEN_FROM))]
-    found = look_around(params.points.gaussians, params.gamma, poses, inputs.capture.camera)
-    state.memory |= {"sky.seen": found.seen, "sky.whole": found.whole}
+    poses = [pose(params, inputs, frame) for frame in range(0, n, -(-n // VISIBILITY_VIEWS))]
+    traced = trace_visibility(params.points.gaussians, params.gamma, poses, inputs.capture.camera)
+    state.memory |= {"visibility.occluded": traced.occluded, "visibility.unoccluded": traced.unoccluded}
 
 
-def sky(state: State) -> Sky | None:
-    """What Gaussians saw when it was last traced."""
-    return Sky(state.memory["sky.seen"], state.memory["sky.whole"]) if "sky.seen" in state.memory else None
+def cached_visibility(state: State) -> VisibilityTransfer | None:
+    """The visibility as it was last traced, or None if it has not been traced yet."""
+    memory = state.memory
+    if "visibility.occluded" not in memory:
+        return None
+    return VisibilityTransfer(memory["visibility.occluded"], memory["visibility.unoccluded"])
 
 
-def _draw(state: State, n: int) -> int:
-    """The next frame: all frames in a new random order, again and again."""
+def _next_frame(state: State, n: int) -> int:
+    """Index of the next frame: every epoch visits all frames once, in random order."""
     if state.step % n == 0 or not len(state.memory["order"]):
         state.memory["order"] = torch.randperm(n, generator=state.rng)
     return int(state.memory["order"][state.step % n])
 
 
-def _annealed(cfg: Config, progress: float) -> dict[str, float]:
-    slow = 0.2**progress
-    return {"": slow, "points.gaussians.means": cfg.rates.decay**progress, "gamma": 1.0}
+def _rate_factors(cfg: Config, progress: float) -> dict[str, float]:
+    """Factors of the learning rates by name prefix, at a progress of 0 to 1."""
+    decayed = 0.2**progress
+    return {"": decayed, "points.gaussians.means": cfg.rates.decay**progress, "gamma": 1.0}
 
 
 def _terms(
     cfg: Config, params: Params, view: Buffers, truth: TargetView, camera: Camera, T_cam_obj: SE3, progress: float
 ) -> dict[str, Tensor]:
+    """Weighted loss terms (eq. 11) of one view, at a progress of 0 to 1."""
     weights, gaussians = cfg.weights, params.points.gaussians
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
-    full, size, seen, depth = camera, (camera.height, camera.width), view.weight > 0, view.depth
-    view, truth, camera, share = _window(view, truth, camera)
-    image = losses.developed(view.rgb, truth.image)
+    full, size, visible, depth = camera, (camera.height, camera.width), view.weight > 0, view.depth
+    view, truth, camera, fraction = _crop_to_object(view, truth, camera)
+    image = losses.srgb_as_captured(view.rgb, truth.image)
     from_depth, known = losses.surface_normals(view.depth, view.alpha > 0.5, camera, T_cam_obj)
     normal = losses.normal_consistency(view.normal, from_depth, known, crease=cfg.crease)
     return {
         "render": losses.photometric(image, truth.image, truth.valid, ssim_weight=cfg.ssim, size=size),
-        "mask": share * weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
-        "normal": share * ramp * weights.normal * normal,
-        "variance": share * ramp * weights.variance * losses.variance(view.depth_var),
+        "mask": fraction * weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
+        "normal": fraction * ramp * weights.normal * normal,
+        "variance": fraction * ramp * weights.variance * losses.variance(view.depth_var),
         "rank": weights.rank * losses.effective_rank(gaussians.log_scales),
         "gamma": weights.gamma * losses.sharpness(gaussians.sdf, params.gamma, floor=cfg.gamma_floor) * 1e-2,
-        "proj": weights.proj * losses.projection(gaussians, seen, depth, full, T_cam_obj, reach=0.1),
-        "highlight": weights.highlight * -torch.expm1(-params.light.log_highlight.square()),
+        "proj": weights.proj * losses.projection(gaussians, visible, depth, full, T_cam_obj, reach=0.1),
+        "specular": weights.specular * -torch.expm1(-params.light.log_specular_scale.square()),
     }
 
 
-def _window(view: Buffers, truth: TargetView, camera: Camera) -> tuple[Buffers, TargetView, Camera, float]:
-    """The part of a view beyond which rendering and photograph are black, and its share of the picture.
+def _crop_to_object(view: Buffers, truth: TargetView, camera: Camera) -> tuple[Buffers, TargetView, Camera, float]:
+    """View, target and camera cropped to the object, and the window's fraction of the image area.
 
-    Means over the picture are those over the window times the share: often a third of the work.
+    Rendered and input image are black outside of the window, so a mean over the image is the mean over the window times
+    the fraction. The crop saves computing time.
     """
-    shown = (view.alpha.detach() > 0) | (truth.image > 0).any(-1) | (truth.mask > 0)
-    if not shown.any():
+    content = (view.alpha.detach() > 0) | (truth.image > 0).any(-1) | (truth.mask > 0)
+    if not content.any():
         return view, truth, camera, 1.0
-    box = crop_box(shown, losses.SSIM_MARGIN)
-    cut = replace(
+    box = crop_box(content, losses.SSIM_MARGIN)
+    cropped_view = replace(
         view,
         **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
         rgb=channels_first(crop(view.rgb, box)).movedim(0, -1),
     )
-    seen = TargetView(
+    cropped_truth = TargetView(
         channels_first(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box)
     )
-    return cut, seen, camera.cropped(*box), box[2] * box[3] / shown.numel()
+    return cropped_view, cropped_truth, camera.cropped(*box), box[2] * box[3] / content.numel()
 
 
 @torch.no_grad()
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
-    params, camera, how = state.params, inputs.capture.camera, cfg.densification
+    """Score the Gaussians over random frames, then split and prune."""
+    params, camera, growth = state.params, inputs.capture.camera, cfg.densification
     assert state.optimizer is not None, "init makes one"
-    bad = params.gamma.new_zeros(len(params.points.albedo_logits))
-    numbers = torch.randperm(len(inputs.capture), generator=state.rng)[: how.score_views].tolist()
-    for number in numbers:
-        T_cam_obj = pose(params, inputs, number)
+    score = params.gamma.new_zeros(len(params.points.albedo_logits))
+    frames = torch.randperm(len(inputs.capture), generator=state.rng)[: growth.score_views].tolist()
+    for frame in frames:
+        T_cam_obj = pose(params, inputs, frame)
         arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
-        first = render(*arguments, sky=sky(state))
-        truth = target_view(inputs.capture, number, first.alpha)
-        error = (losses.developed(first.rgb, truth.image) - truth.image).abs().mean(-1)
-        where = densify.bad_pixels(how, error, truth.mask)
-        bad += render(*arguments, mask=where, sky=sky(state)).touched / len(numbers)
-    drop = opacity(params.points.gaussians.sdf, params.gamma) < how.prune_opacity
-    drop |= state.memory["shown"] < how.prune_weight
-    plan = densify.plan(how, bad, drop)
+        view = render(*arguments, visibility=cached_visibility(state))
+        truth = target_view(inputs.capture, frame, view.alpha)
+        error = (losses.srgb_as_captured(view.rgb, truth.image) - truth.image).abs().mean(-1)
+        bad = densify.bad_pixels(growth, error, truth.mask)
+        score += render(*arguments, mask=bad, visibility=cached_visibility(state)).touched / len(frames)
+    prune = opacity(params.points.gaussians.sdf, params.gamma) < growth.prune_opacity
+    prune |= state.memory["max_weight"] < growth.prune_weight
+    plan = densify.plan(growth, score, prune)
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
     densify.place_children(points.gaussians, plan)
     state.params = replace(params, points=points)
-    state.memory["shown"] = torch.zeros_like(points.albedo_logits[:, 0])
+    state.memory["max_weight"] = torch.zeros_like(points.albedo_logits[:, 0])
 
 
-def _realignments(cfg: Config) -> list[int]:
-    """Steps before which poses are realigned."""
+def _alignment_steps(cfg: Config) -> list[int]:
+    """Steps at whose beginning all poses are aligned."""
     return [cfg.steps * k // (cfg.realignments + 1) for k in range(1, cfg.realignments + 1)]
 
 
 @torch.no_grad()
-def _realign(inputs: Inputs, state: State) -> None:
+def _align_poses(inputs: Inputs, state: State) -> None:
+    """Align the pose of every frame photometrically with the current Gaussians."""
     params, base = state.params, inputs.trajectory.T_cam_obj
-    for number in range(len(inputs.capture)):
-        unexplained = partial(
-            _unexplained, params, inputs, target_view(inputs.capture, number, params.gamma), sky(state)
-        )
-        T_cam_obj = realign(unexplained, pose(params, inputs, number))
-        params.poses[number] = (T_cam_obj @ base[number].inverse()).log()
+    for frame in range(len(inputs.capture)):
+        truth = target_view(inputs.capture, frame, params.gamma)
+        residual = partial(_residuals, params, inputs, truth, cached_visibility(state))
+        T_cam_obj = align_pose(residual, pose(params, inputs, frame))
+        params.poses[frame] = (T_cam_obj @ base[frame].inverse()).log()
 
 
-def _unexplained(
-    params: Params, inputs: Inputs, truth: TargetView, shade: Sky | None, T_cam_obj: SE3
+def _residuals(
+    params: Params, inputs: Inputs, truth: TargetView, visibility: VisibilityTransfer | None, T_cam_obj: SE3
 ) -> Float[Tensor, " r"]:
-    """Colours and, with less weight, coverage that a pose leaves over of a photograph, sRGB."""
+    """Residuals of colour [sRGB] and of weighted coverage between the view at a pose and the input image."""
     arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)
-    view = render(*arguments, sky=shade)
-    colour = losses.developed(view.rgb, truth.image) - truth.image
-    outline = OUTLINE * (view.alpha - truth.mask)[..., None]
-    return (torch.cat([colour, outline], -1) * truth.valid).flatten()
+    view = render(*arguments, visibility=visibility)
+    colour = losses.srgb_as_captured(view.rgb, truth.image) - truth.image
+    coverage = COVERAGE_WEIGHT * (view.alpha - truth.mask)[..., None]
+    return (torch.cat([colour, coverage], -1) * truth.valid).flatten()
 
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
-    """Geometry, first albedo and light; as static colour the mean diffuse one of all frames, unshaded."""
+    """Geometry, albedo and light; the static radiance is the unshadowed diffuse one, averaged over all frames."""
     params = state.params
     T_cam_obj = SE3.exp(params.poses) @ inputs.trajectory.T_cam_obj
     trajectory = Trajectory(T_cam_obj, inputs.trajectory.light)

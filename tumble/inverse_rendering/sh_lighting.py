@@ -1,14 +1,14 @@
-"""Stage 2's colour: it knows that the light does not turn with the object (deviation from the paper's static colour).
+"""Colour model of stage 2: shading by one spherical-harmonic light that is fixed in the env frame.
 
     c = albedo * E(R_env_obj n) + h f0 G(n.v) * S(R_env_obj r),    r = the reflection of the view direction
 
-where E is irradiance / pi and S the light that a glossy surface mirrors, both of one light: 16 spherical harmonics in
-the env frame, shared by all Gaussians. G is the share that the split sum gives to a lobe of roughness 0.5, and h says
-how much of such a highlight there is, under a light whose level is a guess: without it a Lambertian box bends its
-normals by 8 degrees to hide the highlight that it lacks, with it by 3.
+E is irradiance / pi and S the prefiltered radiance for a glossy lobe, both derived from one light of 16 spherical
+harmonics in the env frame, shared by all Gaussians. G is the split-sum factor of a lobe of roughness 0.5. The specular
+scale h is learnt, because the absolute level of the light is unknown.
 
-On hand-held captures a static colour per Gaussian can only fit the mean over poses; and albedo and light found here are
-where stage 3 starts. Two free lights, one for each lobe, would leave their tints to chance.
+This deviates from the paper, whose colour per Gaussian is static in the object frame: with a light that stands still
+relative to the camera, a static colour can only fit the mean over all poses. Albedo and light initialise stage 3. Both
+lobes share one light, because separate lights would leave the colour of each light undetermined.
 """
 
 import math
@@ -24,92 +24,98 @@ from torch.nn.functional import softplus
 from tumble.maths import spherical_harmonics, texel_directions
 from tumble.scene import DIELECTRIC, Environment
 
-GLOSS = 0.08
-"""Width of the mirrored lobe: degree l is dimmed by exp(-GLOSS l (l + 1)), as by a lobe of roughness about 0.5."""
-LOBE = (0.937, -0.296, 5.535, -11.654, 20.113, -9.978)
-"""`brdf.split_sum` at roughness 0.5, a polynomial in 1 - n.v within 0.03: 0.9 face to face, 4.7 at grazing."""
+GLOSSY_FALLOFF = 0.08
+"""Width of the glossy lobe: harmonics of degree l are scaled by exp(-GLOSSY_FALLOFF l (l + 1)), as by a lobe of
+roughness about 0.5."""
+SPLIT_SUM_POLYNOMIAL = (0.937, -0.296, 5.535, -11.654, 20.113, -9.978)
+"""Coefficients of a polynomial in 1 - n.v that approximates `brdf.split_sum` at roughness 0.5 within 0.03: 0.9 at
+normal incidence, 4.7 at grazing angles."""
 
 
 @dataclass(frozen=True)
-class CoarseLight:
-    """Low-order light, as trained."""
+class SHLight:
+    """Light as spherical harmonics up to degree 3, with the scale of the specular lobe; raw parameters, as trained."""
 
     coefficients: Float[Tensor, "16 3"]
-    """Of radiance, env frame. What a lobe makes of it goes through softplus, for a short series rings below zero."""
-    log_highlight: Float[Tensor, ""]
-    """How much brighter the highlight is than that of glass under this light."""
+    """Coefficients of linear radiance, env frame. Values convolved with a lobe pass through a softplus, since a
+    truncated series can be negative."""
+    log_specular_scale: Float[Tensor, ""]
+    """Natural logarithm of the specular lobe's scale relative to a dielectric with F0 = 0.04."""
 
     @staticmethod
-    def constant(level: float, like: Tensor) -> "CoarseLight":
-        """The same light from everywhere, and glass: irradiance / pi and mirrored light are `level`."""
+    def constant(level: float, like: Tensor) -> "SHLight":
+        """Uniform light whose irradiance / pi and glossy radiance equal `level`, with specular scale 1."""
         coefficients = torch.zeros(16, 3, dtype=like.dtype, device=like.device)
         coefficients[0] = _inverse_softplus(level) / 0.28209479177387814
-        return CoarseLight(coefficients, coefficients.new_zeros(()))
+        return SHLight(coefficients, coefficients.new_zeros(()))
 
     def diffuse(self, n_env: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Irradiance / pi on surfaces with env-frame normals."""
+        """Irradiance / pi of surfaces with unit normals `n_env`, env frame."""
         return softplus(spherical_harmonics.basis(n_env, 3) @ (self.coefficients * _lobes(self.coefficients)[0]))
 
     def glossy(self, d_env: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Mirrored light from env-frame directions."""
+        """Radiance convolved with the glossy lobe around unit directions `d_env`, env frame."""
         return softplus(spherical_harmonics.basis(d_env, 3) @ (self.coefficients * _lobes(self.coefficients)[1]))
 
 
 def radiance(
-    light: CoarseLight,
+    light: SHLight,
     albedo: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
     view: Float[Tensor, "n 3"],
     R_env_obj: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "n 3"]:
-    """Linear radiance of surface points towards the eye.
+    """Linear radiance of surface points towards the camera; differentiable in all arguments.
 
     Args:
+        light: Light and specular scale.
+        albedo: Linear diffuse albedo.
         normals: Outward unit normals, object frame.
         view: Unit directions from the points to the camera, object frame.
+        R_env_obj: Rotation from the object frame to the env frame.
     """
-    return _Radiance.apply(light.coefficients, light.log_highlight, albedo, normals, view, R_env_obj)
+    return _Radiance.apply(light.coefficients, light.log_specular_scale, albedo, normals, view, R_env_obj)
 
 
 class _Radiance(torch.autograd.Function):
-    """`radiance` with its derivative written out: a third of the time, of what is half of a step's small tensors.
+    """`radiance` with an explicit backward pass, which takes a third of the time of automatic differentiation.
 
-    x, y and z (and red, green and blue) are rows: sums over many short rows are slow.
+    Tensors are transposed to `[3 n]` inside, since sums over many short rows are slow.
     """
 
     @staticmethod
     def forward(ctx: Any, *args: Tensor) -> Tensor:
-        coefficients, log_highlight, R_env_obj = args[0], args[1], args[5]
+        coefficients, log_specular_scale, R_env_obj = args[0], args[1], args[5]
         albedo, normals, view = (x.mT.contiguous() for x in args[2:5])
         n_v = (normals * view).sum(0)
-        share = DIELECTRIC * _polynomial(LOBE, 1 - n_v.clamp(0, 1))
+        reflectance = DIELECTRIC * _polynomial(SPLIT_SUM_POLYNOMIAL, 1 - n_v.clamp(0, 1))
         mirrored = 2 * n_v * normals - view
-        lobes, strength = _lobes(coefficients), log_highlight.exp()
+        lobes, scale = _lobes(coefficients), log_specular_scale.exp()
         diffuse, at_normals = spherical_harmonics.sum_series(coefficients * lobes[0], R_env_obj @ normals)
         glossy, at_mirrored = spherical_harmonics.sum_series(coefficients * lobes[1], R_env_obj @ mirrored)
         diffuse, glossy = softplus(diffuse), softplus(glossy)
-        kept = (coefficients, strength, R_env_obj, albedo, normals, view, mirrored, n_v, share)
-        ctx.save_for_backward(*kept, diffuse, at_normals, glossy, at_mirrored)
-        return (albedo * diffuse + strength * share * glossy).mT
+        saved = (coefficients, scale, R_env_obj, albedo, normals, view, mirrored, n_v, reflectance)
+        ctx.save_for_backward(*saved, diffuse, at_normals, glossy, at_mirrored)
+        return (albedo * diffuse + scale * reflectance * glossy).mT
 
     @staticmethod
     def backward(ctx: Any, v: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
-        coefficients, strength, R, albedo, normals, view, mirrored, n_v, share, *lights = ctx.saved_tensors
+        coefficients, scale, R, albedo, normals, view, mirrored, n_v, reflectance, *lights = ctx.saved_tensors
         diffuse, at_normals, glossy, at_mirrored = lights
         lobes, v = _lobes(coefficients), v.mT.contiguous()
-        v_lobe = v * strength
+        v_lobe = v * scale
         # The derivative of y = softplus(x) is 1 - exp(-y).
-        v_diffuse, v_glossy = -v * albedo * torch.expm1(-diffuse), -v_lobe * share * torch.expm1(-glossy)
+        v_diffuse, v_glossy = -v * albedo * torch.expm1(-diffuse), -v_lobe * reflectance * torch.expm1(-glossy)
         v_first, v_n_env = spherical_harmonics.series_adjoint(coefficients * lobes[0], at_normals, v_diffuse)
         v_second, v_mirrored_env = spherical_harmonics.series_adjoint(coefficients * lobes[1], at_mirrored, v_glossy)
         v_mirrored = R.mT @ v_mirrored_env
-        v_share = torch.where((n_v >= 0) & (n_v <= 1), (v_lobe * glossy).sum(0), 0.0)
-        slope = _polynomial([k * c for k, c in enumerate(LOBE)][1:], 1 - n_v.clamp(0, 1))
-        v_n_v = 2 * (v_mirrored * normals).sum(0) - DIELECTRIC * slope * v_share
+        v_reflectance = torch.where((n_v >= 0) & (n_v <= 1), (v_lobe * glossy).sum(0), 0.0)
+        slope = _polynomial([k * c for k, c in enumerate(SPLIT_SUM_POLYNOMIAL)][1:], 1 - n_v.clamp(0, 1))
+        v_n_v = 2 * (v_mirrored * normals).sum(0) - DIELECTRIC * slope * v_reflectance
         v_normals = R.mT @ v_n_env + 2 * n_v * v_mirrored + v_n_v * view
         return (
             v_first * lobes[0] + v_second * lobes[1],
-            (v_lobe * glossy * share).sum(),
+            (v_lobe * glossy * reflectance).sum(),
             (v * diffuse).mT,
             v_normals.mT,
             (v_n_v * normals - v_mirrored).mT,
@@ -118,7 +124,7 @@ class _Radiance(torch.autograd.Function):
 
 
 def _polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
-    """The sum of c_k x^k, after Horner."""
+    """Sum of c_k x^k by Horner's scheme."""
     total = torch.full_like(x, coefficients[-1])
     for c in coefficients[-2::-1]:
         total = total * x + c
@@ -126,17 +132,18 @@ def _polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
 
 
 def _lobes(like: Tensor) -> Float[Tensor, "2 16 1"]:
-    """What the clamped cosine over pi, and the mirrored lobe, make of each coefficient."""
+    """Factors per coefficient of a convolution with the clamped cosine over pi, and with the glossy lobe."""
     degrees = [l for l in range(4) for _ in range(2 * l + 1)]  # noqa: E741
     cosine = [spherical_harmonics.COSINE_LOBE[l] / math.pi for l in degrees]  # noqa: E741
-    gloss = [math.exp(-GLOSS * l * (l + 1)) for l in degrees]  # noqa: E741
+    gloss = [math.exp(-GLOSSY_FALLOFF * l * (l + 1)) for l in degrees]  # noqa: E741
     return like.new_tensor([cosine, gloss])[..., None]
 
 
-def environment(light: CoarseLight, height: int) -> Environment:
-    """The light map that a coarse light stands for, as a glossy surface mirrors it: the start of stage 3."""
+def environment(light: SHLight, height: int) -> Environment:
+    """Environment map with the glossy radiance of a spherical-harmonic light: the initial light of stage 3."""
     return Environment.from_radiance(light.glossy(texel_directions(height, 2 * height).to(light.coefficients)))
 
 
 def _inverse_softplus(y: float) -> float:
+    """The value whose softplus is `y`."""
     return float(torch.tensor(y, dtype=torch.float64).expm1().log())

@@ -1,11 +1,11 @@
-"""How strong and how wide the highlight is, and what that says of light and albedo.
+"""Roughness and specular scale of an object by grid search, with all albedos eliminated.
 
-    photograph = albedo_i * diffuse + strength * specular        at a pixel that shows Gaussian i
+    radiance of a pixel that shows Gaussian i = albedo_i * diffuse + specular_scale * specular(roughness)
 
-Albedo and strength trade against each other: what a highlight lacks, dark print takes up, and a descent on both moves
-along that valley for thousands of steps (a red whose green is 0.009 stays at 0.02); the width of the lobe, on which the
-strength depends, hardly moves at all. So all widths and strengths of a grid are tried, every Gaussian's albedo
-eliminated (variable projection, Golub and Pereyra 1973): one pair for the whole object, for the frames tell no more.
+The *specular scale* is the strength of the specular lobe relative to a dielectric with F0 = 0.04. Albedo and specular
+scale are strongly correlated, so gradient descent on both converges slowly, and roughness hardly moves at all.
+Therefore every pair of roughness and scale of a grid is evaluated with the best albedo of every Gaussian (variable
+projection, Golub and Pereyra 1973). One pair is chosen for the whole object.
 """
 
 import math
@@ -17,130 +17,142 @@ from torch import Tensor
 
 from tumble.scene import DIELECTRIC, TEMPERATURE, Material
 
-BRIGHTEST = 0.9
-"""Albedo that 95 % of a surface stays below."""
+MAX_ALBEDO = 0.9
+"""Upper limit of the 95 % quantile of an object's albedo."""
 CLIPPED = 0.95
-"""Linear radiance from which a pixel may be clipped and says nothing."""
-TOLD = 0.02
-"""Share of the highlight that must differ from diffuse light for a fit: 0.1 to 0.3 on objects of the benchmark."""
-ROUGHNESS = (0.3, 0.4, 0.5, 0.6)
-"""Widths that are tried."""
-STRENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, 1.4)
-"""Strengths that are tried, for all channels: with strengths of their own the bundled clip loses 0.7 dB of albedo. What
-asks for the strongest is not believed: under a blurred sun the knight does, with twice its true width, at 0.3 dB of
-albedo."""
-GAIN = 0.01
-"""Share of the error that a trial must take away from what stage 2 left, or it is not believed: errors of shape and
-light, too, look a little more like one highlight than like another. 1.2 to 7.5 % on box, bottle and knight hand-held,
-0.5 on the bundled clip, 0.1 to 0.8 on domes, where all widths fit alike, but for the box under the sun (2.3)."""
-SURE = 0.87
-"""Strength of the highlight in stage 2, that of glass being 1, above which it is tried at all: 0.92 to 1.16 on original
-objects of the benchmark. Below it lie matte ones whose descent was held halfway (the diffuse mustard bottle: 0.75 to
-0.82), under a light that was shaped for that highlight: a trial would believe it, the descent is rid of it.
-"""
-ROUNDS = 6
-"""Of reweighting, towards least absolute errors."""
-NOISE = 0.005
-"""Error under which all residuals weigh the same, sRGB."""
+"""Linear radiance from which a pixel counts as clipped and is ignored."""
+MIN_INDEPENDENT_FRACTION = 0.02
+"""Minimum fraction of the specular lobe's weighted energy that the diffuse lobe does not explain: below it, the scale
+is not observable."""
+ROUGHNESSES = (0.3, 0.4, 0.5, 0.6)
+"""Grid of roughness values."""
+SPECULAR_SCALES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, 1.4)
+"""Grid of specular scales, the same for all colour channels. An optimum at either end of the grid is rejected."""
+MIN_IMPROVEMENT = 0.01
+"""Minimum relative decrease of the error against the initial pair: errors of shape and light alone cause smaller
+ones."""
+MIN_REFINED_SCALE = 0.87
+"""Specular scale after stage 2 above which the grid search is run: matte objects stay below it."""
+REWEIGHTINGS = 6
+"""Iterations of reweighted least squares, which converge to least absolute errors."""
+ERROR_FLOOR = 0.005
+"""Absolute error below which all residuals have the same weight [sRGB]."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Pixels of several frames, linear."""
+    """Pixels of several frames with their lobes, in linear radiance."""
 
     gaussian: Int64[Tensor, " p"]
-    """Which Gaussian a pixel shows."""
+    """Index of the Gaussian that each pixel shows."""
     diffuse: Float[Tensor, "p 3"]
-    """Radiance of a white surface without highlight."""
+    """Radiance of a white Lambertian surface."""
     specular: Float[Tensor, "r p 3"]
-    """Radiance of a black surface with the highlight of strength 1, at each roughness."""
-    photograph: Float[Tensor, "p 3"]
+    """Radiance of the specular lobe at scale 1, for each of the `r` candidate roughness values."""
+    photo: Float[Tensor, "p 3"]
+    """Radiance of the input image."""
 
 
 @dataclass(frozen=True)
-class Fit:
-    """What fits best, and what it means for the albedos."""
+class SpecularFit:
+    """The best pair of roughness and specular scale, and how the albedos depend on the scale."""
 
-    which: int
-    """Of the samples' roughnesses."""
-    strength: float
-    slope: Float[Tensor, "r n 3"]
-    """How much of each Gaussian's albedo a unit of strength replaces, at each roughness; 0 where no sample shows it."""
+    roughness_index: int
+    """Index into the candidate roughness values of the samples."""
+    specular_scale: float
+    """Strength of the specular lobe relative to F0 = 0.04."""
+    albedo_per_scale: Float[Tensor, "r n 3"]
+    """Decrease of each Gaussian's best albedo per unit of specular scale, at each roughness; 0 for Gaussians without
+    samples."""
 
 
 @torch.no_grad()
-def fit(samples: Samples, n: int, which: int, strength: float) -> Fit | None:
-    """Width and strength of the highlight of an object of `n` Gaussians; None where the frames do not tell better than
-    the ones that are given (`which` of the samples' roughnesses).
+def fit(samples: Samples, n: int, roughness_index: int, specular_scale: float) -> SpecularFit | None:
+    """The pair of the grid with the smallest error, or None if it is not clearly better than the initial pair.
 
-    Errors count as they would in sRGB, and by their absolute value rather than their square: edges and print that the
-    Gaussians cannot follow are no evidence. Widths are compared with albedos that are not negative, which a lobe too
-    wide would like them to be; the strength is then taken without that bound, for dark print that may only err upwards
-    pulls it down by a tenth.
+    Errors are absolute errors in sRGB, so that edges and texture that the Gaussians do not resolve count little.
+    Roughness is chosen with albedos limited to be non-negative, since too wide a lobe would need negative ones. The
+    scale is then chosen without this limit, which would bias it downwards on dark texture.
+
+    Args:
+        samples: Pixels with their lobes.
+        n: Number of Gaussians.
+        roughness_index: Initial roughness, as an index into the candidates of the samples.
+        specular_scale: Initial specular scale.
     """
 
-    def left(specular: Tensor, bound: float) -> Tensor:
-        return torch.stack([left_over(samples, specular, k, n, bound)[0] for k in STRENGTHS])
+    def errors(specular: Tensor, min_albedo: float) -> Tensor:
+        return torch.stack([fit_error(samples, specular, scale, n, min_albedo)[0] for scale in SPECULAR_SCALES])
 
-    bounded = torch.stack([left(specular, 0.0) for specular in samples.specular])
-    if bounded.min() > (1 - GAIN) * left_over(samples, samples.specular[which], strength, n, 0.0)[0]:
+    grid = torch.stack([errors(specular, 0.0) for specular in samples.specular])
+    initial_error = fit_error(samples, samples.specular[roughness_index], specular_scale, n, 0.0)[0]
+    if grid.min() > (1 - MIN_IMPROVEMENT) * initial_error:
         return None
-    which = int(bounded.amin(1).argmin())
-    at = int(left(samples.specular[which], -math.inf).argmin())
-    if at in (0, len(STRENGTHS) - 1):
-        return None  # blurred light and filled grooves look like a highlight that grows and grows
-    strength = STRENGTHS[at]
-    x, s = samples.diffuse, samples.specular[which]
-    _, weight = left_over(samples, s, strength, n, -math.inf)
-    slope = torch.stack([_albedos(samples, weight, y, n) for y in samples.specular])
-    rest = s - slope[which][samples.gaussian] * x
-    told = ((weight * rest.square()).sum(0) / (weight * s.square()).sum(0).clamp_min(1e-12)).mean()
-    return Fit(which, strength, slope) if told > TOLD else None
+    best_roughness = int(grid.amin(1).argmin())
+    best_scale = int(errors(samples.specular[best_roughness], -math.inf).argmin())
+    if best_scale in (0, len(SPECULAR_SCALES) - 1):
+        return None  # errors of light and shape can make the optimal scale grow without limit
+    scale = SPECULAR_SCALES[best_scale]
+    x, s = samples.diffuse, samples.specular[best_roughness]
+    _, weight = fit_error(samples, s, scale, n, -math.inf)
+    albedo_per_scale = torch.stack([_albedos(samples, weight, y, n) for y in samples.specular])
+    independent = s - albedo_per_scale[best_roughness][samples.gaussian] * x
+    fraction = ((weight * independent.square()).sum(0) / (weight * s.square()).sum(0).clamp_min(1e-12)).mean()
+    return SpecularFit(best_roughness, scale, albedo_per_scale) if fraction > MIN_INDEPENDENT_FRACTION else None
 
 
-def left_over(
-    samples: Samples, specular: Float[Tensor, "p 3"], strength: float, n: int, bound: float
+def fit_error(
+    samples: Samples, specular: Float[Tensor, "p 3"], scale: float, n: int, min_albedo: float
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "p 3"]]:
-    """What a highlight leaves over when every Gaussian has the albedo that suits it best, no lower than a bound: mean
-    absolute error in sRGB, and the weights of the pixels."""
-    y = samples.photograph
+    """Mean absolute error in sRGB with the best albedo of every Gaussian, and the final weights of the pixels.
+
+    Args:
+        samples: Pixels with their lobes.
+        specular: Specular lobe at scale 1, of one roughness.
+        scale: Specular scale.
+        n: Number of Gaussians.
+        min_albedo: Lower limit of the albedos.
+    """
+    y = samples.photo
     # The derivative of sRGB's curve, finite at black.
     sensitivity = 1.055 / 2.4 * y.clamp(0.004, 1) ** (1 / 2.4 - 1) * (y < CLIPPED)
     weight, error = sensitivity.square(), y
-    for _ in range(ROUNDS):
-        albedo = _albedos(samples, weight, y - strength * specular, n).clamp_min(bound)
-        error = (y - albedo[samples.gaussian] * samples.diffuse - strength * specular) * sensitivity
-        weight = sensitivity.square() / (error.abs() + NOISE)
+    for _ in range(REWEIGHTINGS):
+        albedo = _albedos(samples, weight, y - scale * specular, n).clamp_min(min_albedo)
+        error = (y - albedo[samples.gaussian] * samples.diffuse - scale * specular) * sensitivity
+        weight = sensitivity.square() / (error.abs() + ERROR_FLOOR)
     return error.abs().mean(), weight
 
 
 def _albedos(
-    samples: Samples, weight: Float[Tensor, "p 3"], shown: Float[Tensor, "p 3"], n: int
+    samples: Samples, weight: Float[Tensor, "p 3"], radiance: Float[Tensor, "p 3"], n: int
 ) -> Float[Tensor, "n 3"]:
-    """Weighted least squares of what pixels show, by Gaussian."""
+    """Weighted least-squares albedo of each Gaussian for a given diffuse radiance of the pixels."""
 
-    def summed(values: Tensor) -> Tensor:
+    def sum_by_gaussian(values: Tensor) -> Tensor:
         return values.new_zeros(n, 3).index_add(0, samples.gaussian, values)
 
     x = samples.diffuse
-    return summed(weight * x * shown) / summed(weight * x * x).clamp_min(1e-9)
+    return sum_by_gaussian(weight * x * radiance) / sum_by_gaussian(weight * x * x).clamp_min(1e-9)
 
 
 @torch.no_grad()
-def shared_out(material: Material, log_tint: Float[Tensor, "3"]) -> tuple[Material, Float[Tensor, "3"]]:
-    """Material and logarithmic gain of the light that look the same without a tint of the highlight.
+def absorb_specular_scale(
+    material: Material, log_specular_scale: Float[Tensor, "3"]
+) -> tuple[Material, Float[Tensor, "3"]]:
+    """Material, and log gain of the light, that render (almost) the same with a specular scale of 1.
 
-    The highlight of a dielectric is grey: its tint belongs into the light, and out of the albedo. Where that would
-    leave an albedo above 1, it is the object that has less of a highlight than glass, and the fainter that is, the less
-    its colour counts.
+    The specular lobe of a dielectric is grey, so the scale per channel is moved into the light and divided out of the
+    albedo. Where this would make the albedo exceed `MAX_ALBEDO`, the object has a lower F0 instead; the fainter its
+    lobe, the less the colour of the scale is used.
     """
     albedo = material.albedo
-    bound = (albedo.flatten(0, 1).quantile(0.95, dim=0) / BRIGHTEST).log()
-    faint = (bound - log_tint).max().clamp(min=0)
-    mean = log_tint.mean()
-    gain = mean + (-faint).exp() * (log_tint - mean)
-    gain = gain + (bound - gain).max().clamp(min=0)
-    f0 = (material.f0 * (log_tint - gain).exp()).mean().clamp(max=DIELECTRIC)
-    lit = (albedo / gain.exp()).clamp(max=0.98)
-    albedo_logits = TEMPERATURE * torch.logit(lit)
+    min_gain = (albedo.flatten(0, 1).quantile(0.95, dim=0) / MAX_ALBEDO).log()
+    deficit = (min_gain - log_specular_scale).max().clamp(min=0)
+    mean = log_specular_scale.mean()
+    gain = mean + (-deficit).exp() * (log_specular_scale - mean)
+    gain = gain + (min_gain - gain).max().clamp(min=0)
+    f0 = (material.f0 * (log_specular_scale - gain).exp()).mean().clamp(max=DIELECTRIC)
+    scaled_albedo = (albedo / gain.exp()).clamp(max=0.98)
+    albedo_logits = TEMPERATURE * torch.logit(scaled_albedo)
     return replace(material, albedo_logits=albedo_logits, f0_logit=torch.logit(f0 / (2 * DIELECTRIC))), gain

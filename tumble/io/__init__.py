@@ -1,17 +1,17 @@
-"""Pictures, films, JSON and trees of tensors on disk, and the plugins of a folder.
+"""Images, videos, JSON documents and trees of tensors on disk, network weights, and loading plugins by file name.
 
-Every file is written whole or not at all; every reader says which rule a file breaks, and the fix.
+Every file is written atomically. Every reader raises `BadFile` with the rule that the file breaks and the fix.
 """
 
 from tumble.io import files, tree, video, weights
 from tumble.io.files import BadFile
-from tumble.io.plugins import named, names
+from tumble.io.plugins import load_plugin, plugin_names
 
 __all__ = [
     "BadFile",
     "files",
-    "named",
-    "names",
+    "load_plugin",
+    "plugin_names",
     "tree",
     "video",
     "weights",

@@ -1,9 +1,9 @@
-"""Pictures and tables on disk: PNG, OpenEXR, Radiance HDR and JSON, read with the reason of every refusal.
+"""Reading and writing images and documents: PNG, JPEG, OpenEXR, Radiance HDR and JSON.
 
-*Code values* are 8-bit numbers as a file stores them (sRGB for photographs); *radiance* is linear and in float32.
-Every writer makes a file that is whole or absent: it fills a *partial* one first, whose name says whose it is. Every
-reader raises `BadFile`, which names the file, the rule it broke and the fix, and reads a picture's size before its
-pixels: more than `MAX_PIXELS` are refused.
+*Code values* are 8-bit numbers as a file stores them (sRGB for photos); *radiance* is linear float32. Writers are
+atomic: they fill a *partial* file, whose name holds the number of the writing process, and rename it when it is
+complete. Readers raise `BadFile` with the file, the rule it breaks and the fix. They check the size of an image before
+decoding its pixels and reject more than `MAX_PIXELS`.
 """
 
 import contextlib
@@ -25,29 +25,27 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 MAX_PIXELS = 1 << 26
-"""Largest picture read: 64 megapixels, an 8k x 8k light map; a larger one is a mistake or an attack."""
-
-
-PARTIAL = ".partial-"
-"""Begins the name of what is being written; the number of the process follows."""
+"""Largest image that is read [pixels]: 64 megapixels, an 8k x 8k environment map. Larger ones are errors or attacks."""
+PARTIAL_PREFIX = ".partial-"
+"""Start of the name of an incomplete file or folder; the number of the writing process follows."""
 
 
 class BadFile(ValueError):
-    """A file that breaks a rule of its format. The message names the file, the rule and the fix."""
+    """Error for a file that breaks a rule of its format; the message holds the file, the rule and the fix."""
 
     def __init__(self, path: Path, rule: str, fix: str = "") -> None:
         super().__init__(f"{path}: {rule}" + (f" ({fix})" if fix else ""))
 
 
-class Unwritten(OSError):
-    """A file that could not be written. The message names the file, the reason and the fix."""
+class WriteError(OSError):
+    """Error for a file that could not be written; the message holds the file, the reason and the fix."""
 
 
-def inside(root: Path, name: str) -> Path:
-    """The file `name` of folder `root`.
+def path_inside(root: Path, name: str) -> Path:
+    """Path of the file `name` in the folder `root`.
 
     Raises:
-        BadFile: The name leaves the folder (an absolute path, `..`, or a link to outside).
+        BadFile: The name points outside the folder (an absolute path, `..`, or a link).
     """
     path = root / name
     if Path(name).is_absolute() or not path.resolve().is_relative_to(root.resolve()):
@@ -56,15 +54,15 @@ def inside(root: Path, name: str) -> Path:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn the reasons why a file cannot be written into one sentence with the file and the fix.
+def describe_write_errors(path: Path) -> Iterator[None]:
+    """Context in which errors of writing `path` become a `WriteError`, whose message holds the file and the fix.
 
     Raises:
-        Unwritten: With the number of the system's error, where there is one.
+        WriteError: Its `errno` is that of the system's error, or None.
     """
     try:
         yield
-    except Unwritten:
+    except WriteError:
         raise
     except (OSError, safetensors.SafetensorError) as error:
         fixes = {
@@ -77,18 +75,19 @@ def writing(path: Path) -> Iterator[None]:
         number = getattr(error, "errno", None)
         advice = f"{fixes[number]}, " if number in fixes else ""
         reason = f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}"
-        told = Unwritten(f"{reason} ({advice}what was finished before is kept; the same command goes on from there)")
-        told.errno = number
-        raise told from error
+        fix = f"{advice}then run the same command again: it continues from the last saved state"
+        write_error = WriteError(f"{reason} ({fix})")
+        write_error.errno = number
+        raise write_error from error
 
 
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let `write` fill a partial file beside `path`, then put it in place in one step.
+def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
+    """Write a file atomically: `write` fills a partial file in the same folder, which is then renamed to `path`.
 
     Raises:
-        Unwritten: The disk is full, or the folder may not be written; nothing is left behind.
+        WriteError: The disk is full or the folder is not writable; the partial file is removed.
     """
-    with writing(path):
+    with describe_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=partial_prefix(), suffix=path.suffix, dir=path.parent)
         os.close(handle)
@@ -102,17 +101,17 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def partial_prefix() -> str:
-    """How the names of this process's partial files begin."""
-    return f"{PARTIAL}{os.getpid()}-"
+    """Start of the names of this process's partial files."""
+    return f"{PARTIAL_PREFIX}{os.getpid()}-"
 
 
-def sweep(folder: Path) -> None:
-    """Remove the partial files and folders that killed processes left under a folder, and what this one left."""
+def remove_partial_files(folder: Path) -> None:
+    """Remove the partial files and folders below a folder, except those of other processes that are still running."""
     if os.name != "posix":
-        return  # nobody tells which processes live
-    for path in list(folder.rglob(f"{PARTIAL}*")):
-        owner = path.name.removeprefix(PARTIAL).partition("-")[0]
-        if owner.isdecimal() and int(owner) != os.getpid() and _alive(int(owner)):
+        return  # elsewhere there is no portable way to check whether a process is running
+    for path in list(folder.rglob(f"{PARTIAL_PREFIX}*")):
+        owner = path.name.removeprefix(PARTIAL_PREFIX).partition("-")[0]
+        if owner.isdecimal() and int(owner) != os.getpid() and _is_running(int(owner)):
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -121,54 +120,66 @@ def sweep(folder: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """A JSON document. NaN and infinity, which JSON does not know, are refused."""
+    """The parsed JSON document.
 
-    def refuse(word: str) -> None:
+    Raises:
+        BadFile: The file is missing, is not valid JSON, or holds NaN or infinity, which JSON does not define.
+    """
+
+    def reject(word: str) -> None:
         raise BadFile(path, f"holds {word}, which is not a JSON number")
 
-    _exists(path)
+    _require_file(path)
     try:
-        return json.loads(path.read_text("utf-8"), parse_constant=refuse)
+        return json.loads(path.read_text("utf-8"), parse_constant=reject)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadFile(path, f"is not valid JSON: {error}") from None
 
 
 def write_json(path: Path, document: Any) -> None:
-    """A JSON document, indented; NaN is written as null, for JSON has no other word."""
+    """Write an indented JSON document; NaN and infinities, which JSON does not define, become null."""
     text = json.dumps(_without_nan(document), indent=1, allow_nan=False)
-    write_whole(path, lambda partial: partial.write_text(text + "\n", "utf-8"))
+    write_atomically(path, lambda partial: partial.write_text(text + "\n", "utf-8"))
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Height and width of an 8-bit picture, without decoding it."""
-    with _open(path) as picture:
-        return picture.height, picture.width
+    """Height and width of an 8-bit image [pixels], read without decoding it."""
+    with _open(path) as image:
+        return image.height, image.width
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w c"]:
-    """Code values of an 8-bit PNG or JPEG: 1, 3 or 4 channels as stored (a palette becomes RGB or RGBA)."""
-    with _open(path) as picture:
-        if picture.mode in ("I", "F") or picture.mode.startswith("I;16"):
-            raise BadFile(path, f"has pixels of kind {picture.mode}, not 8 bits", "convert it to 8-bit sRGB")
-        mode = {"L": "L", "1": "L", "RGB": "RGB", "RGBA": "RGBA", "LA": "RGBA"}.get(picture.mode)
+    """Code values of an 8-bit PNG or JPEG: 1, 3 or 4 channels as stored (a palette becomes RGB or RGBA).
+
+    Raises:
+        BadFile: The file is missing, is not an 8-bit image, is damaged, or has more than `MAX_PIXELS` pixels.
+    """
+    with _open(path) as image:
+        if image.mode in ("I", "F") or image.mode.startswith("I;16"):
+            raise BadFile(path, f"has pixels of type {image.mode}, not 8-bit ones", "convert it to 8-bit sRGB")
+        mode = {"L": "L", "1": "L", "RGB": "RGB", "RGBA": "RGBA", "LA": "RGBA"}.get(image.mode)
         if mode is None:
-            mode = "RGBA" if "transparency" in picture.info else "RGB"
+            mode = "RGBA" if "transparency" in image.info else "RGB"
         try:
-            values = np.asarray(picture.convert(mode))
+            values = np.asarray(image.convert(mode))
         except (OSError, SyntaxError) as error:
             raise BadFile(path, f"cannot be decoded: {error}") from None
     return values if values.ndim == 3 else values[..., None]
 
 
 def write_png(path: Path, values: UInt8[np.ndarray, "h w c"]) -> None:
-    """Code values as a PNG of 1, 3 or 4 channels."""
-    picture = Image.fromarray(values[..., 0] if values.shape[2] == 1 else values)
-    write_whole(path, lambda partial: picture.save(partial, "PNG"))
+    """Write code values as a PNG with 1, 3 or 4 channels."""
+    image = Image.fromarray(values[..., 0] if values.shape[2] == 1 else values)
+    write_atomically(path, lambda partial: image.save(partial, "PNG"))
 
 
 def read_radiance(path: Path) -> Float32[np.ndarray, "h w c"]:
-    """Linear float pixels of an OpenEXR (.exr) or Radiance (.hdr) file: 1 or 3 channels, all finite."""
-    _exists(path)
+    """Linear float pixels of an OpenEXR (.exr) or Radiance (.hdr) file with 1 or 3 channels.
+
+    Raises:
+        BadFile: The file is missing, of another format, damaged, too large, or holds NaN or infinity.
+    """
+    _require_file(path)
     readers = {".exr": _read_exr, ".hdr": _read_hdr}
     if path.suffix.lower() not in readers:
         raise BadFile(path, f"has the ending {path.suffix!r}, not .exr or .hdr")
@@ -179,7 +190,7 @@ def read_radiance(path: Path) -> Float32[np.ndarray, "h w c"]:
 
 
 def write_exr(path: Path, values: np.ndarray, *, half: bool = False) -> None:
-    """Linear pixels `[h w c]` as OpenEXR: channel Y for c = 1, RGB for c = 3; 16-bit floats when `half`."""
+    """Write linear pixels `[h w c]` as OpenEXR: channel Y for c = 1, RGB for c = 3; 16-bit floats when `half`."""
     pixels = np.ascontiguousarray(values, np.float16 if half else np.float32)
     channels = {"Y": pixels[..., 0]} if pixels.shape[2] == 1 else {"RGB": pixels}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -188,24 +199,24 @@ def write_exr(path: Path, values: np.ndarray, *, half: bool = False) -> None:
         try:
             OpenEXR.File(header, channels).write(str(partial))
         except RuntimeError as error:
-            # The library's words end with the system's reason.
+            # The message of the library ends with that of the system.
             raise OSError(str(error).rpartition('"')[2].strip(" .")) from None
 
-    write_whole(path, write)
+    write_atomically(path, write)
 
 
 def write_hdr(path: Path, values: Float32[np.ndarray, "h w 3"]) -> None:
-    """Linear radiance as a Radiance RGBE file; a colour keeps about 8 bits under its shared exponent."""
+    """Write linear radiance as a Radiance RGBE file, whose shared exponent keeps about 8 bits of each colour."""
 
     def write(partial: Path) -> None:
-        # OpenCV does not notice when the last block does not fit on the disk.
+        # OpenCV does not report an error when the last block does not fit on the disk.
         if not cv2.imwrite(str(partial), values[..., ::-1]) or cv2.imread(str(partial), cv2.IMREAD_UNCHANGED) is None:
             raise OSError("is the disk full?")
 
-    write_whole(path, write)
+    write_atomically(path, write)
 
 
-def _alive(process: int) -> bool:
+def _is_running(process: int) -> bool:
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -215,20 +226,20 @@ def _alive(process: int) -> bool:
     return True
 
 
-def _exists(path: Path) -> None:
+def _require_file(path: Path) -> None:
     if not path.is_file():
         raise BadFile(path, "is missing" if not path.exists() else "is not a file")
 
 
 def _open(path: Path) -> Image.Image:
-    _exists(path)
+    _require_file(path)
     try:
-        picture = Image.open(path)
+        image = Image.open(path)
     except (OSError, Image.DecompressionBombError) as error:
-        raise BadFile(path, f"is not a picture: {error}") from None
-    if picture.width * picture.height > MAX_PIXELS:
-        raise BadFile(path, f"has {picture.width} x {picture.height} pixels, over the limit of {MAX_PIXELS}")
-    return picture
+        raise BadFile(path, f"is not an image: {error}") from None
+    if image.width * image.height > MAX_PIXELS:
+        raise BadFile(path, f"has {image.width} x {image.height} pixels, over the limit of {MAX_PIXELS}")
+    return image
 
 
 def _read_exr(path: Path) -> np.ndarray:
@@ -259,7 +270,7 @@ def _read_hdr(path: Path) -> np.ndarray:
 
 
 def _hdr_size(path: Path) -> tuple[int, int]:
-    """Height and width from the resolution line that ends a Radiance header."""
+    """Height and width from the resolution line at the end of a Radiance header."""
     with path.open("rb") as file:
         if not file.readline(64).startswith((b"#?RADIANCE", b"#?RGBE")):
             raise BadFile(path, "is not a Radiance HDR file")

@@ -1,23 +1,26 @@
-"""The folder is the registry: `named("datasets", "folder")` is the module `tumble.datasets.folder`."""
+"""Plugins by file name: `load_plugin("datasets", "folder")` imports the module `tumble.datasets.folder`.
+
+The folder itself is the registry. Modules whose name begins with an underscore are not plugins.
+"""
 
 import importlib
 import pkgutil
 from types import ModuleType
 
 
-def names(folder: str) -> list[str]:
-    """The plugins of a folder, by file name, sorted."""
+def plugin_names(folder: str) -> list[str]:
+    """Sorted file names of the plugins in the subpackage `tumble.<folder>`."""
     package = importlib.import_module(f"tumble.{folder}")
     return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_"))
 
 
-def named(folder: str, name: str) -> ModuleType:
-    """The plugin `name` of a folder of the package, imported.
+def load_plugin(folder: str, name: str) -> ModuleType:
+    """Import the plugin `name` of the subpackage `tumble.<folder>`.
 
     Raises:
-        ValueError: There is no such plugin; the message lists those there are.
+        ValueError: There is no such plugin; the message lists the available ones.
     """
-    known = names(folder)
+    known = plugin_names(folder)
     if name not in known:
-        raise ValueError(f"no {name!r} in tumble/{folder}; there are: {', '.join(known) or 'none'}")
+        raise ValueError(f"no {name!r} in tumble/{folder}; available: {', '.join(known) or 'none'}")
     return importlib.import_module(f"tumble.{folder}.{name}")

@@ -1,8 +1,9 @@
-"""Dataclasses of tensors as trees: map over them, name their leaves, move them, keep them on disk.
+"""Trees of tensors: map a function over the tensors, name them, move them between devices, save and load them.
 
-A *tree* is a frozen dataclass whose fields are tensors, other trees, dicts of tensors, or plain *facts* (numbers,
-strings, tuples of those, None). A leaf's *name* is its path of field names joined by dots: `trajectory.T_cam_obj.wxyz`.
-On disk a tree is one safetensors file: leaves by name, facts as JSON in the header. Nothing is ever pickled.
+A *tree* is a frozen dataclass whose fields are tensors, other trees, dicts of tensors, or *plain values* (numbers,
+strings, tuples of those, None). The *name* of a tensor is its path of field names joined by dots, such as
+`trajectory.T_cam_obj.wxyz`. On disk a tree is one safetensors file: tensors by name, and plain values as JSON in the
+header under the key "facts". Nothing is pickled.
 """
 
 import dataclasses
@@ -23,11 +24,12 @@ from tumble.io import files
 from tumble.io.files import BadFile
 
 T = TypeVar("T")
-REMEDY = "remove it, and give the command that made it again"
+FIX = "remove it and run the command that made it again"
+"""Fix that `BadFile` suggests for an unreadable tree."""
 
 
 def map(fn: Callable[[Tensor], Tensor], tree: T) -> T:
-    """Apply `fn` to every tensor of a tree; facts stay as they are."""
+    """The tree with `fn` applied to every tensor, in field order; plain values are unchanged."""
     if isinstance(tree, Tensor):
         return typing.cast(T, fn(tree))
     if isinstance(tree, dict):
@@ -38,7 +40,7 @@ def map(fn: Callable[[Tensor], Tensor], tree: T) -> T:
 
 
 def named_tensors(tree: object) -> dict[str, Tensor]:
-    """Every tensor of a tree under its dotted name, in field order."""
+    """All tensors of a tree by dotted name, in field order."""
     return dict(_walk(tree, ""))
 
 
@@ -48,37 +50,37 @@ def to(tree: T, device: torch.device | str) -> T:
 
 
 def detach(tree: T) -> T:
-    """The tree cut off from the autograd graph, sharing storage."""
+    """The tree detached from the autograd graph; tensors share storage with the originals."""
     return map(torch.Tensor.detach, tree)
 
 
 def save(tree: object, path: Path) -> None:
-    """Write a tree as one safetensors file; the file appears whole or not at all."""
-    # Leaves may share storage (views of one parameter); safetensors wants each to own its bytes.
+    """Write a tree atomically as one safetensors file."""
+    # Tensors may share storage (views of one parameter); safetensors requires each to own its bytes.
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in named_tensors(tree).items()}
-    header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_facts(tree))}
-    files.write_whole(path, lambda partial: safetensors.torch.save_file(tensors, partial, metadata=header))
+    header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_plain_values(tree))}
+    files.write_atomically(path, lambda partial: safetensors.torch.save_file(tensors, partial, metadata=header))
 
 
 def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
-    """Read a tree of class `cls`.
+    """The tree of class `cls` stored in a file.
 
     Raises:
-        BadFile: The file is damaged, holds another class, or lacks a field; the message names both.
+        BadFile: The file is damaged, holds another class, or lacks a field.
     """
     try:
         with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
             header = file.metadata() or {}
             if header.get("type") != cls.__name__:
                 rule = f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}"
-                raise BadFile(path, rule, REMEDY)
+                raise BadFile(path, rule, FIX)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
         return _build(cls, tensors, json.loads(header["facts"]), "")
     except safetensors.SafetensorError as error:
-        raise BadFile(path, f"is damaged: {error}", REMEDY) from None
+        raise BadFile(path, f"is damaged: {error}", FIX) from None
     except KeyError as missing:
         rule = f"lacks {missing}, a field of {cls.__name__}; written by another version?"
-        raise BadFile(path, rule, REMEDY) from None
+        raise BadFile(path, rule, FIX) from None
 
 
 def _fields(tree: object) -> dict[str, Any]:
@@ -86,6 +88,7 @@ def _fields(tree: object) -> dict[str, Any]:
 
 
 def _walk(tree: object, prefix: str) -> Iterator[tuple[str, Tensor]]:
+    """Names and tensors of a tree, depth first in field order."""
     if isinstance(tree, Tensor):
         yield prefix, tree
         return
@@ -96,35 +99,36 @@ def _walk(tree: object, prefix: str) -> Iterator[tuple[str, Tensor]]:
             yield from _walk(value, f"{prefix}.{key}" if prefix else str(key))
 
 
-def _facts(tree: object) -> dict[str, Any]:
-    """What is not a tensor, nested as the tree is; a tensor's place holds the word "tensor"."""
+def _plain_values(tree: object) -> dict[str, Any]:
+    """The plain values of a tree, nested like the tree; each tensor is represented by the string "tensor"."""
     facts: dict[str, Any] = {}
     for name, value in (tree if isinstance(tree, dict) else _fields(tree)).items():
         if isinstance(value, Tensor):
             facts[name] = "tensor"
         elif isinstance(value, dict) or dataclasses.is_dataclass(value):
-            facts[name] = {"tree": _facts(value)}
+            facts[name] = {"tree": _plain_values(value)}
         else:
             facts[name] = {"fact": value}
     return facts
 
 
 def _build(cls: Any, tensors: dict[str, Tensor], facts: dict[str, Any], prefix: str) -> Any:
+    """The tree of class `cls` from its tensors and what `_plain_values` returned; names begin with `prefix`."""
     hints = {} if cls is dict else typing.get_type_hints(cls)
     values: dict[str, Any] = {}
     for name in facts if cls is dict else hints:
-        place, fact = prefix + name, facts[name]
-        if fact == "tensor":
-            values[name] = tensors[place]
-        elif "tree" in fact:
-            values[name] = _build(_tree_class(hints.get(name, dict)), tensors, fact["tree"], place + ".")
+        key, entry = prefix + name, facts[name]
+        if entry == "tensor":
+            values[name] = tensors[key]
+        elif "tree" in entry:
+            values[name] = _build(_tree_class(hints.get(name, dict)), tensors, entry["tree"], key + ".")
         else:
-            values[name] = tuple(fact["fact"]) if isinstance(fact["fact"], list) else fact["fact"]
+            values[name] = tuple(entry["fact"]) if isinstance(entry["fact"], list) else entry["fact"]
     return values if cls is dict else cls(**values)
 
 
 def _tree_class(hint: Any) -> Any:
-    """The dataclass (or dict) that a field's annotation allows: `Material` for `Material | None`."""
+    """The dataclass (or dict) in the annotation of a field: `Material` for `Material | None`."""
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
     return dict if typing.get_origin(hint) is dict else hint

@@ -1,8 +1,8 @@
-"""Drop a matcher here: a file with `VERSION` and `load(device) -> Matcher`.
+"""Matchers: pixel correspondences between two frames. Drop a file with `VERSION` and `load(device) -> Matcher` here.
 
-A matcher takes two views and finds pixels that show the same surface point. Both ends of every correspondence lie on
-pixels that are surely object, away from the border of the mask; a view without such pixels has no match. VERSION is
-raised when the same views give another result. A matcher made of others names them in PARTS.
+A matcher takes two views and returns pairs of pixels that show the same surface point. Both pixels lie on the object,
+away from the border of the mask and from unknown pixels; a view without such pixels gives an empty match. VERSION is
+raised when the same views give another result. A matcher that combines others lists their names in PARTS.
 """
 
 import functools
@@ -17,17 +17,18 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tumble.io import BadFile, files, named
+from tumble.io import BadFile, files, load_plugin
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
 __all__ = ["Matcher", "match_pairs", "settings", "views_of"]
 
 Matcher = Callable[[View, View], Match]
+"""Function that matches two views."""
 
 
 def views_of(capture: Capture) -> list[View]:
-    """Every frame of a capture, as matchers take them."""
+    """All frames of a capture, as inputs of matchers."""
     return [View(i, image, mask) for i, (image, mask) in enumerate(zip(capture.images, capture.masks, strict=True))]
 
 
@@ -39,45 +40,46 @@ def match_pairs(
     device: torch.device | str = "cpu",
     cache: Path | None = None,
 ) -> list[Match]:
-    """The matches of pairs of views, in the order of the pairs; a bar shows how far it is.
+    """Matches of pairs of views, in the order of the pairs, with a progress bar.
 
     Args:
-        views: The frames.
+        views: Frames.
         pairs: Indices into `views`.
-        matcher: File name in this folder.
-        device: Where a matcher with a network runs it.
-        cache: Folder with one file per pair. What is in it is not computed again, so an interrupted run goes on where
-            it stopped; other frames, masks or settings make other files.
+        matcher: Name of the matcher: its file name in this folder.
+        device: Device of a matcher's network.
+        cache: Folder with one file per pair. Cached pairs are not computed again, so that an interrupted run can be
+            resumed; other frames, masks or settings have other file names.
 
     Raises:
+        ValueError: There is no such matcher.
         BadFile: A file of the cache is damaged.
     """
-    # Loaded at the first pair that is not in the cache: a network takes seconds, and may be gone by now.
-    load = functools.cache(named("matching", matcher).load)
-    decides = settings(matcher)
-    names = [_window.digest(view) for view in views]
-    found = []
+    # Loaded at the first pair that is not cached: a network takes seconds to load, and may have been removed.
+    load = functools.cache(load_plugin("matching", matcher).load)
+    key = settings(matcher)
+    digests = [_window.digest(view) for view in views]
+    matches = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         for i, j in bar.track(pairs, description=f"matching ({matcher})"):
-            path = _place(cache, matcher, decides, names[i], names[j])
+            path = _cache_path(cache, matcher, key, digests[i], digests[j])
             if path is not None and path.exists():
-                found.append(_read(path, views[i].number, views[j].number))
+                matches.append(_read(path, views[i].number, views[j].number))
                 continue
-            found.append(load(device)(views[i], views[j]))
+            matches.append(load(device)(views[i], views[j]))
             if path is not None:
-                _write(path, found[-1])
-    return found
+                _write(path, matches[-1])
+    return matches
 
 
 def settings(matcher: str) -> str:
-    """All that decides a matcher's result besides the views, as JSON."""
+    """Everything besides the views that determines a matcher's result, as JSON."""
     return json.dumps(_settings(matcher), sort_keys=True)
 
 
 def _settings(matcher: str) -> dict[str, object]:
-    """The constants of a matcher's file, and of those it is made of."""
-    module = named("matching", matcher)
+    """Constants of a matcher's file, of its windows, and of the matchers it combines."""
+    module = load_plugin("matching", matcher)
     settings: dict[str, object] = {
         f"{source.__name__}.{name}": value
         for source in (module, _window)
@@ -89,22 +91,24 @@ def _settings(matcher: str) -> dict[str, object]:
     return settings
 
 
-def _place(cache: Path | None, matcher: str, settings: str, *names: str) -> Path | None:
+def _cache_path(cache: Path | None, matcher: str, settings: str, *digests: str) -> Path | None:
+    """File of a pair of views in the cache, named by a hash of all that determines its match."""
     if cache is None:
         return None
-    key = hashlib.blake2b(" ".join([matcher, settings, *names]).encode(), digest_size=16).hexdigest()
+    key = hashlib.blake2b(" ".join([matcher, settings, *digests]).encode(), digest_size=16).hexdigest()
     return cache / f"{matcher}-{key}.safetensors"
 
 
 def _write(path: Path, match: Match) -> None:
-    """The correspondences without the frames' numbers: those depend on what else is in the capture."""
+    """Write a match without the frames' indices, which depend on the rest of the capture."""
     tensors = {name: getattr(match, name).contiguous() for name in ("uv_i", "uv_j", "confidence")}
-    files.write_whole(path, lambda partial: safetensors.torch.save_file(tensors, partial))
+    files.write_atomically(path, lambda partial: safetensors.torch.save_file(tensors, partial))
 
 
 def _read(path: Path, i: int, j: int) -> Match:
+    """Match of a file in the cache, between frames `i` and `j`."""
     try:
         tensors = safetensors.torch.load_file(path)
         return Match(i, j, tensors["uv_i"], tensors["uv_j"], tensors["confidence"])
     except (safetensors.SafetensorError, KeyError) as error:
-        raise BadFile(path, f"is no match: {error}", "delete it, it is computed again") from None
+        raise BadFile(path, f"is not a match: {error}", "delete it, it is computed again") from None

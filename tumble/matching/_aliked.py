@@ -1,7 +1,7 @@
-"""ALIKED (Zhao et al. 2023) as functions of its published weights: keypoints with sub-pixel positions, and descriptors.
+"""ALIKED (Zhao et al. 2023): keypoints with sub-pixel positions and descriptors, as functions of the published weights.
 
-Written from the paper's architecture. The deformable convolution is put together from bilinear lookups, because the
-package that has it is not one to depend on.
+Implemented from the paper. The deformable convolution consists of bilinear lookups, to avoid a dependency on
+torchvision.
 """
 
 import torch
@@ -10,17 +10,18 @@ from torch import Tensor
 from torch.nn import functional
 
 RADIUS = 2
-"""Of the windows for suppression and for sub-pixel positions [pixels]."""
+"""Radius of the windows for non-maximum suppression and sub-pixel refinement [pixels]."""
 TEMPERATURE = 0.1
-"""Of the softmax over scores that places a keypoint between pixels (section III-C)."""
-COARSEST = 32
-"""Stride of the last block: images are multiples of it."""
+"""Temperature of the softmax over scores that gives sub-pixel positions (section III-C)."""
+MAX_STRIDE = 32
+"""Stride of the last block, of which image sizes are multiples [pixels]."""
 
 Parameters = dict[str, Tensor]
+"""Published weights by name."""
 
 
 def dense(image: Float[Tensor, "1 3 h w"], p: Parameters) -> tuple[Float[Tensor, "1 c h w"], Float[Tensor, "1 1 h w"]]:
-    """Unit features and keypoint scores per pixel, of sRGB values in [0, 1]."""
+    """Unit features and keypoint scores of every pixel, from sRGB values in [0, 1]."""
     x1 = _block(image, p, "block1")
     x2 = _block(functional.avg_pool2d(x1, 2), p, "block2")
     x3 = _block(functional.avg_pool2d(x2, 4), p, "block3")
@@ -36,27 +37,29 @@ def dense(image: Float[Tensor, "1 3 h w"], p: Parameters) -> tuple[Float[Tensor,
     return functional.normalize(joined, dim=1), score.sigmoid()
 
 
-def keypoints(score: Float[Tensor, "1 1 h w"], usable: Tensor, *, count: int, least: float) -> Float[Tensor, "n 2"]:
-    """Positions of the highest local maxima of the score, at most `count` [pixels, first centre at 0, x first].
+def keypoints(
+    score: Float[Tensor, "1 1 h w"], usable: Tensor, *, max_count: int, min_score: float
+) -> Float[Tensor, "n 2"]:
+    """Positions (x, y) of the highest local maxima of the score [pixels, first centre at 0].
 
     Args:
-        score: Per pixel.
-        usable: Where keypoints may lie, `bool[h w]`.
-        count: Most keypoints.
-        least: Least score.
+        score: Keypoint score per pixel.
+        usable: Pixels that may be keypoints, `bool[h w]`.
+        max_count: Largest number of keypoints.
+        min_score: Smallest score of a keypoint.
     """
     width = score.shape[-1]
-    peaks = score[0, 0] * (_maxima(score)[0, 0] & usable)
-    best = peaks.flatten().topk(min(count, int((peaks > least).sum()))).indices
+    peaks = score[0, 0] * (_local_maxima(score)[0, 0] & usable)
+    best = peaks.flatten().topk(min(max_count, int((peaks > min_score).sum()))).indices
     taps = torch.arange(-RADIUS, RADIUS + 1, device=score.device)
-    around = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).reshape(-1, 2).to(score)
+    offsets = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).reshape(-1, 2).to(score)
     patches = functional.unfold(score, 2 * RADIUS + 1, padding=RADIUS)[0].T[best]
-    middle = (patches / TEMPERATURE).softmax(-1) @ around
-    return torch.stack([best % width, best // width], -1) + middle
+    refinement = (patches / TEMPERATURE).softmax(-1) @ offsets
+    return torch.stack([best % width, best // width], -1) + refinement
 
 
 def descriptors(features: Float[Tensor, "1 c h w"], at: Float[Tensor, "n 2"], p: Parameters) -> Float[Tensor, "n c"]:
-    """Unit descriptors from features at learned places around every keypoint (section III-D: SDDH)."""
+    """Unit descriptors from features at learned positions around every keypoint (SDDH, section III-D)."""
     height, width = features.shape[-2:]
     column, row = at.long().unbind(-1)
     taps = torch.arange(3, device=at.device)
@@ -68,7 +71,7 @@ def descriptors(features: Float[Tensor, "1 c h w"], at: Float[Tensor, "n 2"], p:
     )
     farthest = max(height, width) / 4
     offsets = last[:, :, 0, 0].clamp(-farthest, farthest).unflatten(1, (2, -1)).transpose(1, 2)
-    sampled = _lookup(features, (at[:, None] + offsets)[None])
+    sampled = _sample(features, (at[:, None] + offsets)[None])
     mixed = functional.selu(functional.conv2d(sampled, p["desc_head.sf_conv.weight"]))[0]
     return functional.normalize(torch.einsum("cnp,pcd->nd", mixed, p["desc_head.agg_weights"]), dim=-1)
 
@@ -76,12 +79,12 @@ def descriptors(features: Float[Tensor, "1 c h w"], at: Float[Tensor, "n 2"], p:
 def deformable(
     x: Float[Tensor, "1 c h w"], offsets: Float[Tensor, "1 taps2 h w"], kernel: Float[Tensor, "d c k k"]
 ) -> Float[Tensor, "1 d h w"]:
-    """A convolution whose taps lie elsewhere for every pixel; 0 outside the picture (Dai et al. 2017).
+    """Deformable convolution, with zeros outside the image (Dai et al. 2017).
 
     Args:
         x: Features.
-        offsets: Per tap, rows of the kernel first: vertical, then horizontal [pixels].
-        kernel: With an odd width.
+        offsets: Vertical and horizontal offset per tap of the kernel, row by row, and per pixel [pixels].
+        kernel: Kernel of odd width.
     """
     height, width = x.shape[-2:]
     half = kernel.shape[-1] // 2
@@ -89,19 +92,19 @@ def deformable(
     rows, columns = torch.arange(height, device=x.device), torch.arange(width, device=x.device)
     pixel = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
     tap = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).reshape(-1, 1, 1, 2)
-    moved = offsets[0].unflatten(0, (-1, 2)).permute(0, 2, 3, 1).flip(-1)
-    sampled = _lookup(x, (pixel + tap + moved).flatten(1, 2)[None])
+    shift = offsets[0].unflatten(0, (-1, 2)).permute(0, 2, 3, 1).flip(-1)
+    sampled = _sample(x, (pixel + tap + shift).flatten(1, 2)[None])
     return torch.einsum("bcks,dck->bds", sampled, kernel.flatten(2)).unflatten(-1, (height, width))
 
 
-def _lookup(x: Float[Tensor, "1 c h w"], at: Float[Tensor, "1 n m 2"]) -> Float[Tensor, "1 c n m"]:
-    """Values between pixels, x first, the first centre at 0."""
+def _sample(x: Float[Tensor, "1 c h w"], at: Float[Tensor, "1 n m 2"]) -> Float[Tensor, "1 c n m"]:
+    """Bilinear interpolation at positions (x, y) [pixels, first centre at 0]."""
     size = at.new_tensor([x.shape[-1], x.shape[-2]])
     return functional.grid_sample(x, (2 * at + 1) / size - 1, align_corners=False)
 
 
 def _block(x: Tensor, p: Parameters, name: str) -> Tensor:
-    """Two convolutions, deformable where the weights have offsets, and the shortcut where they have one."""
+    """Residual block of two convolutions, which are deformable if the weights have offsets."""
     y = x
     for k in (1, 2):
         conv, norm = f"{name}.conv{k}", f"{name}.bn{k}"
@@ -120,15 +123,15 @@ def _block(x: Tensor, p: Parameters, name: str) -> Tensor:
     return functional.selu(y)
 
 
-def _maxima(score: Tensor) -> Tensor:
-    """Local maxima, and those that remain maxima once the neighbourhoods of the former are gone, twice."""
+def _local_maxima(score: Tensor) -> Tensor:
+    """Local maxima, and twice the local maxima of what remains without the neighbourhoods of earlier ones."""
 
-    def widest(x: Tensor) -> Tensor:
+    def maximum(x: Tensor) -> Tensor:
         return functional.max_pool2d(x, 2 * RADIUS + 1, 1, RADIUS)
 
-    found = score == widest(score)
+    maxima = score == maximum(score)
     for _ in range(2):
-        covered = widest(found.float()) > 0
+        covered = maximum(maxima.float()) > 0
         rest = score.masked_fill(covered, 0)
-        found = found | ((rest == widest(rest)) & ~covered)
-    return found
+        maxima = maxima | ((rest == maximum(rest)) & ~covered)
+    return maxima

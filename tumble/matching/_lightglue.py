@@ -1,6 +1,6 @@
-"""LightGlue (Lindenberger et al. 2023) as one function of its published weights: which keypoints of two frames are one.
+"""LightGlue (Lindenberger et al. 2023): matching of keypoints, as a function of the published weights.
 
-Written from the paper; all layers run, without its early exit and pruning: there are few keypoints here.
+Implemented from the paper. All layers are run; early exit and pruning are omitted, as there are few keypoints.
 """
 
 import torch
@@ -9,8 +9,10 @@ from torch import Tensor
 from torch.nn import functional
 
 HEADS = 4
+"""Number of attention heads."""
 
 Parameters = dict[str, Tensor]
+"""Published weights by name."""
 
 
 def assignment(
@@ -20,27 +22,30 @@ def assignment(
     descriptors_j: Float[Tensor, "m c"],
     p: Parameters,
 ) -> Float[Tensor, "n m"]:
-    """How likely every pair of keypoints shows one point, in [0, 1] (section 3.1 of the paper).
+    """Probability that two keypoints show the same point, for every pair (section 3.1 of the paper).
 
     Args:
-        at_i: Keypoints of one frame, in [-1, 1] along its longer side.
-        at_j: Of the other.
-        descriptors_i: Of the keypoints.
-        descriptors_j: Of the other frame's.
-        p: The published weights.
+        at_i: Positions of the keypoints of frame i, in [-1, 1] along its longer side.
+        at_j: Positions of the keypoints of frame j.
+        descriptors_i: Descriptors of the keypoints of frame i.
+        descriptors_j: Descriptors of the keypoints of frame j.
+        p: Published weights.
     """
     x_i, x_j = (_linear(d, p, "input_proj") for d in (descriptors_i, descriptors_j))
-    turn_i, turn_j = (_rotary(at, p) for at in (at_i, at_j))
+    rotary_i, rotary_j = (_rotary(at, p) for at in (at_i, at_j))
     last = -1
     while f"transformers.{last + 1}.self_attn.Wqkv.weight" in p:
         last += 1
-        x_i, x_j = (_self(x, turn, p, f"transformers.{last}.self_attn") for x, turn in ((x_i, turn_i), (x_j, turn_j)))
-        x_i, x_j = _cross(x_i, x_j, p, f"transformers.{last}.cross_attn")
+        x_i, x_j = (
+            _self_attention(x, rotary, p, f"transformers.{last}.self_attn")
+            for x, rotary in ((x_i, rotary_i), (x_j, rotary_j))
+        )
+        x_i, x_j = _cross_attention(x_i, x_j, p, f"transformers.{last}.cross_attn")
     name = f"log_assignment.{last}"
     y_i, y_j = (_linear(x, p, f"{name}.final_proj") for x in (x_i, x_j))
-    alike = y_i @ y_j.T / y_i.shape[-1] ** 0.5
-    able_i, able_j = (_linear(x, p, f"{name}.matchability").sigmoid() for x in (x_i, x_j))
-    return alike.softmax(1) * alike.softmax(0) * able_i * able_j.T
+    similarity = y_i @ y_j.T / y_i.shape[-1] ** 0.5
+    matchable_i, matchable_j = (_linear(x, p, f"{name}.matchability").sigmoid() for x in (x_i, x_j))
+    return similarity.softmax(1) * similarity.softmax(0) * matchable_i * matchable_j.T
 
 
 def _linear(x: Tensor, p: Parameters, name: str) -> Tensor:
@@ -48,24 +53,30 @@ def _linear(x: Tensor, p: Parameters, name: str) -> Tensor:
 
 
 def _rotary(at: Tensor, p: Parameters) -> tuple[Tensor, Tensor]:
-    """Cosines and sines by which a position turns pairs of channels (its rotary encoding), the same for all heads."""
+    """Rotary position encoding: cosines and sines that rotate pairs of channels, the same for all heads."""
     phase = (at @ p["posenc.Wr.weight"].T).repeat_interleave(2, -1)
     return phase.cos(), phase.sin()
 
 
-def _turned(x: Float[Tensor, "heads n c"], turn: tuple[Tensor, Tensor]) -> Float[Tensor, "heads n c"]:
+def _rotate(x: Float[Tensor, "heads n c"], rotary: tuple[Tensor, Tensor]) -> Float[Tensor, "heads n c"]:
+    """Channels rotated by the position encoding."""
     even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
-    return x * turn[0] + torch.stack([-odd, even], -1).flatten(-2) * turn[1]
+    return x * rotary[0] + torch.stack([-odd, even], -1).flatten(-2) * rotary[1]
 
 
-def _self(x: Float[Tensor, "n c"], turn: tuple[Tensor, Tensor], p: Parameters, name: str) -> Float[Tensor, "n c"]:
+def _self_attention(
+    x: Float[Tensor, "n c"], rotary: tuple[Tensor, Tensor], p: Parameters, name: str
+) -> Float[Tensor, "n c"]:
+    """Features of one frame's keypoints after self-attention."""
     # Channels of the joint projection: head, then channel, then query, key, value.
     q, k, v = _linear(x, p, f"{name}.Wqkv").unflatten(-1, (HEADS, -1, 3)).permute(3, 1, 0, 2).unbind(0)
-    message = functional.scaled_dot_product_attention(_turned(q, turn)[None], _turned(k, turn)[None], v[None])[0]
-    return _updated(x, _linear(message.transpose(0, 1).flatten(1), p, f"{name}.out_proj"), p, name)
+    message = functional.scaled_dot_product_attention(_rotate(q, rotary)[None], _rotate(k, rotary)[None], v[None])[0]
+    return _update(x, _linear(message.transpose(0, 1).flatten(1), p, f"{name}.out_proj"), p, name)
 
 
-def _cross(x_i: Tensor, x_j: Tensor, p: Parameters, name: str) -> tuple[Tensor, Tensor]:
+def _cross_attention(x_i: Tensor, x_j: Tensor, p: Parameters, name: str) -> tuple[Tensor, Tensor]:
+    """Features of both frames' keypoints after cross-attention."""
+
     def heads(x: Tensor, of: str) -> Tensor:
         return _linear(x, p, f"{name}.{of}").unflatten(-1, (HEADS, -1)).transpose(0, 1)[None]
 
@@ -73,10 +84,11 @@ def _cross(x_i: Tensor, x_j: Tensor, p: Parameters, name: str) -> tuple[Tensor, 
     to_i = functional.scaled_dot_product_attention(qk_i, qk_j, v_j)[0]
     to_j = functional.scaled_dot_product_attention(qk_j, qk_i, v_i)[0]
     out_i, out_j = (_linear(m.transpose(0, 1).flatten(1), p, f"{name}.to_out") for m in (to_i, to_j))
-    return _updated(x_i, out_i, p, name), _updated(x_j, out_j, p, name)
+    return _update(x_i, out_i, p, name), _update(x_j, out_j, p, name)
 
 
-def _updated(x: Tensor, message: Tensor, p: Parameters, name: str) -> Tensor:
+def _update(x: Tensor, message: Tensor, p: Parameters, name: str) -> Tensor:
+    """Features plus a network's output for features and message."""
     y = _linear(torch.cat([x, message], -1), p, f"{name}.ffn.0")
     y = functional.layer_norm(y, y.shape[-1:], p[f"{name}.ffn.1.weight"], p[f"{name}.ffn.1.bias"])
     return x + _linear(functional.gelu(y), p, f"{name}.ffn.3")

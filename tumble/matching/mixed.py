@@ -1,7 +1,8 @@
-"""The default: SIFT's few sure correspondences together with the dense flow's many, where that one is to be believed.
+"""Default matcher: the sparse correspondences of SIFT together with the dense ones of DIS optical flow.
 
-Both state how likely a correspondence is correct. Flow between frames that are far apart loses most of its points on
-the way back, hence its trust in the rest, and falls under the bar as a whole: then SIFT is alone.
+The confidences of both estimate the probability that a correspondence is correct. Between frames far apart most pixels
+fail the forward-backward check of the flow; the confidence of the others is then below the threshold as well, and only
+SIFT's correspondences remain.
 """
 
 import torch
@@ -11,19 +12,20 @@ from tumble.scene import Match, View
 
 VERSION = 1
 PARTS = ("sift", "dis")
-BELIEF = 0.6
-"""Least confidence. It asks that about a quarter of the object's surface returns."""
+"""Names of the combined matchers."""
+MIN_CONFIDENCE = 0.6
+"""Smallest confidence; for flow, about a quarter of the starting points must pass the forward-backward check."""
 
 
 def load(device: torch.device | str):
-    """A matcher that remembers every frame's features."""
+    """Matcher, which caches every frame's SIFT keypoints."""
     sparse, dense = sift.load(device), dis.load(device)
 
     def match(view_i: View, view_j: View) -> Match:
-        found = [matcher(view_i, view_j) for matcher in (sparse, dense)]
+        matches = [matcher(view_i, view_j) for matcher in (sparse, dense)]
         uv_i, uv_j, confidence = (
-            torch.cat([getattr(m, name) for m in found]) for name in ("uv_i", "uv_j", "confidence")
+            torch.cat([getattr(m, name) for m in matches]) for name in ("uv_i", "uv_j", "confidence")
         )
-        return Match(view_i.number, view_j.number, uv_i, uv_j, confidence).select(confidence >= BELIEF)
+        return Match(view_i.number, view_j.number, uv_i, uv_j, confidence).select(confidence >= MIN_CONFIDENCE)
 
     return match

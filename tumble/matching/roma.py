@@ -1,8 +1,8 @@
-"""RoMa v2 (Edstedt et al. 2025), through an installation of the user's own: dense, robust, slow without a GPU.
+"""RoMa v2 (Edstedt et al. 2025), installed by the user: dense and robust matching, slow without a GPU.
 
-The package `romav2` (MIT; its backbone under Meta's DINOv3 licence) fetches code and weights from GitHub on first use
-and needs torchvision, so nothing here installs it. This adapter is written against the interface of romav2 2.0.1 and
-its tests drive it with a stand-in of that interface; with the real network it has not been run by the project.
+The package `romav2` (MIT; its backbone under Meta's DINOv3 licence) downloads code and weights from GitHub on first use
+and requires torchvision, so it is not a dependency. This adapter is written for the interface of romav2 2.0.1 and
+tested with a mock of it; it has not been run with the real network.
 """
 
 import importlib
@@ -10,20 +10,22 @@ import importlib
 import numpy as np
 import torch
 
-from tumble.matching._window import windows
-from tumble.scene import Match, View, no_match
+from tumble.matching._window import crop_windows
+from tumble.scene import Match, View, empty_match
 
 VERSION = 1
-SETTING, SIZE = "base", 640
-"""RoMa's name for one direction at 640 pixels, and the size of the object's window."""
+SETTING = "base"
+"""RoMa's name for its setting of one direction at 640 pixels."""
+SIZE = 640
+"""Height and width of the window around the object that is matched [pixels]."""
 STEP = 8
-"""Grid of starting points [pixels of the window]."""
-BELIEF = 0.5
-"""Least probability that the other frame shows the point ("overlap")."""
+"""Spacing of the grid of starting points [pixels of the window]."""
+MIN_OVERLAP = 0.5
+"""Smallest probability that the other frame shows the point, RoMa's "overlap"."""
 
 
 def load(device: torch.device | str):
-    """A matcher without memory; the network runs where romav2 puts it, `device` is not used.
+    """Matcher; it has no state. The network runs on the device that romav2 selects; `device` is not used.
 
     Raises:
         ModuleNotFoundError: romav2 is not installed.
@@ -31,27 +33,29 @@ def load(device: torch.device | str):
     try:
         romav2 = importlib.import_module("romav2")
     except ModuleNotFoundError as missing:
-        fix = "pip install romav2, in an environment of its own if torchvision is not to come into this one"
-        raise ModuleNotFoundError(f"the matcher roma needs a package that is not here: {missing} ({fix})") from None
-    # It refuses to run otherwise, for its warps would be off.
+        fix = "pip install romav2, in a separate environment if this one should stay without torchvision"
+        raise ModuleNotFoundError(
+            f"the matcher roma needs a package that is not installed: {missing} ({fix})"
+        ) from None
+    # romav2 refuses to run otherwise, because its warps would be inaccurate.
     torch.set_float32_matmul_precision("highest")
     network = romav2.RoMaV2()
     network.apply_setting(SETTING)
 
     def match(view_i: View, view_j: View) -> Match:
-        looks = windows(view_i, view_j, SIZE)
-        if looks is None:
-            return no_match(view_i.number, view_j.number)
-        look_i, look_j = looks
-        found = network.match(look_i.rgb, look_j.rgb)
-        # Where every pixel goes, in [-1, 1] between the outer edges of the picture.
-        warp, overlap = (found[name][0].float().cpu().numpy() for name in ("warp_AB", "overlap_AB"))
+        pair = crop_windows(view_i, view_j, SIZE)
+        if pair is None:
+            return empty_match(view_i.number, view_j.number)
+        window_i, window_j = pair
+        output = network.match(window_i.rgb, window_j.rgb)
+        # Position of every pixel in the other window, in [-1, 1] between the outer edges.
+        warp, overlap = (output[name][0].float().cpu().numpy() for name in ("warp_AB", "overlap_AB"))
         row, column = np.mgrid[STEP // 2 : SIZE : STEP, STEP // 2 : SIZE : STEP].reshape(2, -1)
         start, end = np.stack([column, row], -1) + 0.5, (warp[row, column] + 1) / 2 * SIZE
-        likely = overlap[row, column, 0]
-        kept = look_i.sure[row, column] & look_j.holds(end) & (likely > BELIEF)
-        confidence = torch.from_numpy(likely[kept].astype(np.float32))
-        uv_i, uv_j = look_i.in_frame(start[kept]), look_j.in_frame(end[kept])
+        probability = overlap[row, column, 0]
+        kept = window_i.usable[row, column] & window_j.contains(end) & (probability > MIN_OVERLAP)
+        confidence = torch.from_numpy(probability[kept].astype(np.float32))
+        uv_i, uv_j = window_i.in_frame(start[kept]), window_j.in_frame(end[kept])
         return Match(view_i.number, view_j.number, uv_i, uv_j, confidence)
 
     return match

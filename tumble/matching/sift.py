@@ -1,80 +1,83 @@
-"""RootSIFT: few correspondences, but sure and precise ones, also over wide turns of textured objects.
+"""RootSIFT: few but reliable and precise correspondences, also over wide rotations of textured objects.
 
-Lowe 2004 with the Hellinger kernel of Arandjelovic and Zisserman 2012; the best two neighbours decide (ratio test),
-and both frames have to agree (mutual check). No weights, CPU only; `device` is not used.
+Lowe 2004, with the Hellinger kernel of Arandjelovic and Zisserman 2012, ratio test, and mutual nearest neighbours. No
+weights; runs on the CPU, `device` is not used.
 """
 
 import cv2
 import numpy as np
 import torch
 
-from tumble.matching._window import MARGIN, digest, extent, window
-from tumble.scene import Match, View, no_match
+from tumble.matching._window import MARGIN, crop_window, digest, extent
+from tumble.scene import Match, View, empty_match
 
 VERSION = 1
 SIZE = 384
-"""The object's window is resampled to this size: frames are small, and SIFT's smallest blobs are five pixels wide. More
-finds nothing more in frames of 128 pixels, and takes longer."""
-RATIO = 0.85
-"""Largest distance to the best neighbour, in units of that to the second."""
-DOUBT = 0.15
-"""Of the correspondences with distance ratio r, 1 - exp(-(1 - r) / DOUBT) are correct: measured on three hand-held
-captures (128 pixels, up to 50 degrees apart), 65 % at 0.85 and 98 % at 0.45."""
-CONTRAST = 0.01
-"""Least contrast of a keypoint; OpenCV's 0.04 leaves too few on plain surfaces."""
-KEPT = 2048
-"""Most keypoints of a frame."""
+"""Height and width of the window around the object that is matched [pixels].
+
+It enlarges small frames, because SIFT's smallest blobs are five pixels wide."""
+MAX_RATIO = 0.85
+"""Largest ratio of the distances to the nearest and the second nearest descriptor (ratio test)."""
+RATIO_SCALE = 0.15
+"""Scale of the confidence `1 - exp(-(1 - r) / RATIO_SCALE)` of a correspondence with distance ratio r.
+
+Fitted to the measured fraction of correct correspondences."""
+MIN_CONTRAST = 0.01
+"""Smallest contrast of a keypoint; OpenCV's 0.04 leaves too few on weakly textured surfaces."""
+MAX_KEYPOINTS = 2048
+"""Largest number of keypoints per frame."""
 
 Features = tuple[torch.Tensor, np.ndarray]
-"""Positions in the frame, RootSIFT descriptors."""
+"""Keypoints of a frame: positions [pixels], RootSIFT descriptors."""
 
 
 def load(device: torch.device | str):
-    """A matcher that remembers every frame's features."""
-    known: dict[str, Features] = {}
+    """Matcher, which caches every frame's keypoints."""
+    cached: dict[str, Features] = {}
 
     def features(view: View) -> Features:
         name = digest(view)
-        if name not in known:
-            known[name] = _describe(view)
-        return known[name]
+        if name not in cached:
+            cached[name] = _extract(view)
+        return cached[name]
 
     def match(view_i: View, view_j: View) -> Match:
         (uv_i, roots_i), (uv_j, roots_j) = features(view_i), features(view_j)
         if min(len(uv_i), len(uv_j)) < 2:
-            return no_match(view_i.number, view_j.number)
+            return empty_match(view_i.number, view_j.number)
         # Unit vectors with non-negative components: the cosine is in [0, 1].
         distance = np.sqrt((2 - 2 * roots_i @ roots_j.T).clip(0))
         best, ratio = _best_two(distance)
         back, ratio_back = _best_two(distance.T)
         i = np.arange(len(best))
-        worse = np.maximum(ratio, ratio_back[best])
-        i = i[(back[best] == i) & (worse < RATIO)]
-        confidence = torch.from_numpy(1 - np.exp((worse[i] - 1) / DOUBT).astype(np.float32))
+        max_ratio = np.maximum(ratio, ratio_back[best])
+        i = i[(back[best] == i) & (max_ratio < MAX_RATIO)]
+        confidence = torch.from_numpy(1 - np.exp((max_ratio[i] - 1) / RATIO_SCALE).astype(np.float32))
         return Match(view_i.number, view_j.number, uv_i[i], uv_j[best[i]], confidence)
 
     return match
 
 
-def _describe(view: View) -> Features:
-    reach = extent(view) * (1 + 2 * MARGIN)
-    if reach == 0:
+def _extract(view: View) -> Features:
+    """Keypoints of a view, with descriptors."""
+    width = extent(view) * (1 + 2 * MARGIN)
+    if width == 0:
         return torch.zeros(0, 2), np.zeros((0, 128), np.float32)
-    look = window(view, reach, SIZE)
-    # Without precise upscaling OpenCV's positions are a quarter of a pixel off.
-    detector = cv2.SIFT.create(KEPT, contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    keypoints, descriptors = detector.detectAndCompute(look.grey, look.sure.astype(np.uint8))
+    window = crop_window(view, width, SIZE)
+    # Without precise upscaling, OpenCV's positions are off by a quarter of a pixel.
+    detector = cv2.SIFT.create(MAX_KEYPOINTS, contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
+    keypoints, descriptors = detector.detectAndCompute(window.grey, window.usable.astype(np.uint8))
     if descriptors is None:
         return torch.zeros(0, 2), np.zeros((0, 128), np.float32)
     at = np.array([keypoint.pt for keypoint in keypoints]) + 0.5
     roots = np.sqrt(descriptors / descriptors.sum(1, keepdims=True).clip(1e-6)).astype(np.float32)
-    # OpenCV asks the mask at the nearest pixel of the window, which may lie over another pixel of the frame.
-    kept = look.holds(at)
-    return look.in_frame(at[kept]), roots[kept]
+    # OpenCV tests the mask at the nearest pixel of the window, which may lie on another pixel of the frame.
+    kept = window.contains(at)
+    return window.in_frame(at[kept]), roots[kept]
 
 
 def _best_two(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest of every row, and its distance in units of that of the second."""
+    """Index of the smallest distance in every row, and its ratio to the second smallest."""
     nearest = np.argpartition(distance, 1, axis=1)[:, :2]
     pair = np.take_along_axis(distance, nearest, 1)
     best = nearest[np.arange(len(distance)), pair.argmin(1)]

@@ -1,6 +1,6 @@
 """Rotations and rigid motions, directions on the sphere, spherical harmonics, images, least squares, point sets.
 
-Tensors in, tensors out: nothing here knows a camera or a file.
+Pure functions of tensors, without cameras, scenes or files.
 """
 
 from tumble.maths import spherical_harmonics
@@ -29,8 +29,8 @@ from tumble.maths.images import (
     ssim_map,
     to_srgb8,
 )
-from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, rowwise
-from tumble.maths.points import nearest, smallest_ball
+from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, select_rows
+from tumble.maths.points import nearest, smallest_enclosing_sphere
 from tumble.maths.se3 import SE3, SO3, angle_between, interpolate, mean_rotation, umeyama
 
 __all__ = [
@@ -59,8 +59,8 @@ __all__ = [
     "random_rotation",
     "reflect",
     "resize_area",
-    "rowwise",
-    "smallest_ball",
+    "select_rows",
+    "smallest_enclosing_sphere",
     "spherical_harmonics",
     "srgb_from_linear",
     "ssim",

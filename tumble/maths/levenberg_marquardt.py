@@ -1,4 +1,7 @@
-"""Damped least squares on many small problems side by side: the loop alone, each problem brings its own equations."""
+"""Levenberg-Marquardt minimisation of many small least-squares problems in parallel (Marquardt 1963).
+
+This file holds the loop over steps and the control of damping; the caller provides the equations.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -11,28 +14,31 @@ State = TypeVar("State")
 
 
 class Linearised(NamedTuple):
-    """A least-squares problem about one state."""
+    """Least-squares problems linearised at a state."""
 
     cost: Float[Tensor, " p"]
-    """Of every problem."""
+    """Cost of every problem."""
     system: Any
-    """What a step is computed from: residuals, or normal equations."""
+    """Equations from which a step is computed: residuals, or normal equations."""
 
 
 class Damping(NamedTuple):
-    """How much the diagonal of the normal equations is raised."""
+    """Control of the damping, which is added to the diagonal of the normal equations."""
 
     start: float = 1e-3
+    """Damping of the first step."""
     accepted: float = 0.2
     """Factor after a step that lowers the cost."""
     rejected: float = 8.0
-    """Factor after one that does not."""
-    least: float = 0.0
-    most: float = float("inf")
+    """Factor after a step that does not lower the cost."""
+    minimum: float = 0.0
+    """Lower limit of the damping."""
+    maximum: float = float("inf")
+    """Upper limit of the damping."""
 
 
-STUCK = 1e6
-"""Damping from which a problem does not move any more."""
+STALLED_DAMPING = 1e6
+"""Damping above which steps are negligible and a problem counts as converged."""
 
 
 def minimise(
@@ -45,35 +51,41 @@ def minimise(
     damping: Damping,
     tolerance: float | None = None,
 ) -> tuple[State, Linearised]:
-    """Levenberg-Marquardt (Marquardt 1963): steps that lower a problem's cost are taken, others raise its damping.
+    """The states of least cost found, and the problems linearised there.
+
+    Each problem has its own damping: a step that lowers the cost is accepted, any other only raises the damping.
 
     Args:
-        state: Where all problems start.
-        linearise: Costs and equations about a state.
+        state: Initial states of all problems.
+        linearise: Costs and equations at a state.
         move: The state after the damped step, from a state, its system and the damping of every problem.
-        choose: Per problem, the second argument where the first is true, else the third; of states and of systems.
-        steps: Largest number.
-        tolerance: A problem is done when a step lowers its cost by less than this share; None: only `steps` ends it.
+        choose: `torch.where` per problem for states and systems: the second argument where the first is true, else the
+            third.
+        steps: Maximum number of steps.
+        tolerance: A problem has converged when a step lowers its cost by less than this fraction. With None the loop
+            always makes all steps.
     """
-    now = linearise(state)
-    lam = torch.full_like(now.cost, damping.start)
-    done = torch.zeros_like(now.cost, dtype=torch.bool)
+    current = linearise(state)
+    lam = torch.full_like(current.cost, damping.start)
+    converged = torch.zeros_like(current.cost, dtype=torch.bool)
     for _ in range(steps):
-        moved = move(state, now.system, lam)
-        then = linearise(moved)
-        better = then.cost < now.cost
+        moved = move(state, current.system, lam)
+        proposed = linearise(moved)
+        better = proposed.cost < current.cost
         if tolerance is not None:
-            done |= better & (now.cost - then.cost < tolerance * now.cost)
+            converged |= better & (current.cost - proposed.cost < tolerance * current.cost)
         state = choose(better, moved, state)
-        now = Linearised(torch.where(better, then.cost, now.cost), choose(better, then.system, now.system))
-        lam = torch.where(better, damping.accepted * lam, damping.rejected * lam).clamp(damping.least, damping.most)
-        if tolerance is not None and bool((done | (lam > STUCK)).all()):
+        cost = torch.where(better, proposed.cost, current.cost)
+        current = Linearised(cost, choose(better, proposed.system, current.system))
+        lam = torch.where(better, damping.accepted * lam, damping.rejected * lam)
+        lam = lam.clamp(damping.minimum, damping.maximum)
+        if tolerance is not None and bool((converged | (lam > STALLED_DAMPING)).all()):
             break
-    return state, now
+    return state, current
 
 
-def rowwise(better: Bool[Tensor, " p"], new: Any, old: Any) -> Any:
-    """`choose` for tuples of tensors with one row per problem."""
+def select_rows(better: Bool[Tensor, " p"], new: Any, old: Any) -> Any:
+    """The argument `choose` of `minimise` for (nested tuples of) tensors with one row per problem."""
     if isinstance(new, Tensor):
         return torch.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-    return tuple(rowwise(better, a, b) for a, b in zip(new, old, strict=True))
+    return tuple(select_rows(better, a, b) for a, b in zip(new, old, strict=True))

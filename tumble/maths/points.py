@@ -1,4 +1,4 @@
-"""Sets of points: the nearest of another set, and the smallest ball around one."""
+"""Point sets: nearest neighbours and smallest enclosing spheres."""
 
 from collections.abc import Callable
 
@@ -6,27 +6,27 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-ROWS = 1024
-"""Rows of a distance matrix at once: bounds memory, changes nothing else."""
+CHUNK_ROWS = 1024
+"""Rows of the distance matrix that are computed at once; limits memory and does not affect results."""
 
 
 def nearest(x: Float[Tensor, "a 3"], y: Float[Tensor, "b 3"]) -> Int64[Tensor, " a"]:
-    """Index of the y nearest to each x."""
-    found = [torch.cdist(rows, y).argmin(1) for rows in x.split(ROWS)]
-    return torch.cat([*found, torch.zeros(0, dtype=torch.long, device=x.device)])
+    """Index of the nearest point of `y` for each point of `x`."""
+    indices = [torch.cdist(rows, y).argmin(1) for rows in x.split(CHUNK_ROWS)]
+    return torch.cat([*indices, torch.zeros(0, dtype=torch.long, device=x.device)])
 
 
-def smallest_ball(
+def smallest_enclosing_sphere(
     offsets: Callable[[Float[Tensor, "3"]], Float[Tensor, "n 3"]], centre: Float[Tensor, "3"], *, steps: int
 ) -> Float[Tensor, "3"]:
-    """Centre of the smallest ball that reaches all of some sets (Badoiu and Clarkson 2003).
+    """Centre of the smallest sphere that encloses points or touches lines (Badoiu and Clarkson 2003).
 
     Args:
-        offsets: From a centre to the nearest point of every set: a point itself, the foot on a line.
-        centre: To start from.
-        steps: The last one moves the centre by a share 1 / (steps + 1) of the radius.
+        offsets: Vectors from a given centre to each point, or to the nearest point of each line.
+        centre: Initial centre.
+        steps: Number of iterations; the last one moves the centre by 1 / (steps + 1) of the radius.
     """
     for step in range(1, steps + 1):
-        off = offsets(centre)
-        centre = centre + off[off.norm(dim=-1).argmax()] / (step + 1)
+        to_points = offsets(centre)
+        centre = centre + to_points[to_points.norm(dim=-1).argmax()] / (step + 1)
     return centre

@@ -4,8 +4,8 @@ Frames cancel on the page: `R_a_b @ x_b = x_a`, `T_a_b @ T_b_c = T_a_c`. A rotat
 part first (`wxyz`); a rigid motion adds a translation (`xyz`). Angles are in radians. Batch axes broadcast
 like those of tensors; one motion per frame over many points per frame is `T[:, None] @ x`.
 
-A *tangent* is what `exp` takes and `log` gives: a rotation vector `omega` (axis times angle) or, for rigid
-motions, `(v, omega)`. `exp` is smooth everywhere; `log` up to the half turn, where it has two answers.
+A *tangent* is the argument of `exp` and the result of `log`: a rotation vector `omega` (axis times angle) or, for
+rigid motions, `(v, omega)`. `exp` is smooth everywhere, `log` for angles below pi; at pi it has two solutions.
 """
 
 import math
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 SMALL = 1e-2
-"""Squared angle below which closed forms, which there divide 0 by 0, give way to their series."""
+"""Squared angle below which series replace the closed forms, which divide 0 by 0 at zero."""
 COSINE_SERIES = tuple((-1) ** k / 4**k / math.factorial(2 * k) for k in range(6))
 """cos(x / 2)"""
 SINE_SERIES = tuple((-1) ** k / 2 ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(6))
@@ -33,8 +33,8 @@ INVERSE_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1
 ARCTAN_SERIES = tuple((-1) ** k / (2 * k + 1) for k in range(8))
 """atan(x) / x"""
 COLLINEAR = 1e-6
-"""Second over first singular value of a covariance under which points count as lying on a line: a thousand
-times as long as wide, and still ten times the rounding error of float32."""
+"""Ratio of the second to the first singular value of a covariance below which points count as collinear: such a set is
+a thousand times as long as wide, and the limit is still ten times the rounding error of float32."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SO3:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> "SO3":
-        """No rotation, once per element of the batch."""
+        """The identity, once per element of the batch."""
         return SO3(torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device).expand(*batch, 4))
 
     @staticmethod
@@ -64,9 +64,9 @@ class SO3:
 
     @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 3 3"]) -> "SO3":
-        """From rotation matrices, with a non-negative real part; that they are rotations is not checked."""
+        """From rotation matrices (not checked); the real part of the result is non-negative."""
         m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.flatten(-2).unbind(-1)
-        # The rows of 4 q q^T; that of the largest component is never close to zero.
+        # The rows of 4 q q^T. The row with the largest diagonal element is never close to zero.
         rows = [
             [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
             [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
@@ -80,12 +80,12 @@ class SO3:
 
     @staticmethod
     def from_wxyz(wxyz: Float[Tensor, "*b 4"]) -> "SO3":
-        """From quaternions of any length but zero."""
+        """From quaternions of any length except zero, which are normalised."""
         return SO3(wxyz / torch.linalg.vector_norm(wxyz, dim=-1, keepdim=True))
 
     def log(self) -> Float[Tensor, "*b 3"]:
-        """The shortest rotation vector, at most pi long [radians]; at a half turn, one of the two."""
-        # q and -q are one rotation; the one with w >= 0 turns the short way.
+        """The shortest rotation vector, at most pi long [radians]; at the angle pi, one of the two solutions."""
+        # q and -q are the same rotation; the one with w >= 0 has an angle of at most pi.
         w, v = torch.where(self.wxyz[..., :1] < 0, -self.wxyz, self.wxyz).split([1, 3], -1)
         sine2 = v.square().sum(-1, keepdim=True)
         small = sine2 < SMALL
@@ -99,7 +99,7 @@ class SO3:
         """Rotation matrices, `R @ x_b = x_a` for column vectors."""
         q = self.wxyz
         products = (q[..., :, None] * q[..., None, :]).flatten(-2)
-        # Of few tensors: a stage takes the matrix of a single pose several times per step.
+        # One matrix product instead of many small operations, because stages convert single poses in every step.
         of_products, constant = _matrix_of_products(q.dtype, q.device)
         return (products @ of_products + constant).unflatten(-1, (3, 3))
 
@@ -108,7 +108,7 @@ class SO3:
         return SO3(torch.cat([self.wxyz[..., :1], -self.wxyz[..., 1:]], -1))
 
     def angle(self) -> Float[Tensor, "*b"]:
-        """Angle of the short way, 0 to pi [radians]; its gradient at no rotation is zero."""
+        """Rotation angle, 0 to pi [radians]; its gradient at the identity is zero."""
         sine = torch.linalg.vector_norm(self.wxyz[..., 1:], dim=-1)
         return 2 * torch.atan2(sine, self.wxyz[..., 0].abs())
 
@@ -134,7 +134,7 @@ class SE3:
     wxyz: Float[Tensor, "*b 4"]
     """Rotation as a unit quaternion, real part first."""
     xyz: Float[Tensor, "*b 3"]
-    """Where the origin of b lies in a [unit of the points]."""
+    """Position of the origin of b in frame a [unit of the points]."""
 
     @staticmethod
     def identity(
@@ -143,7 +143,7 @@ class SE3:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> "SE3":
-        """No motion, once per element of the batch."""
+        """The identity, once per element of the batch."""
         wxyz = SO3.identity(batch, dtype=dtype, device=device).wxyz
         return SE3(wxyz, torch.zeros(*batch, 3, dtype=dtype, device=device))
 
@@ -180,7 +180,7 @@ class SE3:
 
     @property
     def translation(self) -> Float[Tensor, "*b 3"]:
-        """Where the origin of b lies in a."""
+        """Position of the origin of b in frame a."""
         return self.xyz
 
     def log(self) -> Float[Tensor, "*b 6"]:
@@ -220,12 +220,12 @@ class SE3:
 
 
 def slerp(a: SO3, b: SO3, t: float | Float[Tensor, "*t"]) -> SO3:
-    """From `a` at t = 0 to `b` at t = 1, the short way at constant speed; `t` has the axes of the batch."""
+    """Spherical interpolation from `a` at t = 0 to `b` at t = 1 along the shortest path; `t` has the batch axes."""
     return a @ SO3.exp(_trailing(t) * (a.inverse() @ b).log())
 
 
 def interpolate(a: SE3, b: SE3, t: float | Float[Tensor, "*t"]) -> SE3:
-    """From `a` at t = 0 to `b` at t = 1: the rotation by `slerp`, the moving origin on a straight line."""
+    """Interpolation from `a` at t = 0 to `b` at t = 1: `slerp` of rotations, linear interpolation of translations."""
     xyz = a.xyz + _trailing(t) * (b.xyz - a.xyz)
     return SE3.from_rotation(slerp(a.rotation, b.rotation, t), xyz)
 
@@ -236,17 +236,17 @@ def angle_between(a: SO3, b: SO3) -> Float[Tensor, "*b"]:
 
 
 def mean_rotation(rotations: SO3, weights: Float[Tensor, " n"] | None = None) -> SO3:
-    """The rotation with the least sum, weighted if need be, of squared matrix differences to a batch `[n]`."""
+    """Chordal mean of a batch `[n]`: the rotation with the least (weighted) sum of squared matrix differences."""
     matrices = rotations.matrix()
     U, _, Vh = torch.linalg.svd((matrices if weights is None else weights[:, None, None] * matrices).mean(0))
     return SO3.from_matrix(_proper(U, Vh))
 
 
 def umeyama(x_b: Float[Tensor, "n 3"], y_a: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, ""], SO3, Float[Tensor, "3"]]:
-    """Scale s, rotation R_a_b, translation t of the least squared `y_a - (s R_a_b @ x_b + t)` (Umeyama 1991).
+    """Scale s, rotation R_a_b and translation t that minimise |y_a - (s R_a_b @ x_b + t)|^2 (Umeyama 1991).
 
     Raises:
-        ValueError: Fewer than three points, or all (nearly) on one line: the rotation about it is unknown.
+        ValueError: There are fewer than three points, or all are (nearly) collinear, which leaves a rotation undefined.
     """
     n = x_b.shape[0]
     if n < 3:
@@ -256,16 +256,16 @@ def umeyama(x_b: Float[Tensor, "n 3"], y_a: Float[Tensor, "n 3"]) -> tuple[Float
     covariance = centred_a.mT @ centred_b / n
     U, spread, Vh = torch.linalg.svd(covariance)
     if spread[1] <= COLLINEAR * spread[0]:
-        raise ValueError(f"a similarity needs points that do not lie on one line, got {n} that do")
+        raise ValueError(f"a similarity needs points that do not lie on one line, got {n} collinear points")
     R_a_b = _proper(U, Vh)
-    # trace(R^T covariance): singular values summed, the last negative where a reflection would fit better.
+    # trace(R^T covariance) is the sum of singular values, the last one negated where a reflection would fit better.
     scale = (R_a_b * covariance).sum() / centred_b.square().sum(-1).mean()
     return scale, SO3.from_matrix(R_a_b), mean_a - scale * (R_a_b @ mean_b)
 
 
 @cache
 def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "16 9"], Float[Tensor, "9"]]:
-    """How the entries of a rotation matrix, row by row, follow from the products of all pairs of w, x, y, z."""
+    """Factors and constants with which products of all pairs of w, x, y, z sum to the entries of a rotation matrix."""
     w, x, y, z = range(4)
     terms = [
         [(y, y, -2), (z, z, -2)], [(x, y, 2), (w, z, -2)], [(x, z, 2), (w, y, 2)],
@@ -280,7 +280,7 @@ def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> tuple[Float
 
 
 def _smooth(x2: Tensor, series: tuple[float, ...], closed: Callable[[Tensor], Tensor]) -> Tensor:
-    """`closed(x)` at x = sqrt(x2), by its series near zero; the other branch stays finite for the gradient."""
+    """`closed(x)` at x = sqrt(x2), or its series near zero; the unused branch stays finite for the gradient."""
     small = x2 < SMALL
     near = _polynomial(torch.where(small, x2, 0.0), series)
     return torch.where(small, near, closed(torch.where(small, 1.0, x2).sqrt()))
@@ -306,7 +306,7 @@ def _quaternion_product(p: Tensor, q: Tensor) -> Tensor:
 
 
 def _proper(U: Tensor, Vh: Tensor) -> Float[Tensor, "3 3"]:
-    """U Vh with the last singular direction turned over where that would be a reflection."""
+    """U Vh as a rotation: the last singular direction is negated where U Vh would be a reflection."""
     sign = torch.linalg.det(U @ Vh).sign()
     return torch.cat([U[:, :2], U[:, 2:] * sign], -1) @ Vh
 
@@ -317,7 +317,7 @@ def _broadcast(wxyz: Tensor, xyz: Tensor) -> SE3:
 
 
 def _batch_index(index: Any) -> Any:
-    """The index with the last axis kept whole, so that an ellipsis means all batch axes."""
+    """The index with a full slice appended for the last axis, so that an ellipsis covers the batch axes only."""
     return (*index, slice(None)) if isinstance(index, tuple) and Ellipsis in index else index
 
 

@@ -1,8 +1,8 @@
-"""Real spherical harmonics to degree 3, 16 functions, orthonormal over the sphere.
+"""Real spherical harmonics up to degree 3 (16 functions), orthonormal over the sphere.
 
-Order: degree l = 0, 1, 2, 3 and within it m = -l .. l. Signs: with the Condon-Shortley phase, so Y_1 is proportional
-to (-y, z, -x), as Gaussian splatting has them. A *coefficient* is the integral of a function times a harmonic; the
-function is the sum of coefficients times harmonics. Directions are rotated, coefficients never are.
+Order: degree l = 0, 1, 2, 3, and within a degree m = -l .. l. The signs include the Condon-Shortley phase, as in
+Gaussian splatting: Y_1 is proportional to (-y, z, -x). A *coefficient* is the integral of a function times a harmonic;
+the function is the sum of coefficients times harmonics. Rotations are applied to directions, never to coefficients.
 """
 
 import math
@@ -17,8 +17,9 @@ from torch import Tensor
 from tumble.maths.directions import texel_directions, texel_solid_angles
 
 MAX_DEGREE = 3
+"""Highest degree of the harmonics in this file."""
 MONOMIALS = ["".join(letters) for degree in range(4) for letters in combinations_with_replacement("xyz", degree)]
-"""All products to degree 3, in order: 1 (the empty one), x, y, z, xx, xy, xz, yy, yz, zz, xxx, xxy and so on."""
+"""All monomials up to degree 3 in order: "" (the constant 1), x, y, z, xx, xy, xz, yy, yz, zz, xxx, xxy and so on."""
 POLYNOMIALS: list[tuple[tuple[int, int], dict[str, int]]] = [
     ((1, 4), {"": 1}),
     ((3, 4), {"y": -1}),
@@ -37,19 +38,19 @@ POLYNOMIALS: list[tuple[tuple[int, int], dict[str, int]]] = [
     ((105, 16), {"xxz": 1, "yyz": -1}),
     ((35, 32), {"xxx": -1, "xyy": 3}),
 ]
-"""Each harmonic as the arguments of `_norm` and a sum of monomials."""
+"""Each harmonic as the arguments of `_norm` and the integer coefficients of its monomials."""
 COSINE_LOBE = (math.pi, 2 * math.pi / 3, math.pi / 4, 0.0)
-"""A_l: what the clamped cosine makes of degree l (Ramamoorthi and Hanrahan 2001)."""
+"""Factors A_l by which convolution with the clamped cosine scales degree l (Ramamoorthi and Hanrahan 2001)."""
 
 
 def basis(d: Float[Tensor, "*b 3"], degree: int) -> Float[Tensor, "*b k"]:
-    """All `k = (degree + 1)^2` harmonics to `degree` at unit directions.
+    """Values of all `k = (degree + 1)^2` harmonics up to `degree` at unit directions.
 
     Raises:
-        ValueError: A degree not in 0 to 3.
+        ValueError: The degree is not in 0 to 3.
     """
     if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"harmonics exist for degrees 0 to {MAX_DEGREE}, not {degree}")
+        raise ValueError(f"the degree of spherical harmonics is 0 to {MAX_DEGREE}, not {degree}")
     x, y, z = d.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     values = [
@@ -76,9 +77,9 @@ def basis(d: Float[Tensor, "*b 3"], degree: int) -> Float[Tensor, "*b k"]:
 
 
 def series(coefficients: Float[Tensor, "k c"], d: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-    """Functions with given coefficients at unit directions: `basis(d, degree) @ coefficients`.
+    """Values at unit directions of functions with given coefficients: `basis(d, degree) @ coefficients`.
 
-    A training step's directions take a third of the time, most of which went into small tensors.
+    It takes a third of the time of that expression for the directions of a training step.
     """
     return _Series.apply(coefficients, d)
 
@@ -86,7 +87,7 @@ def series(coefficients: Float[Tensor, "k c"], d: Float[Tensor, "n 3"]) -> Float
 def sum_series(
     coefficients: Float[Tensor, "k c"], xyz: Float[Tensor, "3 n"]
 ) -> tuple[Float[Tensor, "c n"], Float[Tensor, "m n"]]:
-    """The values of `series` and what `series_adjoint` needs, for functions that write out their own derivative."""
+    """Values of `series` and the monomials that `series_adjoint` needs, for callers with an explicit derivative."""
     monomials = _monomials(xyz, math.isqrt(len(coefficients)) - 1)
     of_harmonics, _ = _polynomials(len(coefficients), xyz.dtype, xyz.device)
     return (coefficients.mT @ of_harmonics) @ monomials, monomials
@@ -95,9 +96,9 @@ def sum_series(
 def series_adjoint(
     coefficients: Float[Tensor, "k c"], monomials: Float[Tensor, "m n"], v: Float[Tensor, "c n"]
 ) -> tuple[Float[Tensor, "k c"], Float[Tensor, "3 n"]]:
-    """Gradients of coefficients and directions from those of the values."""
+    """Gradients of coefficients and directions from the gradient `v` of the values."""
     of_harmonics, derivatives = _polynomials(len(coefficients), v.dtype, v.device)
-    # A product of this form takes a fifth of the time of its transpose.
+    # The product in this order takes a fifth of the time of its transpose.
     v_coefficients = of_harmonics @ (v @ monomials.mT).mT
     c, lower = len(v), derivatives.shape[1]
     slopes = (coefficients.mT @ of_harmonics @ derivatives.mT).flatten(0, 1) @ monomials[:lower]
@@ -119,7 +120,7 @@ class _Series(torch.autograd.Function):
 
 
 def project(radiance: Float[Tensor, "h w c"]) -> Float[Tensor, "16 c"]:
-    """Coefficients of an equirectangular map, each texel taken as constant over its exact solid angle."""
+    """Coefficients of an equirectangular map; each texel counts with its exact solid angle."""
     h, w, _ = radiance.shape
     like = {"dtype": radiance.dtype, "device": radiance.device}
     weighted = radiance * texel_solid_angles(h, w, **like)[..., None]
@@ -127,7 +128,7 @@ def project(radiance: Float[Tensor, "h w c"]) -> Float[Tensor, "16 c"]:
 
 
 def _monomials(xyz: Float[Tensor, "3 n"], degree: int) -> Float[Tensor, "m n"]:
-    """The products that `MONOMIALS` lists, to a degree."""
+    """Values of `MONOMIALS` up to a degree."""
     x, y, z = xyz
     m = xyz.new_empty((1, 4, 10, 20)[degree], xyz.shape[1])
     m[0] = 1
@@ -148,7 +149,7 @@ def _monomials(xyz: Float[Tensor, "3 n"], degree: int) -> Float[Tensor, "m n"]:
 def _polynomials(
     k: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[Float[Tensor, "k m"], Float[Tensor, "3 lower m"]]:
-    """The first k harmonics as polynomials, and the derivatives of monomials along x, y and z as polynomials."""
+    """Coefficients over monomials of the first k harmonics, and of the derivatives of monomials along x, y and z."""
     degree = math.isqrt(k) - 1
     names, lower = MONOMIALS[: (1, 4, 10, 20)[degree]], (1, 1, 4, 10)[degree]
     of_harmonics = torch.zeros(k, len(names), dtype=torch.float64)
@@ -164,4 +165,5 @@ def _polynomials(
 
 
 def _norm(numerator: int, denominator: int) -> float:
+    """Normalisation factor of a harmonic, sqrt(numerator / denominator / pi)."""
     return math.sqrt(numerator / denominator / math.pi)

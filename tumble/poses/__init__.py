@@ -1,7 +1,8 @@
-"""Stage 1: how the object moved, from frames and masks alone.
+"""Stage 1: estimation of the object's poses from images and masks alone.
 
-Two routes with one outcome: `sfm` finds all poses at once from matches and silhouettes, `progressive` follows the
-object frame by frame with a neural field, as the paper does. They do not know each other.
+Two independent methods give the same kind of result, a `PoseResult`: `sfm` estimates all poses at once from matches
+and silhouettes (structure from motion); `progressive` tracks the object frame by frame with a neural field, as in the
+paper.
 """
 
 from tumble.poses import progressive, sfm

@@ -1,10 +1,9 @@
-"""Which frames to match: every frame with some before it, and those where the object comes round again.
+"""Selection of the frame pairs to match: each frame with a few earlier ones, and pairs for loop closure.
 
-Farther pairs are left out: outlines bind all pairs of frames to each other (`frontier`), and tracks carry on. Measured
-on hand-held captures of 64 frames of 128 pixels (knight, soup can, duck): pairs 8 and 16 apart change the median error
-by nothing, pairs of frames that see the same side again by less than 0.05 degrees. A body of revolution is another
-matter: its outlines do not show how it turns about its axis, so that small errors add up until its texture comes round
-again (`comeback`).
+Pairs farther apart than `OFFSETS` are not needed: frontier points constrain all pairs of frames
+(`poses/sfm/frontier_points`), and tracks connect distant frames. Bodies of revolution are the exception: their
+silhouettes do not determine the rotation about the axis, so that errors add up until the texture comes into view again;
+these need loop closure (`poses/sfm/loop_closure`).
 """
 
 from collections.abc import Sequence
@@ -14,25 +13,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 OFFSETS = (1, 2, 4)
-"""Frames between neighbours; FMOV has 8 and 16 as well."""
+"""Distances in time of the pairs [frames]. FMOV, the tracker that the paper extends, also uses 8 and 16."""
 
 Pairs = list[tuple[int, int]]
-"""The earlier frame first."""
+"""Indices of two frames, the earlier frame first."""
 
 
 def neighbours(n: int, offsets: Sequence[int] = OFFSETS) -> Pairs:
-    """Every one of `n` frames with those that many frames before it."""
+    """Pairs of each of `n` frames with the frames that lie `offsets` before it."""
     return [(t - offset, t) for t in range(n) for offset in sorted(offsets) if t >= offset]
 
 
-def best(score: Float[Tensor, "t t"], *, count: int, gap: int, least: float, spread: int) -> Pairs:
-    """The pairs with the highest scores, none beside another that is better.
+def best_pairs(score: Float[Tensor, "t t"], *, count: int, gap: int, min_score: float, spread: int) -> Pairs:
+    """The pairs with the highest scores, by greedy non-maximum suppression, best first.
 
     Args:
-        count: Most pairs.
-        gap: Largest distance in time that the neighbours see to [frames].
-        least: Of a score.
-        spread: A pair stands for all whose frames lie within so many frames of its own.
+        score: Score of every pair (i, j); read where j > i.
+        count: Maximum number of pairs.
+        gap: Pairs at most this far apart in time are left out [frames].
+        min_score: Pairs with a lower score are left out.
+        spread: A chosen pair suppresses all pairs whose frames both lie within this distance of its own [frames].
     """
     score = score.clone()
     frame = torch.arange(len(score), device=score.device)
@@ -40,7 +40,7 @@ def best(score: Float[Tensor, "t t"], *, count: int, gap: int, least: float, spr
     chosen: Pairs = []
     while len(chosen) < count and score.numel() > 0:
         i, j = divmod(int(score.argmax()), len(score))
-        if not float(score[i, j]) >= least:
+        if not float(score[i, j]) >= min_score:
             break
         chosen.append((i, j))
         score[max(0, i - spread) : i + spread + 1, max(0, j - spread) : j + spread + 1] = -torch.inf

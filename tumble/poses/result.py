@@ -1,4 +1,4 @@
-"""How far the poses of a capture can be trusted, frame by frame and as a whole."""
+"""Quality of estimated poses, per frame and for the whole capture, and the result of stage 1."""
 
 import math
 from dataclasses import dataclass
@@ -9,78 +9,91 @@ from torch import Tensor
 
 from tumble.scene import Camera, Trajectory
 
-PoseVerdict = Literal["good", "warn", "bad"]
+PoseRating = Literal["good", "warn", "bad"]
 
-UNSEEN = 0.1
-"""Uncertainty about an axis from which a frame's rotation about it counts as not seen [radians]."""
-WORSE = 4.0
-"""Uncertainty about the worst axis over that about the next from which the axis is blamed, not the frames."""
-FITS, PER_MISFIT = 0.94, math.radians(130)
-"""Overlap of silhouettes and hull that converged solutions keep, and how much one of missing overlap tells: a line by
-eye through six solutions that had not converged, with median errors of 24 to 72 degrees at overlaps of 0.81 to 0.40."""
-LIMITS = math.radians(2.0), math.radians(5.0)
-"""Uncertainty from which poses are worth a look, and from which they are not to be used [radians]."""
-STILL = math.radians(10)
-"""Turn under which an object was not filmed from different sides."""
-MANY_LOST = 0.5
-"""Share of lost frames from which the rest is not to be used either."""
+UNOBSERVABLE_SIGMA = 0.1
+"""Standard deviation of the rotation about an axis above which that rotation counts as not observable [radians]."""
+UNOBSERVABLE_RATIO = 4.0
+"""Ratio of the largest to the second largest standard deviation above which a single axis counts as not observable.
+Below it, all rotations are uncertain, and the frames are at fault rather than the axis."""
+CONVERGED_OVERLAP = 0.94
+"""Median overlap of silhouettes and visual hull at which solutions that have converged arrive (IoU)."""
+ERROR_PER_OVERLAP = math.radians(130)
+"""Median rotation error per unit of overlap below `CONVERGED_OVERLAP` [radians]: a line through measured solutions that
+had not converged."""
+MAX_GOOD_UNCERTAINTY = math.radians(2.0)
+"""Largest uncertainty of rotations that is rated "good" [radians]."""
+MAX_USABLE_UNCERTAINTY = math.radians(5.0)
+"""Largest uncertainty of rotations that is rated "warn"; above it the poses are "bad" [radians]."""
+MIN_ROTATION_RANGE = math.radians(10)
+"""Rotation range below which the object counts as not having rotated [radians]."""
+MAX_LOST_FRACTION = 0.5
+"""Largest fraction of lost frames with which the remaining poses are still usable."""
 
 
 @dataclass(frozen=True)
 class Observability:
-    """The axis of the object about which frames can turn with the least notice."""
+    """Axis of the object about which rotations are least certain, and the standard deviations about three axes."""
 
     axis: Float[Tensor, "3"]
-    """Unit length, object frame. Of a bare body of revolution only its direction in the first picture is known: the
-    last number is NaN."""
+    """Unit vector, object frame. For an untextured body of revolution only its direction in the first image is known:
+    the last component is NaN."""
     sigma: Float[Tensor, "3"]
-    """Typical uncertainty of a frame's rotation about this axis, and about the two across it [radians]."""
+    """Typical standard deviation of a frame's rotation about `axis` and about the two axes perpendicular to it, in
+    descending order [radians]."""
 
     @property
-    def plain(self) -> bool:
-        """Whether hardly any turn leaves a trace in the pictures."""
-        return float(self.sigma[1]) > UNSEEN
+    def several_axes_unobservable(self) -> bool:
+        """Whether rotations about at least two axes are not observable."""
+        return float(self.sigma[1]) > UNOBSERVABLE_SIGMA
 
     @property
-    def unseen(self) -> bool:
-        """Whether turns about the axis leave no trace in the pictures."""
-        return float(self.sigma[0]) > UNSEEN and (self.plain or float(self.sigma[0]) > WORSE * float(self.sigma[1]))
+    def axis_unobservable(self) -> bool:
+        """Whether rotation about `axis` is not observable."""
+        return float(self.sigma[0]) > UNOBSERVABLE_SIGMA and (
+            self.several_axes_unobservable or float(self.sigma[0]) > UNOBSERVABLE_RATIO * float(self.sigma[1])
+        )
 
     @property
     def sentence(self) -> str:
-        """What to tell a person."""
+        """Result and advice in plain words, for the user."""
         known = [f"{float(a):.2f}" for a in self.axis if not a.isnan()]
-        where = f"({', '.join(known)})" + ("" if len(known) == 3 else " of the first picture")
-        if self.plain:
+        where = f"({', '.join(known)})" + ("" if len(known) == 3 else " of the first image")
+        if self.several_axes_unobservable:
             return (
-                "Rotation is not observable: neither texture nor outline shows how the object turns. Stick something "
-                "on it that can be followed."
+                "Rotation is not observable: neither texture nor silhouette shows how the object rotates. Stick "
+                "something on it that can be tracked."
             )
-        if self.unseen:
+        if self.axis_unobservable:
             return (
-                f"Rotation about axis {where} is not observable: neither outline nor texture shows it. If the object "
-                f"has a print, grain hides it: film in more light. If it has none, stick something on it."
+                f"Rotation about axis {where} is not observable: neither silhouette nor texture shows it. If the "
+                f"object has a texture, image noise hides it: record in more light. If it has none, stick something "
+                f"on it that can be tracked."
             )
-        return f"Rotations are seen about every axis, to about {_degrees(self.sigma[0])} degrees about the worst."
+        return (
+            f"Rotations are observable about every axis, to about {_degrees(self.sigma[0])} degrees about the worst "
+            f"axis."
+        )
 
 
 @dataclass(frozen=True)
 class PoseQuality:
-    """Per frame, what its pose rests on."""
+    """Quality of estimated poses: residuals of every frame, and what follows for the capture."""
 
     residual: Float[Tensor, " t"]
-    """Median distance between matches and the points they show [pixels]; NaN without matches."""
+    """Median reprojection error of the frame's track observations [pixels]; NaN without any."""
     inliers: Float[Tensor, " t"]
-    """Number of matches that agree with the pose."""
-    gap: Float[Tensor, " t"]
-    """Median distance between the epipolar planes that touch this outline and those of others [pixels]."""
+    """Number of the frame's track observations with a small reprojection error."""
+    tangency_gap: Float[Tensor, " t"]
+    """Median distance between the tangent epipolar planes of the frame's silhouette contour and those of the other
+    frames' contours [pixels]; NaN where no pair of frames has frontier points."""
     overlap: Float[Tensor, " t"]
-    """Intersection over union of the silhouette and that of the visual hull."""
-    drift: Float[Tensor, " t"]
-    """Angle between the rotations that tracks and that outlines would have preferred [radians]."""
+    """Intersection over union of the silhouette and the projected visual hull."""
+    rotation_disagreement: Float[Tensor, " t"]
+    """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]."""
     lost: Bool[Tensor, " t"]
-    """Whether the pose is a guess from its neighbours."""
-    turn: Float[Tensor, ""]
+    """Whether no consistent pose was found; the pose is then interpolated from other frames."""
+    rotation_range: Float[Tensor, ""]
     """Largest angle between the rotations of two frames [radians]."""
     observability: Observability
 
@@ -88,62 +101,68 @@ class PoseQuality:
         return len(self.residual)
 
     @property
-    def still(self) -> bool:
-        """Whether the object seems not to turn at all: what a ball without texture looks like."""
-        return float(self.turn) < STILL
+    def stationary(self) -> bool:
+        """Whether the poses hardly rotate; those of a sphere without texture do not either, however it rotates."""
+        return float(self.rotation_range) < MIN_ROTATION_RANGE
 
     @property
-    def misfit(self) -> float:
-        """What silhouettes that contradict each other tell about the median error of rotation [radians]."""
+    def overlap_uncertainty(self) -> float:
+        """Median rotation error expected from the overlap of silhouettes and visual hull [radians]."""
         kept = self.overlap[~self.lost]
-        return PER_MISFIT * max(0.0, FITS - float(kept.median())) if len(kept) else math.pi
+        return ERROR_PER_OVERLAP * max(0.0, CONVERGED_OVERLAP - float(kept.median())) if len(kept) else math.pi
 
     @property
     def uncertainty(self) -> float:
-        """Median error of rotation to be expected [radians]."""
-        kept = self.drift[~self.lost]
-        return max(self.misfit, float(kept.median())) if len(kept) else math.pi
+        """Expected median rotation error of the frames that are not lost [radians]."""
+        kept = self.rotation_disagreement[~self.lost]
+        return max(self.overlap_uncertainty, float(kept.median())) if len(kept) else math.pi
 
     @property
-    def verdict(self) -> PoseVerdict:
-        gone = float(self.lost.float().mean())
-        if self.still or self.observability.unseen or self.uncertainty > LIMITS[1] or gone > MANY_LOST:
+    def rating(self) -> PoseRating:
+        """Overall rating: "bad" poses should not be used."""
+        lost = float(self.lost.float().mean())
+        if (
+            self.stationary
+            or self.observability.axis_unobservable
+            or self.uncertainty > MAX_USABLE_UNCERTAINTY
+            or lost > MAX_LOST_FRACTION
+        ):
             return "bad"
-        return "warn" if gone > 0 or self.uncertainty > LIMITS[0] else "good"
+        return "warn" if lost > 0 or self.uncertainty > MAX_GOOD_UNCERTAINTY else "good"
 
     @property
     def sentence(self) -> str:
-        """What to tell a person."""
-        if self.still:
+        """Result and advice in plain words, for the user."""
+        if self.stationary:
             return (
-                "Rotation is not observable: nothing in the pictures shows that the object turns. If it did, stick "
-                "something on it that can be followed."
+                "Rotation is not observable: nothing in the images shows that the object rotates. If it did, stick "
+                "something on it that can be tracked."
             )
-        if self.observability.unseen:
+        if self.observability.axis_unobservable:
             return self.observability.sentence
-        if self.misfit > LIMITS[1]:
+        if self.overlap_uncertainty > MAX_USABLE_UNCERTAINTY:
             return (
-                "The silhouettes contradict each other at these poses: the object changed, or its turns were not "
-                "understood. Film it in smaller turns, alone, and with more texture."
+                "The silhouettes are inconsistent at these poses: the object changed its shape, or its rotations were "
+                "not found. Record it alone, with smaller rotations between frames and with more texture."
             )
         lost = int(self.lost.sum())
-        words = f"Rotations are right to about {_degrees(self.uncertainty)} degrees."
-        return f"{words} {lost} of {len(self)} frames contradict the others." if lost else words
+        accuracy = f"Rotations are accurate to about {_degrees(self.uncertainty)} degrees."
+        return f"{accuracy} {lost} of {len(self)} frames are inconsistent with the others." if lost else accuracy
 
 
 @dataclass(frozen=True)
 class PoseResult:
-    """The outcome of stage 1, by either route."""
+    """Result of stage 1, by either method."""
 
     trajectory: Trajectory
-    """One pose per frame of the capture; of lost frames an interpolated one."""
+    """One pose per frame of the capture; lost frames have an interpolated one."""
     points: Float[Tensor, "n 3"]
-    """On the surface, object frame."""
+    """Triangulated surface points, object frame [object radius]."""
     colours: Float[Tensor, "n 3"]
-    """Linear RGB of the points, median over the frames that show them: shading included."""
+    """Linear RGB of the points, shading included: the median over the frames in which they are visible."""
     quality: PoseQuality
     camera: Camera
-    """The capture's; where its focal length is a guess, with the one that was found."""
+    """Camera of the capture, with the estimated focal length where the capture's was only assumed."""
 
 
 def _degrees(angle: Tensor | float) -> str:

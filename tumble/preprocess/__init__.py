@@ -1,18 +1,18 @@
-"""From footage to a capture: frames are chosen, the object is cut out of them, the lens undone; `check` judges first.
+"""Conversion of footage to a capture: frames are selected, segmented and undistorted; `check_footage` assesses footage.
 
-A film, or a folder of pictures, becomes a capture without poses; pictures with a COLMAP model become one with poses.
+A video or a folder of images becomes a capture without poses; images with a COLMAP model become one with poses.
 """
 
 from typing import TYPE_CHECKING
 
-from tumble._lazy import lazily
+from tumble._lazy import lazy_getattr
 
 if TYPE_CHECKING:
     from tumble.preprocess.box_picker import pick_box
     from tumble.preprocess.check import check_footage, passes
     from tumble.preprocess.options import FootageOptions
     from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
-    from tumble.preprocess.video_to_capture import PREVIEW, PROVENANCE, origin
+    from tumble.preprocess.video_to_capture import PREVIEW, PROVENANCE, footage_fingerprint
 
 __all__ = [
     "FOOTAGE",
@@ -22,18 +22,18 @@ __all__ = [
     "check_footage",
     "passes",
     "input_kind",
-    "origin",
+    "footage_fingerprint",
     "pick_box",
     "to_capture",
 ]
 
-__getattr__ = lazily(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "box_picker": ("pick_box",),
         "check": ("check_footage", "passes"),
         "options": ("FootageOptions",),
         "source": ("FOOTAGE", "input_kind", "to_capture"),
-        "video_to_capture": ("PREVIEW", "PROVENANCE", "origin"),
+        "video_to_capture": ("PREVIEW", "PROVENANCE", "footage_fingerprint"),
     },
 )

@@ -1,7 +1,7 @@
-"""What stands still while the object turns: its picture, the drift of exposure and white balance, the camera's shake.
+"""The static background of a video, the camera's exposure and white-balance drift, and camera shake.
 
-The camera is on a tripod, so a pixel that nothing passes keeps its radiance, and what changes there is the camera's
-doing: a *gain* per colour channel, in linear light, relative to the middle of the film.
+The camera is on a tripod, so a pixel that nothing covers keeps its radiance, and changes there come from the camera:
+one *gain* per frame and colour channel, in linear light, relative to the median frame.
 """
 
 from dataclasses import dataclass
@@ -14,170 +14,182 @@ from jaxtyping import Bool, Float32, Shaped, UInt8
 
 from tumble.maths import linear_from_srgb, to_srgb8
 
-SAMPLES = 41
-"""Frames the median is taken over; odd, so that it is a value that was there."""
-SUPPORT = 0.4
-"""Share of the sightings of a pixel that must agree for their value to be the background's."""
-SEEN = 3
-"""Fewest agreeing sightings that count as knowledge."""
-NEVER = 700
-"""Stands, times the number of the sample, for a hidden value: behind all code values, and never near another."""
-RESTLESS = 8.0
-"""A pixel whose code values scatter more than this shows no still background [code values]."""
-LEAST_NOISE = 1.5
-"""What rounding and compression leave at least [code values]."""
-DIFFERENT, SAME = 5.0, 2.5
-"""Deviations from the background [its noise] from which a pixel surely shows something else, or may be it."""
-LEAST_DIFFERENCE = 14.0
-"""No pixel counts as different below this, whatever its noise: shadows and blocks of the codec [code values]."""
-USABLE = (25, 235)
-"""Code values that carry a gain: neither noise nor clipped."""
-TEXTURED = 16
-"""Least Sobel gradient that shows motion: 2 code values per pixel."""
-LEAST_USABLE = 0.01
-"""Share of the picture below which the drift is not estimated."""
+N_SAMPLES = 41
+"""Number of frames, evenly spaced, from which the background is estimated."""
+MODE_FRACTION = 0.4
+"""Fraction of a pixel's visible values that the interval around their mode must contain."""
+MIN_SUPPORT = 3
+"""Minimum number of values in the interval around the mode; the background of a pixel visible less often is unknown."""
+HIDDEN_CODE = 700
+"""Multiplied by the number of the sample, replaces a covered value: above all code values and far from the others."""
+MAX_NOISE = 8.0
+"""Maximum noise of a static pixel; a pixel of larger noise is unknown [code values]."""
+MIN_NOISE = 1.5
+"""Lower limit of the noise estimate: what rounding and compression leave [code values]."""
+DIFFERENT_SIGMAS = 5.0
+"""Minimum deviation from the background at which a pixel shows something else [standard deviations of the noise]."""
+SAME_SIGMAS = 2.5
+"""Maximum deviation from the background at which a pixel may show it [standard deviations of the noise]."""
+MIN_DIFFERENCE = 14.0
+"""Lower limit of the difference that counts as different: above shadows and codec artefacts [code values]."""
+UNCLIPPED = (25, 235)
+"""Range of the code values from which gains are estimated: neither noise nor clipped."""
+MIN_GRADIENT = 16
+"""Minimum Sobel gradient of a pixel whose optical flow is used: 2 code values per pixel."""
+MIN_USABLE_FRACTION = 0.01
+"""Minimum fraction of usable pixels of an image; with fewer, gain and shift are not estimated."""
 
 
 @dataclass(frozen=True)
-class Backdrop:
-    """The still background."""
+class Background:
+    """The static background of a video."""
 
-    picture: UInt8[np.ndarray, "h w 3"]
+    image: UInt8[np.ndarray, "h w 3"]
     """sRGB code values."""
     noise: Float32[np.ndarray, "h w"]
-    """Robust standard deviation over time, of the worst channel [code values]."""
+    """Robust standard deviation over time, maximum over the channels [code values]."""
     known: Bool[np.ndarray, "h w"]
-    """Where the background was seen often enough, and stood still."""
+    """Pixels whose background was visible often enough, and static."""
 
-    def same(self, picture: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """Pixels that look like the known background."""
-        return self.known & (self._distance(picture) < np.maximum(SAME * self.noise, LEAST_DIFFERENCE / 2))
+    def same(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+        """Pixels whose colour is that of the known background."""
+        return self.known & (self._distance(image) < np.maximum(SAME_SIGMAS * self.noise, MIN_DIFFERENCE / 2))
 
-    def differs(self, picture: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """Pixels that surely do not show the known background."""
-        return self.known & (self._distance(picture) > np.maximum(DIFFERENT * self.noise, LEAST_DIFFERENCE))
+    def differs(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+        """Pixels whose colour is significantly different from the known background."""
+        return self.known & (self._distance(image) > np.maximum(DIFFERENT_SIGMAS * self.noise, MIN_DIFFERENCE))
 
-    def _distance(self, picture: np.ndarray) -> np.ndarray:
-        # A light blur takes the codec's noise away before it is compared.
-        near, far = cv2.GaussianBlur(picture, (3, 3), 0), cv2.GaussianBlur(self.picture, (3, 3), 0)
-        return worst(cv2.absdiff(near, far)).astype(np.float32)
+    def _distance(self, image: np.ndarray) -> np.ndarray:
+        # A slight blur reduces the codec's noise.
+        observed, expected = cv2.GaussianBlur(image, (3, 3), 0), cv2.GaussianBlur(self.image, (3, 3), 0)
+        return channel_max(cv2.absdiff(observed, expected)).astype(np.float32)
 
 
-def backdrop(pictures: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"] | None = None) -> Backdrop:
-    """The mode over time of every pixel, over the frames in which nothing covers it.
+def estimate_background(
+    images: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"] | None = None
+) -> Background:
+    """Mode over time of every pixel, over the frames in which nothing covers it.
 
-    The mode is the middle of the narrowest interval that holds a `SUPPORT` of the values (Grenander's estimator of a
-    mode, channel by channel): the object may be in front more than half of the time.
+    The mode of a channel is the midpoint of the shortest interval that contains the fraction `MODE_FRACTION` of its
+    values (Grenander's estimator), so the object may cover a pixel more than half of the time.
 
     Args:
-        covered: Where the object, or what holds it, is known to be in front.
+        covered: Pixels known to be covered by the object or a hand.
     """
-    samples = np.unique(np.linspace(0, len(pictures) - 1, SAMPLES).round().astype(int))
-    stack = pictures[samples].astype(np.int16)
-    seen = np.full(stack.shape[1:3], len(stack), np.int64)
+    samples = np.unique(np.linspace(0, len(images) - 1, N_SAMPLES).round().astype(int))
+    stack = images[samples].astype(np.int16)
+    n_visible = np.full(stack.shape[1:3], len(stack), np.int64)
     if covered is not None:
         hidden = covered[samples]
-        never = NEVER * np.arange(1, len(stack) + 1, dtype=np.int16)
-        stack = np.where(hidden[..., None], never[:, None, None, None], stack)
-        seen -= hidden.sum(0)
+        codes = HIDDEN_CODE * np.arange(1, len(stack) + 1, dtype=np.int16)
+        stack = np.where(hidden[..., None], codes[:, None, None, None], stack)
+        n_visible -= hidden.sum(0)
     stack.sort(axis=0)
-    agreeing = np.maximum(np.ceil(SUPPORT * seen).astype(int), min(SEEN, len(samples)))
-    picture, width = np.zeros(stack.shape[1:], np.uint8), np.full(stack.shape[1:3], np.inf, np.float32)
-    for count in np.unique(agreeing).tolist():
-        where = (agreeing == count) & (seen >= count)
-        picture[where], width[where] = _mode(stack[:, where], count)
-    # The values of a normal distribution that lie in its middle 40 % spread over 1.05 standard deviations.
-    noise = np.maximum(width / 1.05, LEAST_NOISE)
-    return Backdrop(picture, noise, noise < RESTLESS)
+    support = np.maximum(np.ceil(MODE_FRACTION * n_visible).astype(int), min(MIN_SUPPORT, len(samples)))
+    image, width = np.zeros(stack.shape[1:], np.uint8), np.full(stack.shape[1:3], np.inf, np.float32)
+    for count in np.unique(support).tolist():
+        where = (support == count) & (n_visible >= count)
+        image[where], width[where] = _mode(stack[:, where], count)
+    # The central 40 % of a normal distribution span 1.05 standard deviations.
+    noise = np.maximum(width / 1.05, MIN_NOISE)
+    return Background(image, noise, noise < MAX_NOISE)
 
 
-def completed(one: Backdrop, other: Backdrop) -> Backdrop:
-    """The one, and the other where the one does not know."""
-    picture = np.where(one.known[..., None], one.picture, other.picture)
-    return Backdrop(picture, np.where(one.known, one.noise, other.noise), one.known | other.known)
+def fill_unknown(background: Background, fallback: Background) -> Background:
+    """The background, with unknown pixels taken from the fallback."""
+    image = np.where(background.known[..., None], background.image, fallback.image)
+    return Background(
+        image, np.where(background.known, background.noise, fallback.noise), background.known | fallback.known
+    )
 
 
-def drift(
-    pictures: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"] | None = None
+def estimate_gains(
+    images: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"] | None = None
 ) -> Float32[np.ndarray, "t 3"]:
-    """Gain of every frame and channel against the median frame: what the camera changed; ones where it cannot tell.
+    """Gain of every frame and channel relative to the median frame; 1 where it cannot be estimated.
 
-    The middle of many pixels' ratios, so the object may be in front of a good part of what is usable. A backdrop from
-    drifting frames is not quite one frame's, so the gains are measured twice: the second time against the backdrop of
-    the frames that the first has mended.
+    Interquartile mean of the ratios of many pixels, so the object may cover a good part of them. The gains are
+    estimated twice, because the background of drifting frames is blurred: the second time relative to the background of
+    the frames corrected by the first estimate.
 
     Args:
-        covered: Where the object, or what holds it, is known to be in front.
+        covered: Pixels known to be covered by the object or a hand.
     """
-    rough = _gains(pictures, backdrop(pictures, covered).picture, covered)
-    mended = np.stack([compensate(picture, gain) for picture, gain in zip(pictures, rough, strict=True)])
-    gains = _gains(pictures, backdrop(mended, covered).picture, covered)
+    rough = _gains_relative_to(images, estimate_background(images, covered).image, covered)
+    corrected = np.stack([compensate(image, gain) for image, gain in zip(images, rough, strict=True)])
+    gains = _gains_relative_to(images, estimate_background(corrected, covered).image, covered)
     return gains / np.median(gains, 0)
 
 
-def compensate(picture: UInt8[np.ndarray, "h w 3"], gain: Float32[np.ndarray, "3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture as the camera would have taken it without the drift; what it clipped stays clipped."""
-    values = torch.from_numpy(_linear()[:, None] / gain)
+def compensate(image: UInt8[np.ndarray, "h w 3"], gain: Float32[np.ndarray, "3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The image with the gain divided out in linear light; clipped pixels (255) stay 255."""
+    values = torch.from_numpy(_linear_from_code()[:, None] / gain)
     table = to_srgb8(values).numpy()
     table[255] = 255
-    return cv2.LUT(picture, table[None])
+    return cv2.LUT(image, table[None])
 
 
-def shake(
-    pictures: UInt8[np.ndarray, "t h w 3"], reference: Backdrop, covered: Bool[np.ndarray, "t h w"]
+def background_shift(
+    images: UInt8[np.ndarray, "t h w 3"], reference: Background, covered: Bool[np.ndarray, "t h w"]
 ) -> Float32[np.ndarray, " t"]:
-    """How far the background lies from where it was, as a share of the longer side of the picture.
+    """Displacement of the background per frame, as a fraction of the longer side; 0 if there is too little texture.
 
-    The median length of the optical flow over textured background. 0 where there is too little texture to tell. Where
-    the object is at some time, and nothing is known to stand still, the reference shows the object itself.
+    The median length of the optical flow over textured background. Pixels that the object covers in some frame count
+    only where the background is known, because elsewhere the reference may show the object itself.
+
+    Args:
+        reference: The background from which the shift is measured.
+        covered: Pixels that are not background in each frame.
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    gray = cv2.cvtColor(reference.picture, cv2.COLOR_RGB2GRAY)
-    textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > TEXTURED
-    path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
-    textured &= reference.known | ~path
-    moved = np.zeros(len(pictures), np.float32)
-    for i, picture in enumerate(pictures):
+    gray = cv2.cvtColor(reference.image, cv2.COLOR_RGB2GRAY)
+    textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > MIN_GRADIENT
+    object_path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
+    textured &= reference.known | ~object_path
+    shift = np.zeros(len(images), np.float32)
+    for i, image in enumerate(images):
         keep = textured & ~covered[i]
-        if keep.mean() >= LEAST_USABLE:
-            flow = dis.calc(gray, cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.zeros((*gray.shape, 2), np.float32))
-            moved[i] = np.median(np.linalg.norm(flow[keep], axis=-1)) / max(gray.shape)
-    return moved
+        if keep.mean() >= MIN_USABLE_FRACTION:
+            flow = dis.calc(gray, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.zeros((*gray.shape, 2), np.float32))
+            shift[i] = np.median(np.linalg.norm(flow[keep], axis=-1)) / max(gray.shape)
+    return shift
 
 
-def worst(values: Shaped[np.ndarray, "*b 3"]) -> Shaped[np.ndarray, "*b"]:
-    """The largest of three channels; a reduction over so short an axis is many times slower."""
+def channel_max(values: Shaped[np.ndarray, "*b 3"]) -> Shaped[np.ndarray, "*b"]:
+    """Maximum over three channels; a NumPy reduction over so short an axis is many times slower."""
     return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
 
 
-def _gains(pictures: np.ndarray, reference: np.ndarray, covered: np.ndarray | None) -> Float32[np.ndarray, "t 3"]:
-    """The mean of the middle half of the ratios to a reference: as robust as it needs to be, and finer than 8 bits."""
-    curve, usable = _linear(), _usable(reference)
-    gains = np.ones((len(pictures), 3), np.float32)
-    for i, picture in enumerate(pictures):
-        keep = usable & _usable(picture)
+def _gains_relative_to(
+    images: np.ndarray, reference: np.ndarray, covered: np.ndarray | None
+) -> Float32[np.ndarray, "t 3"]:
+    """Interquartile mean of the ratios to a reference image: robust, and finer than 8 bits."""
+    curve, usable = _linear_from_code(), _unclipped(reference)
+    gains = np.ones((len(images), 3), np.float32)
+    for i, image in enumerate(images):
+        keep = usable & _unclipped(image)
         if covered is not None:
             keep &= ~covered[i]
-        if keep.mean() >= LEAST_USABLE:
-            ratios = np.sort(curve[picture[keep]] / curve[reference[keep]], 0)
+        if keep.mean() >= MIN_USABLE_FRACTION:
+            ratios = np.sort(curve[image[keep]] / curve[reference[keep]], 0)
             quarter = len(ratios) // 4
             gains[i] = ratios[quarter : len(ratios) - quarter].mean(0)
     return gains
 
 
-def _usable(picture: np.ndarray) -> np.ndarray:
-    return cv2.inRange(picture, (USABLE[0],) * 3, (USABLE[1],) * 3) > 0
+def _unclipped(image: np.ndarray) -> np.ndarray:
+    return cv2.inRange(image, (UNCLIPPED[0],) * 3, (UNCLIPPED[1],) * 3) > 0
 
 
 def _mode(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and width of the narrowest interval that holds `count` of sorted values; of the widest channel."""
+    """Midpoint and width (of the widest channel) of the shortest interval that contains `count` of sorted values."""
     widths = values[count - 1 :] - values[: len(values) - count + 1]
     start = widths.argmin(0)[None]
     middle = np.take_along_axis(values, start + (count - 1) // 2, 0)[0]
-    return middle.astype(np.uint8), worst(np.take_along_axis(widths, start, 0)[0]).astype(np.float32)
+    return middle.astype(np.uint8), channel_max(np.take_along_axis(widths, start, 0)[0]).astype(np.float32)
 
 
 @cache
-def _linear() -> Float32[np.ndarray, "256"]:
+def _linear_from_code() -> Float32[np.ndarray, "256"]:
     """Linear light of all code values."""
     return linear_from_srgb(torch.arange(256, dtype=torch.float32) / 255).numpy()

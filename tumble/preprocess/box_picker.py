@@ -1,7 +1,7 @@
-"""Where the object is, asked of a person: one page in the browser, on this machine, that closes when it is answered.
+"""Box around the object, drawn by the user in the browser on a local page.
 
-The page shows one sharp frame, as the pinhole camera sees it; its address holds a random word, so that no other page
-can answer.
+The page shows one sharp undistorted frame. Its address contains a random token, so that no other page can send a box;
+the server stops when a box is received.
 """
 
 import base64
@@ -23,80 +23,84 @@ from tumble.preprocess import footage, video_to_capture
 from tumble.preprocess.footage import FootageFrame
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.source import input_kind
-from tumble.preprocess.survey import lens_of, undistorted
+from tumble.preprocess.survey import lens_of, undistort_frame
 
-LOOKED_AT = 60
-"""Frames among which the sharpest is shown: the first two seconds."""
-ANSWER = 256
-"""Longest answer that is read [bytes]."""
+N_CANDIDATES = 60
+"""Number of frames among which the sharpest is selected: the first two seconds."""
+MAX_REQUEST_BYTES = 256
+"""Maximum size of a request that is read [bytes]."""
 
 Box = tuple[int, int, int, int]
 
 
-def pick_box(path: Path, options: FootageOptions, made: Path, tell: Callable[[str], Any] = print) -> FootageOptions:
-    """The options with a box that a person draws, and the frame it is on; waits until one is drawn.
+def pick_box(
+    path: Path, options: FootageOptions, capture: Path, output: Callable[[str], Any] = print
+) -> FootageOptions:
+    """The options, completed with a box that the user draws and the number of its frame; waits for the box.
 
     Args:
-        made: The capture that the footage becomes. Where it is there already its box is taken, and nobody asked.
-        tell: Is given the page's address, then the options to give next time.
+        capture: The capture to which the footage is converted. If it exists, its box is used and no page is opened.
+        output: Called with the page's address, and then with the options that repeat the choice.
 
     Raises:
         BadFile: The footage cannot be read, or has masks.
-        ValueError: `options` say already where the object is.
+        ValueError: `options` mark the object already.
     """
     if options.box is not None or options.click is not None or options.masks is not None:
-        raise ValueError("--pick asks for what --box, --click or --masks say already: leave it out")
-    if input_kind(path) not in ("film", "pictures"):
-        raise BadFile(path, "is no film and no folder of pictures", "--pick is for those: leave it out")
-    note = made / video_to_capture.PROVENANCE
-    if note.is_file():
-        said = files.read_json(note)["options"]
-        return replace(options, box=None if said["box"] is None else tuple(said["box"]), at=said["at"])
-    frame = sharp_frame(path, options)
-    box = ask(frame, tell)
-    tell(f"--box {' '.join(map(str, box))} --at {frame.number}")
+        raise ValueError(
+            "--pick cannot be combined with --box, --click or --masks, which mark the object already: leave it out"
+        )
+    if input_kind(path) not in ("video", "images"):
+        raise BadFile(path, "is neither a video nor a folder of images", "--pick works only for those: leave it out")
+    provenance = capture / video_to_capture.PROVENANCE
+    if provenance.is_file():
+        saved = files.read_json(provenance)["options"]
+        return replace(options, box=None if saved["box"] is None else tuple(saved["box"]), at=saved["at"])
+    frame = sharpest_frame(path, options)
+    box = request_box(frame, output)
+    output(f"--box {' '.join(map(str, box))} --at {frame.number}")
     return replace(options, box=box, at=frame.number)
 
 
-def sharp_frame(path: Path, options: FootageOptions) -> FootageFrame:
-    """The frame `options.at`, or where that is 0 the sharpest of the first ones, without the lens's distortion."""
+def sharpest_frame(path: Path, options: FootageOptions) -> FootageFrame:
+    """The undistorted frame `options.at`, or if that is 0 the sharpest of the first `N_CANDIDATES`."""
     opened = footage.open_footage(path, options.masks)
-    best, most = None, -1.0
-    for frame in footage.frames(opened):
+    best, highest = None, -1.0
+    for frame in footage.read_frames(opened):
         if frame.mask is not None:
-            raise BadFile(path, "has masks: nothing to ask", "leave --pick out")
+            raise BadFile(path, "has masks, so no box is needed", "leave --pick out")
         if options.at and frame.number < options.at:
             continue
-        sharpness = float(cv2.Laplacian(cv2.cvtColor(frame.picture, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
-        if sharpness > most:
-            best, most = frame, sharpness
-        if frame.number >= (options.at or LOOKED_AT - 1):
+        sharpness = float(cv2.Laplacian(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
+        if sharpness > highest:
+            best, highest = frame, sharpness
+        if frame.number >= (options.at or N_CANDIDATES - 1):
             break
     if best is None:
         raise BadFile(path, f"has no frame {options.at}")
-    return undistorted(best, lens_of(opened, options, *best.picture.shape[:2]))
+    return undistort_frame(best, lens_of(opened, options, *best.image.shape[:2]))
 
 
-def ask(frame: FootageFrame, tell: Callable[[str], Any] = print) -> Box:
-    """Serve the page to this machine alone until a box is drawn: left, top, width, height [pixels]."""
-    height, width = frame.picture.shape[:2]
-    page, word, answers = _page(frame), secrets.token_urlsafe(12), []
+def request_box(frame: FootageFrame, output: Callable[[str], Any] = print) -> Box:
+    """Serve the page on localhost until a box is drawn; returns left, top, width, height [pixels]."""
+    height, width = frame.image.shape[:2]
+    page, token, boxes = _page(frame), secrets.token_urlsafe(12), []
 
     class Handler(BaseHTTPRequestHandler):
         timeout = 30
 
         def do_GET(self) -> None:
-            self._reply(200, page) if self.path == f"/{word}/" else self._reply(404, b"no such page")
+            self._reply(200, page) if self.path == f"/{token}/" else self._reply(404, b"no such page")
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            if self.path != f"/{word}/box" or not length.isdecimal() or int(length) > ANSWER:
+            if self.path != f"/{token}/box" or not length.isdecimal() or int(length) > MAX_REQUEST_BYTES:
                 return self._reply(404, b"no such page")
-            box = _box(self.rfile.read(int(length)), height, width)
+            box = _parse_box(self.rfile.read(int(length)), height, width)
             if box is None:
-                return self._reply(400, f"not a box in {width} x {height} pixels".encode())
+                return self._reply(400, f"not a box inside {width} x {height} pixels".encode())
             self._reply(200, b"")
-            answers.append(box)
+            boxes.append(box)
             server.shutdown()
 
         def _reply(self, code: int, content: bytes) -> None:
@@ -107,34 +111,34 @@ def ask(frame: FootageFrame, tell: Callable[[str], Any] = print) -> Box:
             self.wfile.write(content)
 
         def log_message(self, format: str, *args: Any) -> None:
-            """Say nothing."""
+            """Suppress the log of requests."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         server.daemon_threads = True
-        address = f"http://127.0.0.1:{server.server_address[1]}/{word}/"
+        address = f"http://127.0.0.1:{server.server_address[1]}/{token}/"
         tunnel = f"ssh -L {server.server_address[1]}:127.0.0.1:{server.server_address[1]} THIS_MACHINE"
-        tell(f"{address}   draw a box around the object there (from another machine after {tunnel})")
+        output(f"{address}   open this page and draw a box around the object (on another machine after {tunnel})")
         server.serve_forever(poll_interval=0.1)
-    return answers[0]
+    return boxes[0]
 
 
-def _box(content: bytes, height: int, width: int) -> Box | None:
-    """What the page sends, if it is a box inside the picture."""
+def _parse_box(content: bytes, height: int, width: int) -> Box | None:
+    """The box sent by the page; None if it is no box inside the image."""
     try:
         values = json.loads(content)
     except (json.JSONDecodeError, UnicodeDecodeError):
         return None
     if not isinstance(values, list) or len(values) != 4 or not all(type(v) is int for v in values):
         return None
-    left, top, wide, high = values
-    inside = left >= 0 and top >= 0 and min(wide, high) >= 2 and left + wide <= width and top + high <= height
-    return (left, top, wide, high) if inside else None
+    left, top, w, h = values
+    inside = left >= 0 and top >= 0 and min(w, h) >= 2 and left + w <= width and top + h <= height
+    return (left, top, w, h) if inside else None
 
 
 def _page(frame: FootageFrame) -> bytes:
-    height, width = frame.picture.shape[:2]
-    encoded = cv2.imencode(".jpg", np.ascontiguousarray(frame.picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
-    picture = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
-    parts = {"picture": picture, "width": str(width), "height": str(height), "number": str(frame.number)}
+    height, width = frame.image.shape[:2]
+    encoded = cv2.imencode(".jpg", np.ascontiguousarray(frame.image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    image = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+    parts = {"image": image, "width": str(width), "height": str(height), "number": str(frame.number)}
     template = (resources.files("tumble.preprocess") / "pick.html").read_text("utf-8")
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template).encode()
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template).encode()

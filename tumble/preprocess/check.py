@@ -1,7 +1,8 @@
-"""Is this film, or set of pictures, fit for reconstruction? One finding per property, with what to shoot again.
+"""Suitability of footage for reconstruction: one finding per property, with advice for recording it again.
 
-A finding *stops* when no reconstruction can come of the film, *warns* when it costs quality, and else is good. The film
-is a GO when nothing stops.
+A finding is rated "stop" if no reconstruction is possible, "warn" if its quality will suffer, and else "good". The
+footage is suitable (GO) if no finding is a "stop". A limit given as a pair is (limit of a warning, limit of a stop); if
+the first number is larger, small values are bad.
 """
 
 import math
@@ -16,224 +17,248 @@ from tumble.preprocess import colmap_to_capture, keyframes, video_to_capture
 from tumble.preprocess.box_picker import pick_box
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.source import input_kind
-from tumble.preprocess.survey import Survey, survey
+from tumble.preprocess.survey import Survey, survey_footage
 
-SHAKEN = (0.004, video_to_capture.SHAKEN)
-"""Motion of the background, as a share of the picture's longer side: from here it warns, and stops (8, 38 of 1920)."""
-BLURRED = (1.2, 2.5)
-"""Blur of the object's edges on the frames that would be kept [pixels of the written frames]."""
-DRIFTED = (0.15, 1.0)
-"""Range of exposure over the film [stops]."""
-TINTED = 0.08
-"""Range of a colour channel against green from which white balance is said to drift; it warns only."""
-UNCERTAIN = (0.1, 0.4)
-"""Share of frames whose mask is unsure."""
-CLIPPED = (0.02, 0.3)
-"""Share of frames in which the object touches the border of the picture."""
-BURNT = 0.03
-"""Share of the object's pixels that are saturated; a highlight is allowed."""
-SMALL = (96, 40)
-"""Diameter of the object on the film [pixels]."""
-TURNED = (math.radians(300), math.radians(60))
-"""Turn in all [radians]."""
-FAST = (math.radians(12), math.radians(25))
-"""Turn between neighbouring frames of the film [radians]."""
-WIDE_STEP = math.radians(15)
-"""Turn between kept frames above which matching suffers [radians]."""
-MISSED = (1.0, 3.0)
-"""Mean reprojection error of a COLMAP model [pixels]."""
-APART = (0.4, 0.8)
-"""How far the middles of the masks miss one point, in parts of the median mask's radius."""
-ROUND = (math.radians(90), math.radians(30))
-"""Largest angle between two views of the object [radians]."""
+CAMERA_MOTION = (0.004, video_to_capture.MAX_CAMERA_MOTION)
+"""Limits of the motion of the background [longer side of the image]; 8 and 38 of 1920 pixels."""
+EDGE_BLUR = (1.2, 2.5)
+"""Limits of the blur of the object's edges in the selected frames [pixels of the capture's images]."""
+EXPOSURE_RANGE = (0.15, 1.0)
+"""Limits of the range of the exposure over the video [stops]."""
+MAX_WHITE_BALANCE_RANGE = 0.08
+"""Range of the gain of red or blue relative to green, over the video, above which a warning is given."""
+UNCERTAIN_FRAMES = (0.1, 0.4)
+"""Limits of the fraction of frames with an uncertain or empty mask."""
+CROPPED_FRAMES = (0.02, 0.3)
+"""Limits of the fraction of frames in which the object touches the border of the image."""
+MAX_SATURATED = 0.03
+"""Fraction of saturated pixels of the object above which a warning is given; specular highlights are tolerated."""
+DIAMETER = (96, 40)
+"""Limits of the object's diameter [pixels of the footage]."""
+TOTAL_ROTATION = (math.radians(300), math.radians(60))
+"""Limits of the object's total rotation [radians]."""
+ROTATION_PER_FRAME = (math.radians(12), math.radians(25))
+"""Limits of the rotation between consecutive frames of the video [radians]."""
+MAX_KEYFRAME_STEP = math.radians(15)
+"""Rotation between selected frames above which a warning is given, because matching becomes unreliable [radians]."""
+REPROJECTION_ERROR = (1.0, 3.0)
+"""Limits of the mean reprojection error of a COLMAP model [pixels]."""
+RAY_DISTANCE = (0.4, 0.8)
+"""Limits of the median distance of the rays through the mask centres from a common point [radius of a mask]."""
+VIEW_ANGLE = (math.radians(90), math.radians(30))
+"""Limits of the largest angle between two views of the object [radians]."""
 
-CheckVerdict = Literal["good", "warn", "stop"]
+CheckRating = Literal["good", "warn", "stop"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One property of the film."""
+    """Result of the check of one property of the footage."""
 
     subject: str
-    verdict: CheckVerdict
+    """Name of the property, at most 10 characters."""
+    rating: CheckRating
     state: str
-    """What was measured."""
+    """The measurement, in words."""
     advice: str = ""
-    """What to do about it; empty when good."""
+    """How to improve it; empty if the rating is good."""
 
 
 def check_footage(path: Path, out: Path, options: FootageOptions | None = None, *, pick: bool = False) -> list[Finding]:
-    """Look at a film, or a folder of pictures, and write the preview of its masks to `out`.
+    """Check a video or a folder of images, and write a preview of its masks into the folder `out`.
 
     Args:
-        pick: Ask a person in the browser where the object is.
+        pick: Draw a box around the object in the browser.
 
     Raises:
-        BadFile: It cannot be read, or nothing that moves is found in it.
+        BadFile: The footage cannot be read, or no moving object is found in it.
     """
     options = options or FootageOptions()
     options = pick_box(path, options, out / "capture") if pick else options
-    if input_kind(path) == "posed pictures":
-        return _check_posed(colmap_to_capture.gather(path, options), out, options)
-    found = survey(path, options)
-    chosen = keyframes.chosen(found.turned, found.blurs, found.usable, options.frames)
-    kept = [int(i) for i in np.nonzero(found.usable)[0]] if found.footage.pictures else chosen
-    video_to_capture.preview(found, out / video_to_capture.PREVIEW, kept)
-    findings = [_film(found), _hint(found), _camera(found), _masks(found), _border(found)]
+    if input_kind(path) == "posed images":
+        return _check_posed(colmap_to_capture.collect_silhouettes(path, options), out, options)
+    survey = survey_footage(path, options)
+    selected = keyframes.select_keyframes(survey.rotation, survey.blurs, survey.usable, options.frames)
+    kept = [int(i) for i in np.nonzero(survey.usable)[0]] if survey.footage.images else selected
+    video_to_capture.write_preview(survey, out / video_to_capture.PREVIEW, kept)
+    findings = [_video(survey), _inputs(survey), _camera(survey), _masks(survey), _border(survey)]
     if not kept:
-        return [*findings, Finding("frames", "stop", "none is usable", "draw a box with --pick, or give --masks")]
-    return [*findings, _size(found), *_turning(found, kept), _sharpness(found, kept, options), *_light(found)]
+        return [*findings, Finding("frames", "stop", "no usable frame", "draw a box with --pick, or give --masks")]
+    return [*findings, _size(survey), *_rotation(survey, kept), _sharpness(survey, kept, options), *_light(survey)]
 
 
 def passes(findings: list[Finding]) -> bool:
-    """Whether nothing stops a reconstruction."""
-    return all(finding.verdict != "stop" for finding in findings)
+    """Whether the footage is suitable: no finding is rated "stop"."""
+    return all(finding.rating != "stop" for finding in findings)
 
 
-def _graded(value: float, limits: tuple[float, float]) -> CheckVerdict:
-    """By where a value stands to the limits of warning and stopping; they may rise or fall."""
+def _rate(value: float, limits: tuple[float, float]) -> CheckRating:
+    """Rating of a value by the limits of a warning and of a stop."""
     sign = 1 if limits[1] >= limits[0] else -1
     return "stop" if sign * value > sign * limits[1] else "warn" if sign * value > sign * limits[0] else "good"
 
 
-def _finding(subject: str, verdict: CheckVerdict, state: str, advice: str) -> Finding:
-    return Finding(subject, verdict, state, "" if verdict == "good" else advice)
+def _finding(subject: str, rating: CheckRating, state: str, advice: str) -> Finding:
+    return Finding(subject, rating, state, "" if rating == "good" else advice)
 
 
-def _film(found: Survey) -> Finding:
-    camera, n = found.lens.camera, len(found.numbers)
-    state = f"{camera.width} x {camera.height}, {n} frames looked at, {found.times[-1] - found.times[0]:.1f} s"
-    hdr = found.footage.hdr
-    advice = f"filmed in HDR ({hdr}): its colours are not sRGB; switch HDR video off and shoot again"
-    return _finding("film", "good" if hdr is None else "warn", state, advice)
+def _video(survey: Survey) -> Finding:
+    camera, n = survey.lens.camera, len(survey.numbers)
+    state = f"{camera.width} x {camera.height}, {n} frames surveyed, {survey.times[-1] - survey.times[0]:.1f} s"
+    hdr = survey.footage.hdr
+    advice = f"recorded in HDR ({hdr}), whose colours are not sRGB: switch HDR video off and record again"
+    return _finding("video", "good" if hdr is None else "warn", state, advice)
 
 
-def _hint(found: Survey) -> Finding:
-    focal = float(found.lens.camera.fx_fy_cx_cy[0])
-    state = f"focal length {focal:.0f} pixels ({found.lens.source})"
-    if found.guessed and found.seed is not None and found.seed.box is not None:
-        left, top, width, height = (round(v / found.scale) for v in found.seed.box)
-        state += f"; object guessed at {left} {top} {width} {height} on frame {found.numbers[found.seed.index]}"
-    guesses = found.guessed or found.lens.source == "guess"
-    advice = "look at the mask preview, and draw a box with --pick if it is wrong; give --focal or --fov if known"
-    advice += ": else the run estimates it" if found.lens.source == "guess" else ""
-    return _finding("hints", "warn" if guesses else "good", state, advice)
+def _inputs(survey: Survey) -> Finding:
+    focal = float(survey.lens.camera.fx_fy_cx_cy[0])
+    state = f"focal length {focal:.0f} pixels ({survey.lens.source})"
+    if survey.seed_from_motion and survey.seed is not None and survey.seed.box is not None:
+        left, top, width, height = (round(v / survey.scale) for v in survey.seed.box)
+        state += f"; object detected at {left} {top} {width} {height} on frame {survey.numbers[survey.seed.index]}"
+    assumed = survey.seed_from_motion or survey.lens.source == "guess"
+    advice = (
+        "check the preview of the masks; if it is wrong, draw a box with --pick; give --focal or --fov if you know it"
+    )
+    advice += " (otherwise the run estimates the focal length)" if survey.lens.source == "guess" else ""
+    return _finding("inputs", "warn" if assumed else "good", state, advice)
 
 
-def _camera(found: Survey) -> Finding:
-    moved = video_to_capture.shaken(found)
-    state = f"the background moves by {100 * moved:.1f} % of the picture"
-    return _finding("camera", _graded(moved, SHAKEN), state, "put the camera on a tripod: it must stand still")
+def _camera(survey: Survey) -> Finding:
+    motion = video_to_capture.camera_motion(survey)
+    state = f"the background moves by {100 * motion:.1f} % of the image"
+    return _finding("camera", _rate(motion, CAMERA_MOTION), state, "put the camera on a tripod: it must stand still")
 
 
-def _masks(found: Survey) -> Finding:
-    share = float(found.masks.unsure.mean())
-    worst = int(found.numbers[found.masks.confidence.argmin()])
-    state = f"unsure on {100 * share:.0f} % of the frames"
-    if share > 0:
-        state += f", most at frame {worst}"
-    advice = "look at the preview (red edges); --pick a box on a clear frame (--at), --masks, or a plainer background"
-    return _finding("masks", _graded(share, UNCERTAIN), state, advice)
+def _masks(survey: Survey) -> Finding:
+    fraction = float(survey.masks.uncertain.mean())
+    worst = int(survey.numbers[survey.masks.confidence.argmin()])
+    state = f"uncertain on {100 * fraction:.0f} % of the frames"
+    if fraction > 0:
+        state += f", most on frame {worst}"
+    advice = (
+        "check the preview (red borders); --pick a box on a clear frame (--at), give --masks, or use a plain background"
+    )
+    return _finding("masks", _rate(fraction, UNCERTAIN_FRAMES), state, advice)
 
 
-def _border(found: Survey) -> Finding:
-    inside = found.inside
+def _border(survey: Survey) -> Finding:
+    inside = survey.inside
     edge = inside[:, [0, 1, -2, -1]].any((1, 2)) | inside[:, :, [0, 1, -2, -1]].any((1, 2))
-    share = float(edge.mean())
-    state = f"the object touches the border of the picture on {100 * share:.0f} % of the frames"
-    return _finding("framing", _graded(share, CLIPPED), state, "keep the whole object in the picture, with room around")
+    fraction = float(edge.mean())
+    state = f"the object touches the border of the image on {100 * fraction:.0f} % of the frames"
+    return _finding(
+        "framing", _rate(fraction, CROPPED_FRAMES), state, "keep the whole object in the image, with some margin"
+    )
 
 
-def _size(found: Survey) -> Finding:
-    area = float(np.median(found.inside[found.usable].sum((1, 2))))
-    diameter = 2 * math.sqrt(area / math.pi) / found.scale
+def _size(survey: Survey) -> Finding:
+    area = float(np.median(survey.inside[survey.usable].sum((1, 2))))
+    diameter = 2 * math.sqrt(area / math.pi) / survey.scale
     state = f"the object is {diameter:.0f} pixels across"
-    return _finding("size", _graded(diameter, SMALL), state, "go nearer, or film at a higher resolution")
+    return _finding(
+        "size", _rate(diameter, DIAMETER), state, "move the camera closer, or record at a higher resolution"
+    )
 
 
-def _turning(found: Survey, kept: list[int]) -> list[Finding]:
-    total = float(found.turned[-1])
-    state = f"turns by about {math.degrees(total):.0f} degrees in all"
-    advice = "turn it all the way round, twice, tilting it; a surface without any texture looks as if it did not turn"
-    findings = [_finding("turning", _graded(total, TURNED), state, advice)]
-    if found.footage.pictures:
+def _rotation(survey: Survey, kept: list[int]) -> list[Finding]:
+    total = float(survey.rotation[-1])
+    state = f"about {math.degrees(total):.0f} degrees in total"
+    advice = (
+        "turn the object by 360 degrees twice, and tilt it; the rotation of a surface without texture is not measured"
+    )
+    findings = [_finding("rotation", _rate(total, TOTAL_ROTATION), state, advice)]
+    if survey.footage.images:
         return findings
-    frames_apart = np.maximum(np.diff(found.numbers), 1)
-    fastest = float(np.percentile(np.diff(found.turned) / frames_apart, 95))
+    spacing = np.maximum(np.diff(survey.numbers), 1)
+    fastest = float(np.percentile(np.diff(survey.rotation) / spacing, 95))
     state = f"up to {math.degrees(fastest):.0f} degrees from frame to frame"
-    findings.append(_finding("speed", _graded(fastest, FAST), state, "turn it more slowly, or film at 60 per second"))
-    step = keyframes.largest_step(found.turned, kept)
-    state = f"{len(kept)} to keep, at most {math.degrees(step):.0f} degrees apart"
-    slower = "turn more slowly where the preview shows no green edge for long"
-    advice = slower if len(kept) == len(found.numbers) else f"keep more of them with --frames; or {slower}"
-    return [*findings, _finding("frames", "warn" if step > WIDE_STEP else "good", state, advice)]
+    findings.append(
+        _finding(
+            "speed",
+            _rate(fastest, ROTATION_PER_FRAME),
+            state,
+            "turn the object more slowly, or record 60 frames per second",
+        )
+    )
+    step = keyframes.largest_step(survey.rotation, kept)
+    state = f"{len(kept)} selected, at most {math.degrees(step):.0f} degrees apart"
+    slower = "turn the object more slowly where the preview shows no green border for long"
+    advice = slower if len(kept) == len(survey.numbers) else f"select more with --frames, or {slower}"
+    return [*findings, _finding("frames", "warn" if step > MAX_KEYFRAME_STEP else "good", state, advice)]
 
 
-def _sharpness(found: Survey, kept: list[int], options: FootageOptions) -> Finding:
-    window = video_to_capture.crop_window(found, kept)
+def _sharpness(survey: Survey, kept: list[int], options: FootageOptions) -> Finding:
+    window = video_to_capture.crop_window(survey, kept)
     shrink = min(options.size / max(window[2:]), 1.0)
-    width = float(np.median(found.blurs[kept]))
+    width = float(np.median(survey.blurs[kept]))
     blur = math.sqrt(max(width**2 - keyframes.PROBE_BLUR**2, 0.0)) * shrink if math.isfinite(width) else math.inf
-    state = f"edges are blurred by {blur:.1f} pixels at the size of the written frames"
-    return _finding("sharpness", _graded(blur, BLURRED), state, "more light, a shorter exposure, focus on the object")
+    state = f"edges are blurred by {blur:.1f} pixels in the capture's images"
+    return _finding(
+        "sharpness", _rate(blur, EDGE_BLUR), state, "use more light, a shorter exposure, and focus on the object"
+    )
 
 
-def _light(found: Survey) -> list[Finding]:
-    stops = float(np.ptp(np.log2(found.gains[:, 1])))
-    tint = float(np.ptp(found.gains / found.gains[:, 1:2], axis=0).max())
-    advice = "lock exposure and white balance; what drifted is taken out, what was clipped is lost"
-    verdict = _graded(stops, DRIFTED)
-    verdict = "warn" if verdict == "good" and tint > TINTED else verdict
-    drifted = _finding("exposure", verdict, f"drifts by {stops:.2f} stops, colours by {100 * tint:.0f} %", advice)
-    pixels = found.pictures[found.inside]
-    burnt = float((pixels.min(-1) >= 250).mean()) if len(pixels) else 0.0
-    state = f"{100 * burnt:.1f} % of the object is saturated"
-    advice = "expose for the object's brightest side: what is saturated has no colour"
-    return [drifted, _finding("highlights", "warn" if burnt > BURNT else "good", state, advice)]
+def _light(survey: Survey) -> list[Finding]:
+    stops = float(np.ptp(np.log2(survey.gains[:, 1])))
+    colour = float(np.ptp(survey.gains / survey.gains[:, 1:2], axis=0).max())
+    advice = "lock exposure and white balance; the drift is corrected, but clipped colours are lost"
+    rating = _rate(stops, EXPOSURE_RANGE)
+    rating = "warn" if rating == "good" and colour > MAX_WHITE_BALANCE_RANGE else rating
+    exposure = _finding("exposure", rating, f"drifts by {stops:.2f} stops, colours by {100 * colour:.0f} %", advice)
+    pixels = survey.images[survey.inside]
+    saturated = float((pixels.min(-1) >= 250).mean()) if len(pixels) else 0.0
+    state = f"{100 * saturated:.1f} % of the object is saturated"
+    advice = "expose for the object's brightest side: saturated pixels have no colour"
+    return [exposure, _finding("highlights", "warn" if saturated > MAX_SATURATED else "good", state, advice)]
 
 
-# Pictures with poses --------------------------------------------------------------------------------------------------
+# Images with poses ----------------------------------------------------------------------------------------------------
 
 
-def _check_posed(found: colmap_to_capture.Posed, out: Path, options: FootageOptions) -> list[Finding]:
-    """What a COLMAP model, its pictures and their masks are good for."""
-    R_new_cam = colmap_to_capture.turns(found, options.light)
-    glass, fine = colmap_to_capture.camera(found, R_new_cam, options.size)
-    shown = colmap_to_capture.frames(found, R_new_cam, glass, fine, options)
+def _check_posed(posed: colmap_to_capture.PosedImages, out: Path, options: FootageOptions) -> list[Finding]:
+    """Findings of a COLMAP model with its images and masks."""
+    R_new_cam = colmap_to_capture.camera_rotations(posed, options.light)
+    camera, oversampling = colmap_to_capture.common_camera(posed, R_new_cam, options.size)
+    resampled = colmap_to_capture.resampled_frames(posed, R_new_cam, camera, oversampling, options)
     video.write_clip(
         out / video_to_capture.PREVIEW,
-        (video_to_capture.tinted(p, m, video_to_capture.KEPT) for p, m in shown),
+        (video_to_capture.mask_overlay(p, m, video_to_capture.KEPT_EDGE) for p, m in resampled),
         quality=24,
     )
-    n = len(found.seen)
-    words = {"object": "the camera went round it", "camera": "it turned, its background masked"}
-    state = f"stands still with the {options.light}: {words[options.light]}; --light says otherwise"
-    findings = [_model(found), Finding("light", "good", state)]
-    share = len(found.empty) / (n + len(found.empty))
-    state, advice = f"{100 * share:.0f} % of the pictures do not show the object", "mend the masks that are empty"
-    findings.append(_finding("masks", _graded(share, UNCERTAIN), state, advice))
-    state = f"the middles of the masks meet within {100 * found.apart:.0f} % of a mask's radius"
-    advice = "masks and poses contradict each other, or the object did not stand still in the model"
-    findings.append(_finding("agreement", _graded(found.apart, APART), state, advice))
-    share = sum(outline.cut for outline in found.seen) / n
-    state = f"the object touches the border of the picture on {100 * share:.0f} % of the pictures"
-    advice = "keep the whole object in the picture, with room around"
-    findings.append(_finding("framing", _graded(share, CLIPPED), state, advice))
-    diameter = float(np.median([outline.diameter for outline in found.seen]))
+    n = len(posed.silhouettes)
+    reasons = {"object": "the camera moved around the object", "camera": "the object was turned, its background masked"}
+    state = f"fixed to the {options.light}: {reasons[options.light]}; change it with --light"
+    findings = [_model(posed), Finding("light", "good", state)]
+    fraction = len(posed.empty) / (n + len(posed.empty))
+    state, advice = f"{100 * fraction:.0f} % of the masks are empty", "correct the empty masks"
+    findings.append(_finding("masks", _rate(fraction, UNCERTAIN_FRAMES), state, advice))
+    state = (
+        f"the rays through the mask centres miss a common point by {100 * posed.ray_distance:.0f} % of a mask's radius"
+    )
+    advice = "masks and poses are inconsistent, or the object did not rest relative to the model's points"
+    findings.append(_finding("agreement", _rate(posed.ray_distance, RAY_DISTANCE), state, advice))
+    fraction = sum(silhouette.cropped for silhouette in posed.silhouettes) / n
+    state = f"the object touches the border of {100 * fraction:.0f} % of the images"
+    advice = "keep the whole object in the image, with some margin"
+    findings.append(_finding("framing", _rate(fraction, CROPPED_FRAMES), state, advice))
+    diameter = float(np.median([silhouette.diameter for silhouette in posed.silhouettes]))
     state = f"the object is {diameter:.0f} pixels across"
-    findings.append(_finding("size", _graded(diameter, SMALL), state, "go nearer, or take larger pictures"))
-    places = colmap_to_capture.trajectory(found, R_new_cam, options.light).camera_positions.double().numpy()
-    places = places / np.linalg.norm(places, axis=1, keepdims=True)
-    widest = math.acos(float((places @ places.T).clip(-1, 1).min()))
-    state = f"seen from {n} places, up to {math.degrees(widest):.0f} degrees apart"
-    findings.append(_finding("views", _graded(widest, ROUND), state, "take pictures from all sides, from above, too"))
+    findings.append(_finding("size", _rate(diameter, DIAMETER), state, "move the camera closer, or take larger images"))
+    positions = colmap_to_capture.trajectory(posed, R_new_cam, options.light).camera_positions.double().numpy()
+    positions = positions / np.linalg.norm(positions, axis=1, keepdims=True)
+    widest = math.acos(float((positions @ positions.T).clip(-1, 1).min()))
+    state = f"{n} camera positions, up to {math.degrees(widest):.0f} degrees apart"
+    findings.append(_finding("views", _rate(widest, VIEW_ANGLE), state, "take images from all sides, also from above"))
     return findings
 
 
-def _model(found: colmap_to_capture.Posed) -> Finding:
-    state = f"{len(found.model.views)} pictures with a pose, {len(found.model.points)} points"
-    if not len(found.model.errors):
+def _model(posed: colmap_to_capture.PosedImages) -> Finding:
+    state = f"{len(posed.model.views)} images with a pose, {len(posed.model.points)} points"
+    if not len(posed.model.errors):
         return Finding("model", "good", state)
-    error = float(found.model.errors.mean())
-    advice = "sharper pictures, more texture around the object, or fewer wrong matches"
-    return _finding("model", _graded(error, MISSED), f"{state}, off by {error:.2f} pixels on average", advice)
+    error = float(posed.model.errors.mean())
+    advice = "use sharper images or more texture around the object, and remove wrong matches"
+    return _finding(
+        "model", _rate(error, REPROJECTION_ERROR), f"{state}, mean reprojection error {error:.2f} pixels", advice
+    )

@@ -1,11 +1,11 @@
-"""Sparse models of COLMAP, binary and text: cameras, posed pictures, points (colmap.github.io/format.html).
+"""Reader of sparse COLMAP models, binary and text: cameras, posed images, points (colmap.github.io/format.html).
 
-    FOLDER/sparse/0/cameras.bin  images.bin  points3D.bin       or .txt, and points3D may be missing
-    FOLDER/sparse/, FOLDER/colmap/sparse/0/ and FOLDER/ itself  are looked at, too
+    FOLDER/sparse/0/cameras.bin  images.bin  points3D.bin       or .txt; points3D is optional
+    FOLDER/sparse/, FOLDER/colmap/sparse/0/ and FOLDER/ itself  are searched as well
 
-Of several numbered models the one with most pictures is taken. Poses are world to camera, with OpenCV axes; the files'
-principal points put the centre of the first pixel at (0.5, 0.5), OpenCV's functions at (0, 0). Files of more than
-`MAX_BYTES` are refused, and so is every count that its file cannot hold.
+Of several numbered models the one with most images is read. Poses are world to camera, with OpenCV axes. The principal
+points of the files put the centre of the first pixel at (0.5, 0.5), OpenCV's functions at (0, 0). Files larger than
+`MAX_BYTES` are refused, and so is any count that exceeds its file.
 """
 
 import math
@@ -23,8 +23,8 @@ from tumble.io import BadFile
 from tumble.maths import SO3
 
 MAX_BYTES = 1 << 30
-"""Largest file of a model that is read; a thousand pictures make a tenth of it."""
-MODELS = {
+"""Maximum size of a file that is read; a model of a thousand images has a tenth of it."""
+CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
     2: ("SIMPLE_RADIAL", 4),
@@ -35,19 +35,21 @@ MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5),
 }
-"""Camera models by their number in binary files: name and count of parameters."""
-PARAMETERS = dict(MODELS.values())
-UNIT = 1e-3
-"""Largest deviation of a quaternion's length from 1."""
+"""Name and number of parameters of the camera models, by their number in binary files."""
+N_PARAMETERS = dict(CAMERA_MODELS.values())
+"""Number of parameters of the camera models, by name."""
+QUATERNION_TOLERANCE = 1e-3
+"""Maximum deviation of a quaternion's length from 1."""
 
 
 @dataclass(frozen=True)
 class Optics:
-    """One camera: a matrix and how its lens bends lines, as OpenCV wants both."""
+    """Intrinsics and lens distortion of one camera, in OpenCV's convention."""
 
     K: Float64[np.ndarray, "3 3"]
-    """With the centre of the first pixel at (0, 0) [pixels]."""
+    """Camera matrix; the centre of the first pixel is (0, 0) [pixels]."""
     distortion: Float64[np.ndarray, " n"]
+    """Distortion coefficients: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6, or k1 to k4 of its fisheye model."""
     fisheye: bool
     """Whether the coefficients are those of OpenCV's fisheye model."""
     height: int
@@ -56,21 +58,21 @@ class Optics:
     """[pixels]"""
 
     def normalised(self, uv: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
-        """Where pixels lie on the plane at depth 1 before the camera."""
+        """Undistorted coordinates of pixels on the plane at depth 1 in front of the camera."""
         undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
         return undistort(uv[:, None].astype(np.float64), self.K, self.distortion)[:, 0]
 
 
 @dataclass(frozen=True)
-class PosedPicture:
-    """One picture with its pose."""
+class PosedImage:
+    """One image with its pose."""
 
     name: str
-    """Path of the picture in the folder of pictures."""
+    """Path of the image, relative to the folder of images."""
     optics: Optics
     R_cam_world: Float64[np.ndarray, "3 3"]
     t_cam_world: Float64[np.ndarray, "3"]
-    """[the model's unit]"""
+    """Translation [unit of the model]."""
 
 
 @dataclass(frozen=True)
@@ -78,62 +80,64 @@ class SparseModel:
     """A sparse reconstruction."""
 
     path: Path
-    views: tuple[PosedPicture, ...]
-    """In the order of their names."""
+    views: tuple[PosedImage, ...]
+    """Images sorted by name."""
     points: Float64[np.ndarray, "n 3"]
-    """World frame; none where the model has no file of points."""
+    """Points in the world frame; empty if the model has no file of points."""
     errors: Float64[np.ndarray, " n"]
     """Mean reprojection error of every point [pixels]."""
 
 
 def recognises(path: Path) -> bool:
-    """Whether a folder holds a sparse model."""
-    return path.is_dir() and bool(_places(path))
+    """Whether a folder contains a sparse model."""
+    return path.is_dir() and bool(_model_folders(path))
 
 
 def read(path: Path) -> SparseModel:
-    """The sparse model in a folder of COLMAP.
+    """Read the sparse model in a COLMAP folder.
 
     Raises:
-        BadFile: There is none, a file is damaged, or a camera model is not known.
+        BadFile: There is no model, a file is damaged, or a camera model is unknown.
     """
-    places = _places(path)
-    if not places:
-        raise BadFile(path, "holds no sparse model of COLMAP", "sparse/0/ with cameras, images as .bin or .txt")
-    models = [_read(place) for place in places]
+    folders = _model_folders(path)
+    if not folders:
+        raise BadFile(
+            path, "holds no sparse COLMAP model", "expected sparse/0/ with cameras and images as .bin or .txt"
+        )
+    models = [_read(folder) for folder in folders]
     return max(models, key=lambda model: len(model.views))
 
 
-def _places(path: Path) -> list[Path]:
+def _model_folders(path: Path) -> list[Path]:
     sparse = [path / "sparse", path / "colmap" / "sparse"]
-    numbered = [sorted(p for p in folder.glob("*") if p.name.isdecimal()) for folder in sparse]
+    numbered = [sorted(p for p in parent.glob("*") if p.name.isdecimal()) for parent in sparse]
     for group in (numbered[0], [sparse[0]], numbered[1], [path]):
-        if found := [place for place in group if _file(place, "cameras") and _file(place, "images")]:
-            return found
+        if models := [folder for folder in group if _file(folder, "cameras") and _file(folder, "images")]:
+            return models
     return []
 
 
-def _file(place: Path, name: str) -> Path | None:
-    return next((p for ending in (".bin", ".txt") if (p := place / f"{name}{ending}").is_file()), None)
+def _file(folder: Path, name: str) -> Path | None:
+    return next((p for ending in (".bin", ".txt") if (p := folder / f"{name}{ending}").is_file()), None)
 
 
-def _read(place: Path) -> SparseModel:
-    cameras, images, points = (_file(place, name) for name in ("cameras", "images", "points3D"))
-    assert cameras is not None, "a place has both"
-    assert images is not None, "a place has both"
+def _read(folder: Path) -> SparseModel:
+    cameras, images, points = (_file(folder, name) for name in ("cameras", "images", "points3D"))
+    assert cameras is not None, "checked by _model_folders"
+    assert images is not None, "checked by _model_folders"
     optics = dict(_cameras(cameras))
     views = sorted(_views(images, optics), key=lambda view: view.name)
     if not views:
-        raise BadFile(images, "holds no picture")
+        raise BadFile(images, "lists no image")
     if len({view.name for view in views}) < len(views):
-        raise BadFile(images, "has two pictures of one name")
+        raise BadFile(images, "lists two images of the same name")
     rows = np.array(list(_points(points)) if points is not None else [], np.float64).reshape(-1, 4)
     if points is not None and not np.isfinite(rows).all():
-        raise BadFile(points, "holds NaN or infinity")
-    return SparseModel(place, tuple(views), rows[:, :3], rows[:, 3])
+        raise BadFile(points, "contains NaN or infinity")
+    return SparseModel(folder, tuple(views), rows[:, :3], rows[:, 3])
 
 
-# Both layouts give these three ----------------------------------------------------------------------------------------
+# The same for both file formats ---------------------------------------------------------------------------------------
 
 
 def _cameras(path: Path) -> Iterator[tuple[int, Optics]]:
@@ -141,17 +145,15 @@ def _cameras(path: Path) -> Iterator[tuple[int, Optics]]:
         yield number, _optics(path, model, width, height, np.array(parameters))
 
 
-def _views(path: Path, optics: dict[int, Optics]) -> Iterator[PosedPicture]:
+def _views(path: Path, optics: dict[int, Optics]) -> Iterator[PosedImage]:
     for name, pose, camera in _binary_images(path) if _binary(path) else _text_images(path):
         values = np.array(pose)
         if camera not in optics:
-            raise BadFile(path, f"{name} was taken by camera {camera}, there is none of that number")
+            raise BadFile(path, f"{name} refers to camera {camera}, which does not exist")
         length = math.sqrt(float((values[:4] ** 2).sum()))
-        if not np.isfinite(values).all() or abs(length - 1) > UNIT:
-            raise BadFile(path, f"{name} has no rotation: its quaternion has length {length:.4g}")
-        yield PosedPicture(
-            name, optics[camera], SO3(torch.from_numpy(values[:4] / length)).matrix().numpy(), values[4:]
-        )
+        if not np.isfinite(values).all() or abs(length - 1) > QUATERNION_TOLERANCE:
+            raise BadFile(path, f"{name} has no valid rotation: its quaternion has length {length:.4g}")
+        yield PosedImage(name, optics[camera], SO3(torch.from_numpy(values[:4] / length)).matrix().numpy(), values[4:])
 
 
 def _points(path: Path) -> Iterator[tuple[float, ...]]:
@@ -159,14 +161,14 @@ def _points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _optics(path: Path, model: str, width: int, height: int, values: Float64[np.ndarray, " n"]) -> Optics:
-    """The parameters by OpenCV's names: k1 k2 p1 p2 k3 k4 k5 k6, or k1 to k4 of a fisheye lens."""
+    """Optics from the parameters of a COLMAP camera model."""
     two_focals = model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
     fx, fy, cx, cy = values[:4] if two_focals else (values[0], values[0], values[1], values[2])
     if not np.isfinite(values).all() or min(fx, fy) <= 0 or not (0 < width < 1 << 16 and 0 < height < 1 << 16):
         raise BadFile(path, f"has a camera of {width} x {height} pixels with the parameters {values.tolist()}")
     coefficients = np.zeros(4 if "FISHEYE" in model else 8)
-    rest = values[4 if two_focals else 3 :]
-    coefficients[: len(rest)] = rest
+    distortion = values[4 if two_focals else 3 :]
+    coefficients[: len(distortion)] = distortion
     K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     return Optics(K, coefficients, "FISHEYE" in model, height, width)
 
@@ -178,28 +180,29 @@ def _binary(path: Path) -> bool:
     return path.suffix == ".bin"
 
 
-class _Bytes:
-    """A file's bytes and how far they are read; a class, because every read moves on."""
+class _ByteReader:
+    """Sequential reader of a file's bytes; a mutable class, because every read advances the position."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.at, self.data = path, 0, _content(path)
+        self.path, self.position, self.data = path, 0, _content(path)
 
     def take(self, layout: str) -> tuple:
-        """The next numbers, little-endian, by struct's letters."""
+        """The next numbers, little-endian, in a format of `struct`."""
         size = struct.calcsize(f"<{layout}")
         self.skip(size)
-        return struct.unpack_from(f"<{layout}", self.data, self.at - size)
+        return struct.unpack_from(f"<{layout}", self.data, self.position - size)
 
     def skip(self, size: int) -> None:
-        self.at += size
-        if self.at > len(self.data):
-            raise BadFile(self.path, f"is damaged: it ends at byte {len(self.data)}, {self.at} are needed")
+        self.position += size
+        if self.position > len(self.data):
+            raise BadFile(self.path, f"is damaged: it has {len(self.data)} bytes, and {self.position} are needed")
 
-    def word(self) -> str:
-        end = self.data.find(b"\0", self.at)
+    def take_string(self) -> str:
+        """The next zero-terminated string."""
+        end = self.data.find(b"\0", self.position)
         if end < 0:
-            raise BadFile(self.path, "is damaged: a name does not end")
-        text, self.at = self.data[self.at : end], end + 1
+            raise BadFile(self.path, "is damaged: a name is not terminated")
+        text, self.position = self.data[self.position : end], end + 1
         return text.decode("utf-8", errors="replace")
 
 
@@ -210,29 +213,29 @@ def _content(path: Path) -> bytes:
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
-    data = _Bytes(path)
+    data = _ByteReader(path)
     for _ in range(data.take("Q")[0]):
         number, kind, width, height = data.take("IiQQ")
-        if kind not in MODELS:
-            raise BadFile(path, f"has the camera model {kind}", _known())
-        model, count = MODELS[kind]
+        if kind not in CAMERA_MODELS:
+            raise BadFile(path, f"has the unknown camera model {kind}", _known_models())
+        model, count = CAMERA_MODELS[kind]
         yield number, model, width, height, data.take(f"{count}d")
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, tuple[float, ...], int]]:
-    data = _Bytes(path)
+    data = _ByteReader(path)
     for _ in range(data.take("Q")[0]):
         _, *pose, camera = data.take("I7dI")
-        name = data.word()
-        data.skip(24 * data.take("Q")[0])  # keypoints: two coordinates and the number of a point
+        name = data.take_string()
+        data.skip(24 * data.take("Q")[0])  # per keypoint: two coordinates and the number of a point
         yield name, tuple(pose), camera
 
 
 def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
-    data = _Bytes(path)
+    data = _ByteReader(path)
     for _ in range(data.take("Q")[0]):
-        _, x, y, z, _, _, _, error, seen = data.take("Q3d3BdQ")
-        data.skip(8 * seen)
+        _, x, y, z, _, _, _, error, track_length = data.take("Q3d3BdQ")
+        data.skip(8 * track_length)
         yield x, y, z, error
 
 
@@ -240,7 +243,7 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _lines(path: Path) -> list[str]:
-    """Without comments; empty ones stay, for a picture without keypoints has one."""
+    """Lines that are no comments, including empty ones, which occur as the keypoints of images."""
     lines = _content(path).decode("utf-8", errors="replace").splitlines()
     return [line for line in lines if not line.startswith("#")]
 
@@ -251,7 +254,7 @@ def _numbers(path: Path, words: list[str]) -> tuple[float, ...]:
     except ValueError:
         values = (math.nan,)
     if not all(map(math.isfinite, values)):
-        raise BadFile(path, f"has {' '.join(words)[:60]!r} in the place of numbers")
+        raise BadFile(path, f"has {' '.join(words)[:60]!r} where numbers are expected")
     return values
 
 
@@ -261,10 +264,12 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float,
         if not words:
             continue
         model = words[1] if len(words) > 1 else ""
-        if model not in PARAMETERS:
-            raise BadFile(path, f"has the camera model {model!r}", _known())
-        if len(words) != 4 + PARAMETERS[model]:
-            raise BadFile(path, f"has a {model} with {len(words) - 4} parameters, it has {PARAMETERS[model]}")
+        if model not in N_PARAMETERS:
+            raise BadFile(path, f"has the unknown camera model {model!r}", _known_models())
+        if len(words) != 4 + N_PARAMETERS[model]:
+            raise BadFile(
+                path, f"has a {model} camera with {len(words) - 4} parameters instead of {N_PARAMETERS[model]}"
+            )
         number, width, height, *parameters = _numbers(path, [words[0], *words[2:]])
         yield int(number), model, int(width), int(height), tuple(parameters)
 
@@ -276,7 +281,7 @@ def _text_images(path: Path) -> Iterator[tuple[str, tuple[float, ...], int]]:
     for line in lines[::2]:
         words = line.split(maxsplit=9)
         if len(words) < 10:
-            raise BadFile(path, f"has {line[:60]!r} in the place of a picture", "two lines per picture")
+            raise BadFile(path, f"has {line[:60]!r} where an image is expected", "there must be two lines per image")
         _, *pose, camera = _numbers(path, words[:9])
         yield words[9].strip(), tuple(pose), int(camera)
 
@@ -287,10 +292,10 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
         if not words:
             continue
         if len(words) < 8:
-            raise BadFile(path, f"has {line[:60]!r} in the place of a point")
+            raise BadFile(path, f"has {line[:60]!r} where a point is expected")
         _, x, y, z, _, _, _, error = _numbers(path, words[:8])
         yield x, y, z, error
 
 
-def _known() -> str:
-    return f"known: {', '.join(PARAMETERS)}"
+def _known_models() -> str:
+    return f"known models: {', '.join(N_PARAMETERS)}"

@@ -1,9 +1,9 @@
-"""From pictures with masks and a sparse model of COLMAP to a capture folder with poses.
+"""Conversion of images with masks and a sparse COLMAP model to a capture folder with poses.
 
-Every picture is seen again through one pinhole camera: lenses are undone, and where the light stands with the object,
-the camera is turned to look at the object's centre, which is exact, for it stays where it is. (A camera that the light
-stands with must not turn from frame to frame: all pictures get one turn.) The object's unit is fixed from its
-silhouettes: the smallest ball that reaches all rays through them. +y is up on the mean picture.
+Every image is resampled to one common pinhole camera: lens distortion is removed, and the camera is rotated about its
+centre of projection to look at the object's centre. If the light is fixed to the camera, the lighting would rotate with
+it, so all images get the same rotation. The unit of length is set by the silhouettes: the smallest sphere that reaches
+all rays through their contours has radius 1. +y is up in the mean image.
 """
 
 import math
@@ -19,265 +19,281 @@ from jaxtyping import Float64, UInt8
 
 from tumble.datasets import capture_document, training_frame
 from tumble.io import BadFile, files
-from tumble.maths import SE3, smallest_ball
+from tumble.maths import SE3, smallest_enclosing_sphere
 from tumble.preprocess import colmap, video_to_capture
-from tumble.preprocess.colmap import PosedPicture, SparseModel
-from tumble.preprocess.footage import mask_of, read_mask
-from tumble.preprocess.options import LEAST_FRAMES, FootageOptions
-from tumble.preprocess.survey import small_mask
+from tumble.preprocess.colmap import PosedImage, SparseModel
+from tumble.preprocess.footage import find_mask, read_mask
+from tumble.preprocess.options import MIN_FRAMES, FootageOptions
+from tumble.preprocess.survey import downsample_mask
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Trajectory, mask_from_alpha, undistortion
 
-ROOM = 1.02
-"""Radius of the unit ball over what the silhouettes reach."""
-PART = 0.05
-"""A piece of a mask this small against the largest is a speck, and no part of the silhouette."""
-SEARCH = 2000
-"""Steps of the search for the ball; the last ones move it by a thousandth of its radius."""
-LEVEL = 0.3
-"""Length of the mean upward direction under which the cameras have none in common."""
+RADIUS_MARGIN = 1.02
+"""Radius of the object's sphere divided by the radius that the silhouettes determine."""
+MIN_PART_FRACTION = 0.05
+"""Minimum area of a component of a mask, as a fraction of the largest one; a smaller one is noise."""
+SPHERE_STEPS = 2000
+"""Number of steps of the search for the smallest sphere; the last ones move it by a thousandth of its radius."""
+MIN_UP_LENGTH = 0.3
+"""Minimum length of the mean of the cameras' up directions (unit vectors); below it there is no common one."""
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """One picture with a pose, and the outline of the object in it."""
+    """One posed image, and the silhouette of the object in it."""
 
-    view: PosedPicture
-    picture: Path
+    view: PosedImage
+    image: Path
+    """Image file."""
     mask: Path | None
-    """None where the picture's alpha is the mask."""
+    """Mask file; None if the image's alpha channel is the mask."""
     rays: Float64[np.ndarray, "m 2"]
-    """Around the object's convex hull, on the plane at depth 1 before the camera."""
+    """Vertices of the convex hull of the silhouette, on the plane at depth 1 in front of the camera."""
     diameter: float
-    """Of a disk of the mask's area [pixels]."""
-    cut: bool
-    """Whether the object touches the border of the picture."""
+    """Diameter of a disc of the mask's area [pixels]."""
+    cropped: bool
+    """Whether the object touches the border of the image."""
 
 
 @dataclass(frozen=True)
-class Posed:
-    """Pictures with poses, before they are written."""
+class PosedImages:
+    """The images used, with poses and silhouettes, and the sphere around the object."""
 
     model: SparseModel
     root: Path
-    """Folder of the pictures."""
-    seen: tuple[Silhouette, ...]
+    """Folder of the images."""
+    silhouettes: tuple[Silhouette, ...]
     empty: tuple[str, ...]
-    """Pictures whose mask is."""
+    """Names of images with an empty mask, which are not used."""
     centre: Float64[np.ndarray, "3"]
-    """Of the object, in the model's frame and unit."""
+    """Centre of the object, in the model's frame and unit."""
     radius: float
-    """[the model's unit]"""
-    apart: float
-    """Median distance of the rays through the masks' middles from their meeting point [radius of the median mask]."""
+    """Radius of the object [unit of the model]."""
+    ray_distance: float
+    """Median distance of the rays through the mask centres from their common point [radius of the median mask]."""
 
 
 def capture_from_model(path: Path, out: Path, options: FootageOptions) -> Path:
-    """A capture folder (docs/format.md) with poses; returns it.
+    """Convert images with a COLMAP model to a capture folder (docs/format.md) with poses; returns the folder.
 
     Raises:
-        BadFile: Model, pictures or masks break a rule, or `out` is there already; nothing is written then.
+        BadFile: Model, images or masks break a rule, or `out` is not empty; nothing is written then.
     """
-    video_to_capture.refuse_full(out)
-    found = gather(path, options)
-    if len(found.seen) < LEAST_FRAMES:
-        raise BadFile(path, f"shows the object on {len(found.seen)} pictures", "see `tumble check` for what is wrong")
-    return video_to_capture.write_folder(out, lambda partial: _write(found, path, partial, options))
+    video_to_capture.require_new_folder(out)
+    posed = collect_silhouettes(path, options)
+    if len(posed.silhouettes) < MIN_FRAMES:
+        raise BadFile(
+            path, f"shows the object on {len(posed.silhouettes)} images only", "run `tumble check` to find out why"
+        )
+    return video_to_capture.write_folder(out, lambda partial: _write(posed, path, partial, options))
 
 
-def gather(path: Path, options: FootageOptions) -> Posed:
-    """The pictures that are used, evenly over the model's, with their outlines and the ball around the object.
+def collect_silhouettes(path: Path, options: FootageOptions) -> PosedImages:
+    """Silhouettes of at most `options.frames` images, evenly spaced in the model, and the sphere around the object.
 
     Raises:
-        BadFile: Model, pictures or masks break a rule, or the masks do not look at one object.
+        BadFile: Model, images or masks break a rule, or the masks do not show one object.
     """
     if lens := [n for n in ("focal", "fov", "fisheye", "distortion") if getattr(options, n) is not None]:
-        raise BadFile(path, f"has a COLMAP model, which knows the lens: --{lens[0]} contradicts it", "leave it out")
+        raise BadFile(
+            path, f"has a COLMAP model, which contains the lens: --{lens[0]} contradicts it", "leave that option out"
+        )
     model = colmap.read(path)
     root = path / "images" if (path / "images").is_dir() else path
     spread = np.linspace(0, len(model.views) - 1, min(options.frames, len(model.views))).round().astype(int)
-    outlines = [_silhouette(path, root, model.views[i], options) for i in spread]
-    seen = tuple(outline for outline in outlines if len(outline.rays))
-    empty = tuple(outline.view.name for outline in outlines if not len(outline.rays))
-    if not seen:
-        raise BadFile(path, "has masks, and all are empty", "white is the object; --invert-masks if it is black")
-    centre, radius, apart = ball(seen)
-    for outline in seen:
-        depth = outline.view.R_cam_world[2] @ centre + outline.view.t_cam_world[2]
+    candidates = [_silhouette(path, root, model.views[i], options) for i in spread]
+    silhouettes = tuple(silhouette for silhouette in candidates if len(silhouette.rays))
+    empty = tuple(silhouette.view.name for silhouette in candidates if not len(silhouette.rays))
+    if not silhouettes:
+        raise BadFile(path, "has only empty masks", "the object must be white; use --invert-masks if it is black")
+    centre, radius, ray_distance = bounding_sphere(silhouettes)
+    for silhouette in silhouettes:
+        depth = silhouette.view.R_cam_world[2] @ centre + silhouette.view.t_cam_world[2]
         if depth <= 1.05 * radius:
-            rule = "the mask does not show what the other masks show"
-            raise BadFile(outline.mask or outline.picture, rule, "poses and masks must be those of these pictures")
-    return Posed(model, root, seen, empty, centre, radius, apart)
+            rule = "the mask is inconsistent with the other masks"
+            raise BadFile(silhouette.mask or silhouette.image, rule, "poses and masks must belong to these images")
+    return PosedImages(model, root, silhouettes, empty, centre, radius, ray_distance)
 
 
-def ball(seen: tuple[Silhouette, ...]) -> tuple[Float64[np.ndarray, "3"], float, float]:
-    """Centre and radius of the smallest ball that reaches all rays, in the model's unit; and `Posed.apart`.
+def bounding_sphere(silhouettes: tuple[Silhouette, ...]) -> tuple[Float64[np.ndarray, "3"], float, float]:
+    """Centre and radius of the smallest sphere that reaches all rays [unit of the model], and their `ray_distance`.
 
-    A point of the surface that is the farthest is on the outline of the views across it, so over many views this is the
-    ball around the object, up to `ROOM`.
+    The surface point farthest from the centre lies on the contour in the views perpendicular to it, so with many views
+    this is the sphere around the object, up to `RADIUS_MARGIN`.
     """
-    starts = [-outline.view.R_cam_world.T @ outline.view.t_cam_world for outline in seen]
-    rays = [_unit(np.c_[o.rays, np.ones(len(o.rays))]) @ o.view.R_cam_world for o in seen]
-    middles = _unit(np.stack([direction.mean(0) for direction in rays]))
-    across = np.eye(3) - middles[:, :, None] * middles[:, None]
-    # Parallel rays meet nowhere: the least-squares answer stays finite.
-    centre = np.linalg.lstsq(across.sum(0), (across @ np.stack(starts)[..., None]).sum(0)[:, 0], rcond=None)[0]
-    apart = np.median(np.linalg.norm(_to_ray(centre, np.stack(starts), middles), axis=1))
-    far = np.linalg.norm(np.stack(starts) - centre, axis=1)
-    wide = [np.linalg.norm(r - middle, axis=1).max() for r, middle in zip(rays, middles, strict=True)]
+    starts = [-s.view.R_cam_world.T @ s.view.t_cam_world for s in silhouettes]
+    rays = [_unit(np.c_[s.rays, np.ones(len(s.rays))]) @ s.view.R_cam_world for s in silhouettes]
+    axes = _unit(np.stack([direction.mean(0) for direction in rays]))
+    P = np.eye(3) - axes[:, :, None] * axes[:, None]
+    # Least squares, because the solution stays finite for parallel rays, which do not intersect.
+    centre = np.linalg.lstsq(P.sum(0), (P @ np.stack(starts)[..., None]).sum(0)[:, 0], rcond=None)[0]
+    ray_distance = np.median(np.linalg.norm(_offsets_to_rays(centre, np.stack(starts), axes), axis=1))
+    distances = np.linalg.norm(np.stack(starts) - centre, axis=1)
+    radii = [np.linalg.norm(r - axis, axis=1).max() for r, axis in zip(rays, axes, strict=True)]
     start = np.repeat(np.stack(starts), [len(r) for r in rays], 0)
     direction = np.concatenate(rays)
 
     def offsets(x: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(_to_ray(x.numpy(), start, direction))
+        return torch.from_numpy(_offsets_to_rays(x.numpy(), start, direction))
 
-    found = smallest_ball(offsets, torch.from_numpy(centre), steps=SEARCH)
-    radius = float(offsets(found).norm(dim=-1).max())
-    return found.numpy(), ROOM * radius, float(apart / np.median(far * wide))
+    solution = smallest_enclosing_sphere(offsets, torch.from_numpy(centre), steps=SPHERE_STEPS)
+    radius = float(offsets(solution).norm(dim=-1).max())
+    return solution.numpy(), RADIUS_MARGIN * radius, float(ray_distance / np.median(distances * radii))
 
 
-def _to_ray(x: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """From a point to its feet on lines."""
-    off = start - x
-    return off - (off * direction).sum(1, keepdims=True) * direction
+def _offsets_to_rays(x: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Vectors from a point to the closest points of lines."""
+    offset = start - x
+    return offset - (offset * direction).sum(1, keepdims=True) * direction
 
 
 def _unit(x: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
-# Pictures -------------------------------------------------------------------------------------------------------------
+# Images ---------------------------------------------------------------------------------------------------------------
 
 
-def _silhouette(path: Path, root: Path, view: PosedPicture, options: FootageOptions) -> Silhouette:
-    picture = files.inside(root, view.name)
+def _silhouette(path: Path, root: Path, view: PosedImage, options: FootageOptions) -> Silhouette:
+    image = files.path_inside(root, view.name)
     folder = options.masks or (path / "masks" if (path / "masks").is_dir() else None)
-    mask = None if folder is None else mask_of(picture, folder / Path(view.name).parent)
-    labels = _seen(picture, mask, view, options)[1]
-    count, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == OBJECT).astype(np.uint8))
+    mask = None if folder is None else find_mask(image, folder / Path(view.name).parent)
+    labels = _read_image_and_mask(image, mask, view, options)[1]
+    count, ids, boxes, _ = cv2.connectedComponentsWithStats((labels == OBJECT).astype(np.uint8))
     areas = boxes[1:, cv2.CC_STAT_AREA]
     if count < 2:
-        return Silhouette(view, picture, mask, np.zeros((0, 2)), 0.0, False)
-    inside = np.isin(pieces, 1 + np.nonzero(areas >= PART * areas.max())[0])
+        return Silhouette(view, image, mask, np.zeros((0, 2)), 0.0, False)
+    inside = np.isin(ids, 1 + np.nonzero(areas >= MIN_PART_FRACTION * areas.max())[0])
     rows, columns = np.nonzero(inside)
     hull = cv2.convexHull(np.stack([columns, rows], -1).astype(np.int32))[:, 0].astype(np.float64)
-    cut = bool(inside[[0, -1]].any() or inside[:, [0, -1]].any())
+    cropped = bool(inside[[0, -1]].any() or inside[:, [0, -1]].any())
     diameter = 2 * math.sqrt(len(rows) / math.pi)
-    return Silhouette(view, picture, mask, view.optics.normalised(hull), diameter, cut)
+    return Silhouette(view, image, mask, view.optics.normalised(hull), diameter, cropped)
 
 
-def _seen(
-    picture: Path, mask: Path | None, view: PosedPicture, options: FootageOptions
+def _read_image_and_mask(
+    image: Path, mask: Path | None, view: PosedImage, options: FootageOptions
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """A picture as it was taken, and its mask."""
-    values = files.read_image(picture)
+    """An image as it was recorded, and its mask."""
+    values = files.read_image(image)
     if values.shape[:2] != (view.optics.height, view.optics.width):
-        found = f"is {values.shape[1]} x {values.shape[0]} pixels"
-        fix = "give the pictures that COLMAP saw"
-        raise BadFile(picture, f"{found}, its model says {view.optics.width} x {view.optics.height}", fix)
+        size = f"has {values.shape[1]} x {values.shape[0]} pixels"
+        fix = "give the images that COLMAP processed, at their size"
+        raise BadFile(image, f"{size}, but in the COLMAP model {view.optics.width} x {view.optics.height}", fix)
     colour = np.repeat(values, 3, 2) if values.shape[2] == 1 else np.ascontiguousarray(values[..., :3])
     if mask is not None:
         return colour, read_mask(mask, values, options.invert_masks)
     if values.shape[2] != 4:
-        fix = "masks/NAME.png beside images/, white object; the camera moves, so masks cannot be found by motion"
-        raise BadFile(picture, "has no mask", fix)
+        fix = "add masks/NAME.png beside images/, with a white object; the camera moves, so motion cannot segment it"
+        raise BadFile(image, "has no mask", fix)
     alpha = np.ascontiguousarray(values[..., 3])
     return colour, mask_from_alpha(255 - alpha if options.invert_masks else alpha)
 
 
-# The one camera -------------------------------------------------------------------------------------------------------
+# Common camera --------------------------------------------------------------------------------------------------------
 
 
-def turns(found: Posed, light: str) -> Float64[np.ndarray, "t 3 3"]:
-    """`R_new_cam` of every picture, which makes the camera look at the object."""
-    views = [outline.view for outline in found.seen]
-    forward = _unit(np.stack([view.R_cam_world @ found.centre + view.t_cam_world for view in views]))
+def camera_rotations(posed: PosedImages, light: str) -> Float64[np.ndarray, "t 3 3"]:
+    """Rotation `R_new_cam` per image that makes the camera look at the object.
+
+    If the light is fixed to the camera, all images get the same rotation.
+    """
+    views = [silhouette.view for silhouette in posed.silhouettes]
+    forward = _unit(np.stack([view.R_cam_world @ posed.centre + view.t_cam_world for view in views]))
     if light == "camera":
         forward = np.broadcast_to(_unit(forward.mean(0)), forward.shape)
     right = _unit(np.cross([0.0, 1.0, 0.0], forward))
     return np.stack([right, np.cross(forward, right), forward], 1)
 
 
-def camera(found: Posed, R_new_cam: Float64[np.ndarray, "t 3 3"], size: int) -> tuple[Camera, int]:
-    """The camera that holds all silhouettes, and how many pixels of the pictures go into one of its, along a side."""
-    corners = [np.c_[o.rays, np.ones(len(o.rays))] @ R.T for o, R in zip(found.seen, R_new_cam, strict=True)]
-    plane = np.concatenate([x[:, :2] / x[:, 2:] for x in corners])
+def common_camera(posed: PosedImages, R_new_cam: Float64[np.ndarray, "t 3 3"], size: int) -> tuple[Camera, int]:
+    """The camera whose image contains all silhouettes, and the oversampling factor for resampling to it.
+
+    The factor is the number of original pixels per pixel of this camera, along a side.
+    """
+    rays = [np.c_[s.rays, np.ones(len(s.rays))] @ R.T for s, R in zip(posed.silhouettes, R_new_cam, strict=True)]
+    plane = np.concatenate([x[:, :2] / x[:, 2:] for x in rays])
     low, high = plane.min(0), plane.max(0)
     low, high = low - video_to_capture.MARGIN * (high - low).max(), high + video_to_capture.MARGIN * (high - low).max()
-    native = float(np.median([outline.view.optics.K[0, 0] for outline in found.seen]))
+    native = float(np.median([silhouette.view.optics.K[0, 0] for silhouette in posed.silhouettes]))
     focal = min(size / float((high - low).max()), native)
     width, height = (max(math.ceil(focal * side - 1e-6), 8) for side in high - low)
     cx, cy = -focal * low
     return Camera(torch.tensor([focal, focal, cx, cy]).float(), height, width), max(1, round(native / focal))
 
 
-def frames(
-    found: Posed, R_new_cam: Float64[np.ndarray, "t 3 3"], glass: Camera, fine: int, options: FootageOptions
+def resampled_frames(
+    posed: PosedImages,
+    R_new_cam: Float64[np.ndarray, "t 3 3"],
+    camera: Camera,
+    oversampling: int,
+    options: FootageOptions,
 ) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]]:
-    """Pictures and masks through the new camera; what it sees beyond a picture's border is unknown."""
-    large = glass.resized(fine * glass.height, fine * glass.width)
-    for outline, R in zip(found.seen, R_new_cam, strict=True):
-        optics = outline.view.optics
-        colour, labels = _seen(outline.picture, outline.mask, outline.view, options)
-        undistorted = undistortion(optics.K, optics.distortion, large, fisheye=optics.fisheye, R_new_cam=R)
-        colour = undistorted(colour, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
-        labels = undistorted(labels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT, UNKNOWN)
-        picture = video_to_capture.developed(colour, np.ones(3), (glass.height, glass.width))
-        mask = small_mask(np.ascontiguousarray(labels), glass.height, glass.width)
-        yield np.where(mask[..., None] == BACKGROUND, np.uint8(0), picture), mask
+    """Images and masks as seen by the common camera; pixels beyond the border of an image are unknown."""
+    large = camera.resized(oversampling * camera.height, oversampling * camera.width)
+    for silhouette, R in zip(posed.silhouettes, R_new_cam, strict=True):
+        optics = silhouette.view.optics
+        colour, labels = _read_image_and_mask(silhouette.image, silhouette.mask, silhouette.view, options)
+        remap = undistortion(optics.K, optics.distortion, large, fisheye=optics.fisheye, R_new_cam=R)
+        colour = remap(colour, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        labels = remap(labels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT, UNKNOWN)
+        image = video_to_capture.resample(colour, np.ones(3), (camera.height, camera.width))
+        mask = downsample_mask(np.ascontiguousarray(labels), camera.height, camera.width)
+        yield np.where(mask[..., None] == BACKGROUND, np.uint8(0), image), mask
 
 
-def trajectory(found: Posed, R_new_cam: Float64[np.ndarray, "t 3 3"], light: str) -> Trajectory:
-    """Poses in the object's unit: its centre at the origin, its radius 1."""
-    R = np.stack([outline.view.R_cam_world for outline in found.seen])
-    t = np.stack([outline.view.t_cam_world for outline in found.seen])
-    x_cam = R @ found.centre + t
+def trajectory(posed: PosedImages, R_new_cam: Float64[np.ndarray, "t 3 3"], light: str) -> Trajectory:
+    """Poses in the object frame: the centre is the origin, the radius 1."""
+    R = np.stack([silhouette.view.R_cam_world for silhouette in posed.silhouettes])
+    t = np.stack([silhouette.view.t_cam_world for silhouette in posed.silhouettes])
+    x_cam = R @ posed.centre + t
     R_world_obj = _upright(R, -(R.mT @ x_cam[..., None])[..., 0]).T
     matrices = np.tile(np.eye(4), (len(R), 1, 1))
     matrices[:, :3, :3] = R_new_cam @ R @ R_world_obj
-    matrices[:, :3, 3] = (R_new_cam @ x_cam[..., None])[..., 0] / found.radius
+    matrices[:, :3, 3] = (R_new_cam @ x_cam[..., None])[..., 0] / posed.radius
     T_cam_obj = SE3.from_matrix(torch.from_numpy(matrices))
     return Trajectory(SE3(T_cam_obj.wxyz.float(), T_cam_obj.xyz.float()), "camera" if light == "camera" else "object")
 
 
-def _upright(R_cam_world: np.ndarray, places: np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """`R_obj_world`: +y up in the mean picture, and the first camera over the +z side.
+def _upright(R_cam_world: np.ndarray, positions: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """Rotation `R_obj_world` with +y up in the mean image and the first camera in the half plane of +z.
 
     Args:
-        R_cam_world: All cameras.
-        places: Of the cameras, from the object's centre.
+        R_cam_world: Rotations of all cameras.
+        positions: Camera positions relative to the object's centre.
     """
     up = -R_cam_world[:, 1].mean(0)
-    if np.linalg.norm(up) < LEVEL:
+    if np.linalg.norm(up) < MIN_UP_LENGTH:
         return np.eye(3)
     y = _unit(up)
-    side = places[0] - (places[0] @ y) * y
-    if np.linalg.norm(side) < 1e-3 * np.linalg.norm(places[0]):
+    side = positions[0] - (positions[0] @ y) * y
+    if np.linalg.norm(side) < 1e-3 * np.linalg.norm(positions[0]):
         side = np.cross(y, np.eye(3)[np.abs(y).argmin()])
     z = _unit(side)
     return np.stack([np.cross(y, z), y, z])
 
 
-def _write(found: Posed, path: Path, out: Path, options: FootageOptions) -> None:
-    R_new_cam = turns(found, options.light)
-    glass, fine = camera(found, R_new_cam, options.size)
-    matrices = trajectory(found, R_new_cam, options.light).camera_to_object().tolist()
+def _write(posed: PosedImages, path: Path, out: Path, options: FootageOptions) -> None:
+    R_new_cam = camera_rotations(posed, options.light)
+    camera, oversampling = common_camera(posed, R_new_cam, options.size)
+    matrices = trajectory(posed, R_new_cam, options.light).camera_to_object().tolist()
     entries: list[dict[str, Any]] = []
-    for i, (picture, mask) in enumerate(frames(found, R_new_cam, glass, fine, options)):
+    for i, (image, mask) in enumerate(resampled_frames(posed, R_new_cam, camera, oversampling, options)):
         name = f"{i:04d}.png"
-        files.write_png(out / "images" / name, picture)
+        files.write_png(out / "images" / name, image)
         files.write_png(out / "masks" / name, mask[..., None])
         entries.append(training_frame(name, matrices[i]))
     provenance = {
         "source": str(path),
-        **video_to_capture.origin(path, options),
-        "model": str(found.model.path),
-        "centre": found.centre.tolist(),
-        "radius": found.radius,
-        "without_object": found.empty,
+        **video_to_capture.footage_fingerprint(path, options),
+        "model": str(posed.model.path),
+        "centre": posed.centre.tolist(),
+        "radius": posed.radius,
+        "without_object": posed.empty,
         "frames": [
-            {"name": entry["file_path"], "source": o.view.name} for entry, o in zip(entries, found.seen, strict=True)
+            {"name": entry["file_path"], "source": s.view.name}
+            for entry, s in zip(entries, posed.silhouettes, strict=True)
         ],
     }
     files.write_json(out / video_to_capture.PROVENANCE, provenance)
-    document = capture_document(glass, options.light, entries, setting=None, with_light=False)
+    document = capture_document(camera, options.light, entries, setting=None, with_light=False)
     files.write_json(out / "transforms.json", document | {"focal_source": "model"})

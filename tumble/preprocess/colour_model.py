@@ -1,8 +1,9 @@
-"""How likely a pixel shows the object, the hand that holds it, or the background: colours, and the still backdrop.
+"""Per-pixel probability of object, hand and background, from colour histograms and the static background.
 
-Three histograms over CIE Lab, learnt as the film goes on, and a normal distribution about the backdrop where that is
-known. All are densities per cubic code value, so that they can be compared. The answers are combined by Bayes' rule
-with a prior from the frame before, and smoothed by a few rounds of mean field over neighbours of similar colour.
+There are three histograms over CIE Lab (object, hand, background), updated from frame to frame, and a normal
+distribution around the static background where that is known. All are densities per cubic code value, so that they can
+be compared. They are combined by Bayes' rule with a prior from the previous frame, and smoothed by mean-field
+iterations of a Markov random field whose neighbours are coupled if their colours are similar.
 """
 
 from dataclasses import dataclass
@@ -11,168 +12,191 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
-from tumble.preprocess.background import Backdrop, worst
+from tumble.preprocess.background import Background, channel_max
 
 BINS = (8, 32, 32)
-"""Of lightness, a and b: shading changes lightness most."""
+"""Number of bins for L, a and b; fewer for lightness, because shading changes it most."""
 BIN_VOLUME = 256.0**3 / (8 * 32 * 32)
-ANYTHING = 256.0**-3
-"""Density of a colour of which nothing is known."""
-NEW_OBJECT, NEW_HAND, NEW_BACKGROUND = 0.1, 0.02, 0.001
-"""Share of each class that has never been seen: the object shows new sides, the hand hardly, a still backdrop never."""
-SHADOW_PENALTY, DARKEST_SHADOW = 5.0, 0.55
-"""A shadow dims the backdrop to this at most; as a log likelihood it costs that much."""
-HAND_SHARE = 0.15
-"""Of what is not the object, this is expected to be hand."""
-UNSEEN = 0.35
-"""How often the background shows at a pixel where it was never found: mostly something is in front."""
-STRONGEST = 8.0
-"""Log odds that no pixel's evidence exceeds."""
-LEARNING = 0.05
+"""Volume of a bin [cubic code values]."""
+UNIFORM_DENSITY = 256.0**-3
+"""Density of the uniform distribution over all colours [1 / cubic code value]."""
+OBJECT_NOVELTY = 0.1
+"""Probability that a pixel of the object has a colour not learnt yet, or one of a background known only by colour."""
+HAND_NOVELTY = 0.02
+"""Probability that a pixel of the hand has a colour not learnt yet."""
+BACKGROUND_NOVELTY = 0.001
+"""Probability that a pixel of the static background has another colour; it hardly changes."""
+SHADOW_PENALTY = 5.0
+"""Penalty of the log likelihood for explaining a pixel by a shadow on the background."""
+MIN_SHADOW_RATIO = 0.55
+"""Darkest shadow: minimum ratio of a shaded code value to the unshaded one."""
+HAND_PRIOR = 0.15
+"""Prior probability of hand among the pixels that are not object."""
+UNKNOWN_BACKGROUND_PRIOR = 0.35
+"""Prior probability of background where the static background is unknown: mostly something covers it."""
+MAX_LOG_ODDS = 8.0
+"""Limit of the absolute log odds of a single pixel."""
+LEARNING_RATE = 0.05
 """Weight of a new frame in a histogram."""
-FIRST = 0.7
-"""Weight of the seed frame."""
-LEAST_PIXELS = 30
-"""Fewer pixels teach nothing."""
-SKIN = (40, 138, 85), (255, 175, 125)
-"""Least and largest Y, Cr, Cb of skin of all people: where the search for hands starts."""
-RIM, BESIDE = 2, 9
-"""How far inside a silhouette the backdrop is looked for: as far as the codec and a blur smear [pixels]; and the window
-from which the colour of the object beside it is taken."""
-ROUNDS, SMOOTHNESS, CONTRAST = 6, 1.2, 12.0
-"""Mean field: rounds; log odds from each of the four neighbours; difference of colour that parts neighbours [codes]."""
+SEED_WEIGHT = 0.7
+"""Weight of the seed frame in a histogram."""
+MIN_PIXELS = 30
+"""Minimum number of pixels of a class in a frame; fewer do not update its histogram."""
+SKIN_YCRCB = (40, 138, 85), (255, 175, 125)
+"""Lower and upper limit of Y, Cr, Cb of skin of all tones; wider than skin, because hands are searched for with it."""
+RIM_WIDTH = 2
+"""Width of the rim inside a silhouette that may be background: as far as codec and blur mix colours [pixels]."""
+NEIGHBOURHOOD = 9
+"""Side of the window over which the object's colour next to the rim is averaged [pixels]."""
+MEAN_FIELD_ITERATIONS = 6
+"""Number of mean-field iterations."""
+SMOOTHNESS = 1.2
+"""Coupling: log odds that each of the four neighbours contributes if it has the same colour."""
+CONTRAST = 12.0
+"""Standard deviation of the colour difference over which the coupling of neighbours decays [code values]."""
 
 
 @dataclass(frozen=True)
-class Colours:
-    """Densities of Lab colours; each is all zero until learnt."""
+class ColourModel:
+    """Densities of Lab colours per class; a density is all zero until it is learnt."""
 
     object: Float32[np.ndarray, "8 32 32"]
     hand: Float32[np.ndarray, "8 32 32"]
     background: Float32[np.ndarray, "8 32 32"]
 
-    def learn(
+    def updated(
         self,
         lab: UInt8[np.ndarray, "h w 3"],
         *,
         object: Bool[np.ndarray, "h w"],
         hand: Bool[np.ndarray, "h w"],
         background: Bool[np.ndarray, "h w"],
-        weight: float = LEARNING,
-    ) -> "Colours":
-        """With one more frame; classes too small to say anything stay as they are."""
+        weight: float = LEARNING_RATE,
+    ) -> "ColourModel":
+        """The model updated with one more frame; a class with fewer than `MIN_PIXELS` pixels stays unchanged."""
         old = (self.object, self.hand, self.background)
-        new = [_learnt(h, lab[where], weight) for h, where in zip(old, (object, hand, background), strict=True)]
-        return Colours(*new)
+        new = [
+            _updated_density(h, lab[where], weight) for h, where in zip(old, (object, hand, background), strict=True)
+        ]
+        return ColourModel(*new)
 
-    def hand_evidence(self, lab: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-        """Log likelihood ratio of hand against object, smoothed over three pixels."""
-        hand, thing = _looked_up(self.hand, NEW_HAND, lab), _looked_up(self.object, NEW_OBJECT, lab)
-        return cv2.blur(hand - thing, (3, 3))
+    def hand_log_ratio(self, lab: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+        """Log likelihood ratio of hand to object, averaged over 3 x 3 pixels."""
+        log_hand, log_object = (
+            _log_density(self.hand, HAND_NOVELTY, lab),
+            _log_density(self.object, OBJECT_NOVELTY, lab),
+        )
+        return cv2.blur(log_hand - log_object, (3, 3))
 
 
-def at_first() -> Colours:
-    """Nothing is known but how skin looks in general."""
+def initial_colours() -> ColourModel:
+    """The model before the first frame: a broad density of skin for the hand, nothing for the other classes."""
     empty = np.zeros(BINS, np.float32)
-    return Colours(empty, _skin(), empty)
+    return ColourModel(empty, _skin_density(), empty)
 
 
-def object_odds(
-    picture: UInt8[np.ndarray, "h w 3"],
+def object_log_odds(
+    image: UInt8[np.ndarray, "h w 3"],
     prior: Float32[np.ndarray, "h w"],
     hand: Bool[np.ndarray, "h w"],
-    backdrop: Backdrop,
-    colours: Colours,
+    background: Background,
+    colours: ColourModel,
 ) -> Float32[np.ndarray, "h w"]:
-    """Log odds of object against hand and background, pixel by pixel.
+    """Log odds of the object against hand and background, per pixel.
 
     Args:
-        prior: Probability of the object before the picture is looked at, inside (0, 1).
-        hand: What is hand whatever the backdrop says: a hand that holds still is part of the backdrop.
+        prior: Prior probability of the object, inside (0, 1).
+        hand: Pixels that are hand although they match the static background, which contains a hand that holds still.
     """
-    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
-    background = _looked_up(colours.background, NEW_OBJECT, lab)
-    still = backdrop.known & ~hand
-    background[still] = _about_backdrop(picture, backdrop)[still]
-    held = _looked_up(colours.hand, NEW_HAND, lab)
-    background += np.where(backdrop.known, 0, np.log(UNSEEN)).astype(np.float32)
-    other = np.logaddexp(np.log1p(-HAND_SHARE) + background, np.log(HAND_SHARE) + held)
-    odds = _looked_up(colours.object, NEW_OBJECT, lab) - other + np.log(prior) - np.log1p(-prior)
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    log_background = _log_density(colours.background, OBJECT_NOVELTY, lab)
+    static = background.known & ~hand
+    log_background[static] = _background_log_density(image, background)[static]
+    log_hand = _log_density(colours.hand, HAND_NOVELTY, lab)
+    log_background += np.where(background.known, 0, np.log(UNKNOWN_BACKGROUND_PRIOR)).astype(np.float32)
+    log_other = np.logaddexp(np.log1p(-HAND_PRIOR) + log_background, np.log(HAND_PRIOR) + log_hand)
+    odds = _log_density(colours.object, OBJECT_NOVELTY, lab) - log_other + np.log(prior) - np.log1p(-prior)
     odds[hand] = np.minimum(odds[hand], -1)
-    return odds.clip(-STRONGEST, STRONGEST).astype(np.float32)
+    return odds.clip(-MAX_LOG_ODDS, MAX_LOG_ODDS).astype(np.float32)
 
 
-def smoothed(odds: Float32[np.ndarray, "h w"], picture: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Probability of the object when neighbours of similar colour agree more often than not (mean field of an MRF)."""
-    colour = picture.astype(np.float32)
+def mean_field_probability(
+    odds: Float32[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "h w"]:
+    """Probability of the object after mean-field smoothing, which couples neighbours of similar colour."""
+    colour = image.astype(np.float32)
     right, below = np.diff(colour, axis=1), np.diff(colour, axis=0)
     across = SMOOTHNESS * np.exp(-_dot(right, right) / (2 * CONTRAST**2))
     down = SMOOTHNESS * np.exp(-_dot(below, below) / (2 * CONTRAST**2))
-    votes = np.tanh(odds / 2)
-    for _ in range(ROUNDS):
+    spin = np.tanh(odds / 2)
+    for _ in range(MEAN_FIELD_ITERATIONS):
         field = odds.copy()
-        field[:, 1:] += across * votes[:, :-1]
-        field[:, :-1] += across * votes[:, 1:]
-        field[1:] += down * votes[:-1]
-        field[:-1] += down * votes[1:]
-        votes = np.tanh(field / 2)
-    return 0.5 + 0.5 * votes
+        field[:, 1:] += across * spin[:, :-1]
+        field[:, :-1] += across * spin[:, 1:]
+        field[1:] += down * spin[:-1]
+        field[:-1] += down * spin[1:]
+        spin = np.tanh(field / 2)
+    return 0.5 + 0.5 * spin
 
 
-def trimmed(
-    inside: Bool[np.ndarray, "h w"], picture: UInt8[np.ndarray, "h w 3"], backdrop: Backdrop
+def trim_rim(
+    inside: Bool[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"], background: Background
 ) -> Bool[np.ndarray, "h w"]:
-    """The object without those pixels of its rim that look more like the backdrop than like the object beside them.
+    """The silhouette without rim pixels whose colour is closer to the background than to the object nearby.
 
-    A pixel of which a tenth shows the object differs from a still backdrop: without this, silhouettes are too wide.
+    A pixel of which a tenth is object differs from a static background already, so untrimmed silhouettes are too wide.
     """
-    core = cv2.erode(inside.astype(np.float32), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM + 1,) * 2))
-    shown, share = picture.astype(np.float32), cv2.blur(core, (BESIDE, BESIDE))
-    beside = cv2.blur(shown * core[..., None], (BESIDE, BESIDE)) / np.maximum(share, 1e-6)[..., None]
-    from_object, from_backdrop = shown - beside, shown - backdrop.picture
-    nearer = _dot(from_backdrop, from_backdrop) < _dot(from_object, from_object)
-    return inside & ~((core == 0) & (share > 0) & backdrop.known & nearer)
+    core = cv2.erode(inside.astype(np.float32), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_WIDTH + 1,) * 2))
+    colour, weight = image.astype(np.float32), cv2.blur(core, (NEIGHBOURHOOD, NEIGHBOURHOOD))
+    nearby = cv2.blur(colour * core[..., None], (NEIGHBOURHOOD, NEIGHBOURHOOD)) / np.maximum(weight, 1e-6)[..., None]
+    to_object, to_background = colour - nearby, colour - background.image
+    closer = _dot(to_background, to_background) < _dot(to_object, to_object)
+    return inside & ~((core == 0) & (weight > 0) & background.known & closer)
 
 
-def skin_coloured(picture: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the colour of skin; wood and cardboard, too."""
-    return cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb), *SKIN) > 0
+def skin_coloured(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels in the colour range of skin, which includes wood and cardboard."""
+    return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb), *SKIN_YCRCB) > 0
 
 
-def _about_backdrop(picture: np.ndarray, backdrop: Backdrop) -> Float32[np.ndarray, "h w"]:
-    """Log density of the picture's colours when the backdrop, or a shadow on it, is seen."""
-    seen = cv2.GaussianBlur(picture, (3, 3), 0).astype(np.float32)
-    still = cv2.GaussianBlur(backdrop.picture, (3, 3), 0).astype(np.float32)
-    scale = -3 * np.log(backdrop.noise * np.sqrt(2 * np.pi))
-    lit = scale - _deviation(seen - still, backdrop.noise)
-    dimming = (_dot(seen, still) / np.maximum(_dot(still, still), 1)).clip(DARKEST_SHADOW, 1)
-    shaded = scale - SHADOW_PENALTY - _deviation(seen - dimming[..., None] * still, backdrop.noise)
-    return np.logaddexp(np.maximum(lit, shaded), np.log(NEW_BACKGROUND * ANYTHING)).astype(np.float32)
+def _background_log_density(image: np.ndarray, background: Background) -> Float32[np.ndarray, "h w"]:
+    """Log density of the image's colours, given the static background with or without a shadow on it."""
+    colour = cv2.GaussianBlur(image, (3, 3), 0).astype(np.float32)
+    unshaded = cv2.GaussianBlur(background.image, (3, 3), 0).astype(np.float32)
+    scale = -3 * np.log(background.noise * np.sqrt(2 * np.pi))
+    lit = scale - _half_squared_deviation(colour - unshaded, background.noise)
+    dimming = (_dot(colour, unshaded) / np.maximum(_dot(unshaded, unshaded), 1)).clip(MIN_SHADOW_RATIO, 1)
+    shaded = scale - SHADOW_PENALTY - _half_squared_deviation(colour - dimming[..., None] * unshaded, background.noise)
+    return np.logaddexp(np.maximum(lit, shaded), np.log(BACKGROUND_NOVELTY * UNIFORM_DENSITY)).astype(np.float32)
 
 
-def _deviation(difference: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Half the squared deviation, of the worst channel."""
-    return 0.5 * np.square(worst(np.abs(difference)) / noise)
+def _half_squared_deviation(difference: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Half the squared deviation in units of the noise, maximum over the channels."""
+    return 0.5 * np.square(channel_max(np.abs(difference)) / noise)
 
 
-def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.einsum("hwc,hwc->hw", one, other)
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("hwc,hwc->hw", a, b)
 
 
-def _looked_up(density: np.ndarray, new: float, lab: np.ndarray) -> Float32[np.ndarray, "h w"]:
-    table = np.log((1 - new) * density + new * ANYTHING) if density.any() else np.full(BINS, np.log(ANYTHING))
+def _log_density(density: np.ndarray, novelty: float, lab: np.ndarray) -> Float32[np.ndarray, "h w"]:
+    table = (
+        np.log((1 - novelty) * density + novelty * UNIFORM_DENSITY)
+        if density.any()
+        else np.full(BINS, np.log(UNIFORM_DENSITY))
+    )
     return table[lab[..., 0] >> 5, lab[..., 1] >> 3, lab[..., 2] >> 3].astype(np.float32)
 
 
-def _learnt(density: np.ndarray, lab: Shaped[np.ndarray, "m 3"], weight: float) -> np.ndarray:
-    if len(lab) < LEAST_PIXELS:
+def _updated_density(density: np.ndarray, lab: Shaped[np.ndarray, "m 3"], weight: float) -> np.ndarray:
+    if len(lab) < MIN_PIXELS:
         return density
-    new = _histogram(lab)
+    new = _density(lab)
     return (1 - weight) * density + weight * new if density.any() else new
 
 
-def _histogram(lab: Shaped[np.ndarray, "m 3"]) -> Float32[np.ndarray, "8 32 32"]:
-    """Density, spread to neighbouring bins."""
+def _density(lab: Shaped[np.ndarray, "m 3"]) -> Float32[np.ndarray, "8 32 32"]:
+    """Normalised histogram of colours, smoothed over neighbouring bins."""
     bins = np.ravel_multi_index((lab[:, 0] >> 5, lab[:, 1] >> 3, lab[:, 2] >> 3), BINS)
     counts = np.bincount(bins, minlength=8 * 32 * 32).reshape(BINS).astype(np.float32)
     smooth = np.stack([cv2.GaussianBlur(layer, (0, 0), 0.7, borderType=cv2.BORDER_REPLICATE) for layer in counts])
@@ -181,11 +205,11 @@ def _histogram(lab: Shaped[np.ndarray, "m 3"]) -> Float32[np.ndarray, "8 32 32"]
     return smooth / (smooth.sum() * np.float32(BIN_VOLUME))
 
 
-def _skin() -> Float32[np.ndarray, "8 32 32"]:
-    """A broad density of skin, for hands that no frame has shown apart from the object."""
+def _skin_density() -> Float32[np.ndarray, "8 32 32"]:
+    """A broad density of skin colours, for hands that are not yet seen apart from the object."""
     width = np.array([32, 8, 8], np.uint8)
     codes = np.indices(BINS, np.uint8).reshape(3, -1).T * width + width // 2
     rgb = cv2.cvtColor(codes[None], cv2.COLOR_LAB2RGB)
-    # Lab holds colours that no screen shows; those do not come back.
-    real = np.abs(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[0].astype(int) - codes).max(-1) < 6
-    return _histogram(codes[skin_coloured(rgb)[0] & real])
+    # Lab colours outside the sRGB gamut do not survive the round trip.
+    in_gamut = np.abs(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[0].astype(int) - codes).max(-1) < 6
+    return _density(codes[skin_coloured(rgb)[0] & in_gamut])

@@ -1,9 +1,9 @@
-"""What a camera left behind: a film, or a folder of pictures, as one sequence of upright frames with masks and lens.
+"""Footage: a video or a folder of images, read as a sequence of upright frames with masks and one lens.
 
-A folder of pictures is sorted by the numbers in its names, so that `frame10` follows `frame9`; with a subfolder
-`images/`, that is meant, and `masks/` beside it. Masks of a film are a folder of pictures, one per frame in order.
-Masks of pictures have the picture's stem (`0001.png`) or, as COLMAP names them, its whole name (`0001.jpg.png`). A
-picture's alpha channel is its mask when no other is given.
+The images of a folder are sorted by the numbers in their names, so that `frame10` follows `frame9`. If the folder has a
+subfolder `images/`, the images are taken from there, and the masks from `masks/` beside it. Masks of a video are a
+folder of images, one per frame in order. A mask of an image has the stem of its name (`0001.png`) or, as in COLMAP, its
+whole name (`0001.jpg.png`). Without other masks the alpha channel of an image is its mask.
 """
 
 import math
@@ -20,34 +20,41 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from tumble.io import BadFile, files, video
-from tumble.scene import Camera, decoded_mask, mask_from_alpha, undistortion
+from tumble.scene import Camera, decode_mask, mask_from_alpha, undistortion
 
-PICTURES = (".png", ".jpg", ".jpeg")
-"""Endings of pictures read from folders."""
-FILM_DIAGONAL = math.hypot(36, 24)
-"""Of the 35 mm film that equivalent focal lengths are stated for [mm]."""
-GUESSED_FOCAL = 28.0
-"""Equivalent focal length of a phone's main camera while it films [mm]: 24 to 26 on photographs, then cropped."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""File endings of the images that are read from folders."""
+FULL_FRAME_DIAGONAL = math.hypot(36, 24)
+"""Diagonal of 35 mm film, to which equivalent focal lengths refer [mm]."""
+DEFAULT_EQUIVALENT_FOCAL = 28.0
+"""Assumed 35 mm equivalent focal length of a phone's main camera in video mode [mm]; photos have 24 to 26, videos are
+cropped."""
 EQUIVALENT_FOCAL_TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
-"""The one tag of films that names the lens; most cameras write none."""
-EXIF_ORIENTATION, EXIF_IFD, EXIF_EQUIVALENT_FOCAL = 0x0112, 0x8769, 0xA405
-TURNS = ((0, False), (0, False), (0, True), (2, False), (2, True), (3, True), (3, False), (1, True), (1, False))
-"""EXIF orientations 0 (none said) to 8 as quarter turns counter-clockwise, then a mirror left to right."""
+"""The only metadata tag of videos that states the focal length; most cameras write none."""
+EXIF_ORIENTATION = 0x0112
+"""EXIF tag of the orientation."""
+EXIF_IFD = 0x8769
+"""EXIF tag of the directory that holds the camera's settings."""
+EXIF_EQUIVALENT_FOCAL = 0xA405
+"""EXIF tag of the focal length in 35 mm equivalent [mm]."""
+ORIENTATIONS = ((0, False), (0, False), (0, True), (2, False), (2, True), (3, True), (3, False), (1, True), (1, False))
+"""Per EXIF orientation 0 (not stated) to 8: number of quarter turns counter-clockwise, and whether to mirror left to
+right after them."""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """A film or a folder of pictures, opened but not read."""
+    """An opened video or folder of images; no frame is read yet."""
 
     path: Path
-    pictures: tuple[Path, ...]
-    """Of a folder, in order; empty for a film."""
+    images: tuple[Path, ...]
+    """Images of a folder, in order; empty for a video."""
     masks: tuple[Path, ...]
-    """One per frame, or empty."""
+    """Mask files, one per frame, or empty."""
     equivalent_focal: float | None
-    """From the metadata [mm on 35 mm film]."""
+    """35 mm equivalent focal length from the metadata [mm]."""
     hdr: str | None
-    """"PQ" or "HLG" when the film's code values are not sRGB."""
+    """"PQ" or "HLG" if the code values of the video are not sRGB."""
 
 
 @dataclass(frozen=True)
@@ -55,71 +62,71 @@ class FootageFrame:
     """One upright frame."""
 
     number: int
-    """Counted from 0 in the footage."""
+    """Number of the frame in the footage, counted from 0."""
     time: float
-    """[s]; of pictures, their number at 30 per second."""
-    picture: UInt8[np.ndarray, "h w 3"]
+    """Time in the video [s]; the frames of an image folder are 1/30 s apart."""
+    image: UInt8[np.ndarray, "h w 3"]
     """sRGB code values."""
     mask: UInt8[np.ndarray, "h w"] | None
-    """OBJECT, UNKNOWN or BACKGROUND, where one is given."""
+    """OBJECT, UNKNOWN or BACKGROUND; None if there is no mask."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The pinhole camera that the footage is turned into, and how."""
+    """The pinhole camera to which the footage is undistorted."""
 
     camera: Camera
     source: Literal["given", "metadata", "guess"]
-    """Where the focal length is from."""
+    """Where the focal length is from; "guess" is the default for phones."""
     undistort: Callable[[np.ndarray, int], np.ndarray] | None
-    """Maps a picture, by an OpenCV interpolation, to what the pinhole camera sees; None when it is one already."""
+    """Resamples an image to the pinhole camera, given an OpenCV interpolation flag; None if there is no distortion."""
 
 
 def open_footage(path: Path, masks: Path | None = None) -> Footage:
-    """The footage at a path, with masks from a folder.
+    """Open the footage at a path, with masks from a folder.
 
     Raises:
-        BadFile: Nothing readable there, or not one mask per frame.
+        BadFile: The footage cannot be read, or the number of masks differs from the number of images.
     """
     if not path.is_dir():
-        film = video.probe(path)
-        mask_files = () if masks is None else _pictures_in(masks)
-        return Footage(path, (), mask_files, _positive(film.tags.get(EQUIVALENT_FOCAL_TAG)), film.hdr)
+        header = video.probe(path)
+        mask_files = () if masks is None else _list_images(masks)
+        return Footage(path, (), mask_files, _positive_number(header.tags.get(EQUIVALENT_FOCAL_TAG)), header.hdr)
     with_images = (path / "images").is_dir()
-    pictures = _pictures_in(path / "images" if with_images else path)
+    images = _list_images(path / "images" if with_images else path)
     masks = path / "masks" if masks is None and with_images and (path / "masks").is_dir() else masks
-    mask_files = () if masks is None else tuple(mask_of(picture, masks) for picture in pictures)
-    with Image.open(pictures[0]) as first:
-        stated = first.getexif().get_ifd(EXIF_IFD).get(EXIF_EQUIVALENT_FOCAL)
-    return Footage(path, pictures, mask_files, _positive(stated), None)
+    mask_files = () if masks is None else tuple(find_mask(image, masks) for image in images)
+    with Image.open(images[0]) as first:
+        equivalent_focal = first.getexif().get_ifd(EXIF_IFD).get(EXIF_EQUIVALENT_FOCAL)
+    return Footage(path, images, mask_files, _positive_number(equivalent_focal), None)
 
 
-def frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[FootageFrame]:
-    """All frames, one at a time.
+def read_frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[FootageFrame]:
+    """Read all frames, one at a time.
 
     Raises:
-        BadFile: A frame cannot be read or differs in size from the first, a mask is missing or of another size.
+        BadFile: A frame cannot be read or differs in size from the first; a mask is missing or has another size.
     """
-    source = _films_frames(footage) if not footage.pictures else _folders_frames(footage, invert_masks)
+    source = _video_frames(footage) if not footage.images else _image_frames(footage, invert_masks)
     shape, number = None, -1
-    for number, (time, picture, mask) in enumerate(source):
-        shape = shape or picture.shape
-        if picture.shape != shape:
-            name = footage.pictures[number] if footage.pictures else footage.path
-            found = f"frame {number} is {picture.shape[1]} x {picture.shape[0]}, the first {shape[1]} x {shape[0]}"
-            raise BadFile(name, found, "all frames come from one camera in one mode")
+    for number, (time, image, mask) in enumerate(source):
+        shape = shape or image.shape
+        if image.shape != shape:
+            name = footage.images[number] if footage.images else footage.path
+            rule = f"frame {number} has {image.shape[1]} x {image.shape[0]} pixels, the first {shape[1]} x {shape[0]}"
+            raise BadFile(name, rule, "all frames must be from one camera in one mode")
         if footage.masks:
             if number >= len(footage.masks):
-                rule = f"holds {len(footage.masks)} masks, the film has more frames"
-                raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the film, in order")
-            mask = read_mask(footage.masks[number], picture, invert_masks)
-        yield FootageFrame(number, time, picture, mask)
-    if footage.masks and not footage.pictures and number + 1 < len(footage.masks):
-        rule = f"holds {len(footage.masks)} masks, the film has {number + 1} frames"
-        raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the film, in order")
+                rule = f"holds {len(footage.masks)} masks, but the video has more frames"
+                raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the video, in order")
+            mask = read_mask(footage.masks[number], image, invert_masks)
+        yield FootageFrame(number, time, image, mask)
+    if footage.masks and not footage.images and number + 1 < len(footage.masks):
+        rule = f"holds {len(footage.masks)} masks, but the video has {number + 1} frames"
+        raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the video, in order")
 
 
-def lens(
+def resolve_lens(
     footage: Footage,
     height: int,
     width: int,
@@ -129,23 +136,23 @@ def lens(
     fisheye: tuple[float, ...] | None,
     distortion: tuple[float, ...] | None,
 ) -> Lens:
-    """The camera of the footage: as given, else from its metadata, else a phone's (28 mm on 35 mm film).
+    """The camera of the footage: from the options, else from its metadata, else a phone's (28 mm equivalent).
 
-    Metadata and guess are for the whole picture, so they are off when the film was cropped after it was taken.
+    Focal lengths from metadata and the default refer to the full image, so they are wrong for footage that was cropped.
 
     Args:
-        height: Of the upright frames [pixels].
-        width: [pixels]
-        focal: [pixels]
-        fov: Horizontal field of view [degrees], used when `focal` is None.
+        height: Height of the upright frames [pixels].
+        width: Width of the upright frames [pixels].
+        focal: Focal length [pixels].
+        fov: Horizontal field of view [degrees]; used if `focal` is None.
         fisheye: OpenCV's fisheye coefficients k1 k2 k3 k4; zeros are the ideal equidistant lens.
-        distortion: OpenCV's k1 k2 p1 p2 [k3].
+        distortion: OpenCV's coefficients k1 k2 p1 p2 [k3].
 
     Raises:
-        ValueError: Contradicting or impossible arguments.
+        ValueError: The arguments contradict each other or are out of range.
     """
     if fisheye is not None and distortion is not None:
-        raise ValueError("--fisheye and --distortion are two lens models: give one")
+        raise ValueError("--fisheye and --distortion are different lens models: give only one of them")
     if fov is not None and not 1 <= fov <= (179 if fisheye is None else 240):
         raise ValueError(f"--fov is out of range: {fov:g} degrees")
     if focal is not None and not focal > 0:
@@ -156,85 +163,85 @@ def lens(
         focal = 0.5 * width / (math.tan(half) if fisheye is None else half)
     if focal is None:
         source = "guess" if footage.equivalent_focal is None else "metadata"
-        focal = (footage.equivalent_focal or GUESSED_FOCAL) / FILM_DIAGONAL * math.hypot(width, height)
+        focal = (footage.equivalent_focal or DEFAULT_EQUIVALENT_FOCAL) / FULL_FRAME_DIAGONAL * math.hypot(width, height)
     camera = Camera(torch.tensor([focal, focal, width / 2, height / 2]), height, width)
     coefficients = fisheye if fisheye is not None else distortion
     if coefficients is None:
         return Lens(camera, source, None)
-    bent = np.array(coefficients, np.float64)
-    return Lens(camera, source, undistortion(camera.opencv_matrix, bent, camera, fisheye=fisheye is not None))
+    values = np.array(coefficients, np.float64)
+    return Lens(camera, source, undistortion(camera.opencv_matrix, values, camera, fisheye=fisheye is not None))
 
 
-def _positive(stated: object) -> float | None:
+def _positive_number(text: object) -> float | None:
     try:
-        value = float(str(stated))
+        value = float(str(text))
     except ValueError:
         return None
     return value if math.isfinite(value) and value > 0 else None
 
 
-def _pictures_in(path: Path) -> tuple[Path, ...]:
+def _list_images(path: Path) -> tuple[Path, ...]:
     if not path.is_dir():
         raise BadFile(path, "is missing" if not path.exists() else "is not a folder")
-    found = sorted((p for p in path.iterdir() if p.suffix.lower() in PICTURES), key=_by_numbers)
-    if not found:
-        raise BadFile(path, "holds no pictures", f"known endings: {', '.join(PICTURES)}")
-    for one, other in pairwise(found):
-        if one.stem == other.stem:
-            raise BadFile(path, f"holds both {one.name} and {other.name}", "keep one of them")
-    return tuple(found)
+    images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key)
+    if not images:
+        raise BadFile(path, "holds no images", f"known file endings: {', '.join(IMAGE_SUFFIXES)}")
+    for a, b in pairwise(images):
+        if a.stem == b.stem:
+            raise BadFile(path, f"holds both {a.name} and {b.name}", "keep one of them")
+    return tuple(images)
 
 
-def _by_numbers(path: Path) -> list[tuple[int, int, str]]:
+def _natural_key(path: Path) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", path.name)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
-def mask_of(picture: Path, masks: Path) -> Path:
-    """The mask of a picture, by its stem or its whole name.
+def find_mask(image: Path, masks: Path) -> Path:
+    """Path of the mask of an image, named by its stem or its whole name.
 
     Raises:
-        BadFile: There is none.
+        BadFile: There is no such mask.
     """
-    names = [picture.stem + ending for ending in PICTURES] + [picture.name + ".png"]
+    names = [image.stem + ending for ending in IMAGE_SUFFIXES] + [image.name + ".png"]
     for name in names:
         if (masks / name).is_file():
             return masks / name
-    raise BadFile(masks, f"has no mask for {picture.name}", f"name it {names[0]} or {names[-1]}")
+    raise BadFile(masks, f"has no mask for {image.name}", f"name the mask {names[0]} or {names[-1]}")
 
 
-def _films_frames(footage: Footage) -> Iterator[tuple[float, np.ndarray, None]]:
-    for time, picture in video.timed_frames(footage.path):
-        yield time, picture, None
+def _video_frames(footage: Footage) -> Iterator[tuple[float, np.ndarray, None]]:
+    for time, image in video.timed_frames(footage.path):
+        yield time, image, None
 
 
-def _folders_frames(footage: Footage, invert: bool) -> Iterator[tuple[float, np.ndarray, np.ndarray | None]]:
-    for number, path in enumerate(footage.pictures):
+def _image_frames(footage: Footage, invert: bool) -> Iterator[tuple[float, np.ndarray, np.ndarray | None]]:
+    for number, path in enumerate(footage.images):
         values = _upright(path, files.read_image(path))
         mask = None
         if values.shape[2] == 4:
             alpha = np.ascontiguousarray(values[..., 3])
             mask = mask_from_alpha(255 - alpha if invert else alpha)
-        picture = np.repeat(values, 3, 2) if values.shape[2] == 1 else np.ascontiguousarray(values[..., :3])
-        yield number / video.FPS, picture, mask
+        image = np.repeat(values, 3, 2) if values.shape[2] == 1 else np.ascontiguousarray(values[..., :3])
+        yield number / video.FPS, image, mask
 
 
 def _upright(path: Path, values: np.ndarray) -> np.ndarray:
-    with Image.open(path) as picture:
-        said = picture.getexif().get(EXIF_ORIENTATION, 1)
-    turns, mirror = TURNS[said] if said in range(len(TURNS)) else TURNS[1]
-    turned = np.rot90(values, turns)
-    return np.ascontiguousarray(turned[:, ::-1] if mirror else turned)
+    with Image.open(path) as image:
+        orientation = image.getexif().get(EXIF_ORIENTATION, 1)
+    quarter_turns, mirror = ORIENTATIONS[orientation] if orientation in range(len(ORIENTATIONS)) else ORIENTATIONS[1]
+    rotated = np.rot90(values, quarter_turns)
+    return np.ascontiguousarray(rotated[:, ::-1] if mirror else rotated)
 
 
-def read_mask(path: Path, picture: UInt8[np.ndarray, "h w c"], invert: bool) -> UInt8[np.ndarray, "h w"]:
-    """A mask of a picture's size as OBJECT, UNKNOWN and BACKGROUND.
+def read_mask(path: Path, image: UInt8[np.ndarray, "h w c"], invert: bool) -> UInt8[np.ndarray, "h w"]:
+    """Read a mask with the size of an image, as OBJECT, UNKNOWN and BACKGROUND.
 
     Raises:
-        BadFile: It cannot be read or is of another size.
+        BadFile: The mask cannot be read or has another size.
     """
     mask = np.ascontiguousarray(files.read_image(path)[..., -1])
-    if mask.shape != picture.shape[:2]:
-        found = f"is {mask.shape[1]} x {mask.shape[0]} pixels"
-        raise BadFile(path, f"{found}, its frame is {picture.shape[1]} x {picture.shape[0]}", "masks are upright, too")
-    return decoded_mask(mask, invert=invert)
+    if mask.shape != image.shape[:2]:
+        rule = f"has {mask.shape[1]} x {mask.shape[0]} pixels, its frame {image.shape[1]} x {image.shape[0]}"
+        raise BadFile(path, rule, "masks must be as large as the upright frames")
+    return decode_mask(mask, invert=invert)

@@ -1,10 +1,10 @@
-"""Which frames to keep: one per few degrees of the object's turning, the sharpest of those at hand.
+"""Keyframe selection: one frame per few degrees of rotation of the object, the sharpest of the candidates.
 
-For a ball of radius r in pixels that turns by a small angle, about whatever axis, half of its disc moves by more than
-r angle / sqrt(2) pixels: about an axis in the picture plane the motion is angle * depth, about the line of sight
-angle * distance from the centre, and depth and distance both have the median r / sqrt(2) over a disc. So the median
-optical flow inside the silhouette, less the silhouette's own shift, measures the turn, roughly: a long or flat object
-is not a ball, and flow is blind on a surface without texture.
+The rotation is estimated from optical flow. When a sphere with radius r [pixels] rotates by a small angle about any
+axis, the median displacement over its disc is r angle / sqrt(2): about an axis in the image plane the displacement is
+angle * depth, about the optical axis it is angle * distance from the centre, and over a disc both depth and distance
+have the median r / sqrt(2). So the median flow inside the silhouette, minus the translation of the silhouette, measures
+the angle. It is a rough measure: a long or flat object is no sphere, and there is no flow on a surface without texture.
 """
 
 import math
@@ -14,110 +14,116 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-STEP = math.radians(8)
-"""Turn between kept frames [radians]; with the choice inside a window, 4 to 12 degrees."""
-FEW = 2
-"""Frames per window up to which all are kept: to thin so few saves little, and single turns are measured too roughly to
-say which would leave a gap."""
-ANCHOR = math.radians(3)
-"""Turns are measured from an earlier frame until they reach this, lest the noise of flow adds up [radians]."""
-TEXTURED = 12.0
-"""Least gradient by which flow is believed [code values / pixel]."""
+KEYFRAME_STEP = math.radians(8)
+"""Rotation between keyframes [radians]; with the choice inside each window, 4 to 12 degrees."""
+FRAMES_PER_WINDOW = 2
+"""If a video has at most this many usable frames per window, all are kept, because single rotation estimates are too
+rough to select from so few."""
+ANCHOR_ROTATION = math.radians(3)
+"""Rotations are measured from an anchor frame until they exceed this, so that the noise of flow does not accumulate
+[radians]."""
+MIN_GRADIENT = 12.0
+"""Minimum gradient of a pixel whose flow is used [code values / pixel]."""
 PROBE_BLUR = 1.0
-"""Of the picture before its edges are measured: keeps noise from passing for sharpness [pixels]."""
-FAINTEST = 1e-3
-"""Mean squared Laplacian below which there is nothing but rounding."""
-LEAST_PIXELS = 30
-"""Smaller silhouettes do not measure a turn."""
+"""Standard deviation of the blur before edges are measured, so that noise does not count as sharpness [pixels]."""
+MIN_LAPLACIAN = 1e-3
+"""Minimum mean squared Laplacian of a region with edges; below it there are only rounding errors."""
+MIN_PIXELS = 30
+"""Minimum number of pixels from which a rotation is estimated."""
 
 
-def turned(pictures: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]) -> Float64[np.ndarray, " t"]:
-    """How far the object has turned since the first frame, along its way [radians]; never falls."""
+def cumulative_rotation(
+    images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]
+) -> Float64[np.ndarray, " t"]:
+    """Angle by which the object has rotated since the first frame, summed along the path [radians]; never decreases."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    total, anchor, base = np.zeros(len(pictures)), 0, 0.0
-    grays = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
-    for i in range(1, len(pictures)):
-        angle = turn(dis, grays[anchor], grays[i], inside[anchor], inside[i])
+    total, anchor, base = np.zeros(len(images)), 0, 0.0
+    grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    for i in range(1, len(images)):
+        angle = rotation_between(dis, grays[anchor], grays[i], inside[anchor], inside[i])
         total[i] = max(total[i - 1], base + angle)
-        if angle > ANCHOR or inside[anchor].sum() < LEAST_PIXELS:
+        if angle > ANCHOR_ROTATION or inside[anchor].sum() < MIN_PIXELS:
             anchor, base = i, total[i]
     return total
 
 
-def turn(
+def rotation_between(
     dis: cv2.DISOpticalFlow,
-    one: UInt8[np.ndarray, "h w"],
-    other: UInt8[np.ndarray, "h w"],
-    inside_one: Bool[np.ndarray, "h w"],
-    inside_other: Bool[np.ndarray, "h w"],
+    gray_a: UInt8[np.ndarray, "h w"],
+    gray_b: UInt8[np.ndarray, "h w"],
+    inside_a: Bool[np.ndarray, "h w"],
+    inside_b: Bool[np.ndarray, "h w"],
 ) -> float:
-    """Angle between two frames [radians], small ones only; 0 where there is too little to see."""
-    x, y = cv2.Sobel(one, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(one, cv2.CV_32F, 0, 1, scale=1 / 8)
-    core = cv2.erode(inside_one.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    seen = core & (np.hypot(x, y) > TEXTURED)
-    if min(seen.sum(), inside_other.sum()) < LEAST_PIXELS:
+    """Small rotation of the object between two frames [radians]; 0 where there is too little texture to measure it."""
+    x, y = cv2.Sobel(gray_a, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray_a, cv2.CV_32F, 0, 1, scale=1 / 8)
+    core = cv2.erode(inside_a.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    textured = core & (np.hypot(x, y) > MIN_GRADIENT)
+    if min(textured.sum(), inside_b.sum()) < MIN_PIXELS:
         return 0.0
-    flow = dis.calc(one, other, np.zeros((*one.shape, 2), np.float32))[seen]
-    shift = _centre(inside_other) - _centre(inside_one)
-    radius = math.sqrt(float(inside_one.sum()) / math.pi)
+    flow = dis.calc(gray_a, gray_b, np.zeros((*gray_a.shape, 2), np.float32))[textured]
+    shift = _centre(inside_b) - _centre(inside_a)
+    radius = math.sqrt(float(inside_a.sum()) / math.pi)
     return float(np.median(np.linalg.norm(flow - shift, axis=-1))) * math.sqrt(2) / radius
 
 
-def edges(picture: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 2"]:
-    """Squared gradient and squared Laplacian of the slightly blurred lightness: the food of `blur`."""
-    gray = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), PROBE_BLUR)
+def edge_energy(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 2"]:
+    """Squared gradient and squared Laplacian of the slightly blurred lightness: the input of `edge_blur`."""
+    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), PROBE_BLUR)
     x, y = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=1, scale=0.5), cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
     return np.stack([x * x + y * y, np.square(cv2.Laplacian(gray, cv2.CV_32F, ksize=1))], -1)
 
 
-def blur(energy: Float32[np.ndarray, "h w 2"], inside: Bool[np.ndarray, "h w"]) -> float:
-    """Width of the edges inside a mask, with the probe's own of 1 [pixels of the picture that `edges` saw].
+def edge_blur(energy: Float32[np.ndarray, "h w 2"], inside: Bool[np.ndarray, "h w"]) -> float:
+    """Blur of the edges inside a mask, including the blur of the probe (`PROBE_BLUR`) [pixels of the image].
 
-    An edge blurred by a Gaussian of deviation s has (integral of gradient^2) / (integral of second derivative^2) =
-    2 s^2, whatever its contrast. Fine texture gives less than 1. Infinite where there are no edges.
+    An edge blurred by a Gaussian of standard deviation s has (integral of gradient^2) / (integral of second
+    derivative^2) = 2 s^2 at any contrast. Fine texture gives less than 1. Infinite where there are no edges.
+
+    Args:
+        energy: From `edge_energy`.
     """
     gradient, laplacian = energy[inside].mean(0) if inside.any() else (0.0, 0.0)
-    if laplacian < FAINTEST:
+    if laplacian < MIN_LAPLACIAN:
         return math.inf
     return math.sqrt(float(gradient / laplacian) / 2)
 
 
-def chosen(
-    total: Float64[np.ndarray, " t"],
+def select_keyframes(
+    rotation: Float64[np.ndarray, " t"],
     blurs: Float64[np.ndarray, " t"],
     usable: Bool[np.ndarray, " t"],
     n_frames: int,
 ) -> list[int]:
-    """Indices of the frames to keep: the sharpest usable one in the middle half of every window of turning.
+    """Indices of the keyframes: in each window of rotation, the sharpest usable frame near its middle.
 
-    All usable ones of a film that has hardly more frames than windows.
+    All usable frames of a video that has hardly more frames than windows.
 
     Args:
-        total: From `turned`.
-        blurs: From `blur`.
-        usable: Frames whose mask is good enough.
-        n_frames: At most this many; the windows widen to fit.
+        rotation: From `cumulative_rotation` [radians].
+        blurs: From `edge_blur`.
+        usable: Frames with a reliable mask.
+        n_frames: Maximum number of keyframes; the windows widen accordingly.
     """
-    first, last = float(total[0]), float(total[-1])
-    count = max(min(round((last - first) / STEP) + 1, n_frames), 1)
-    every = [int(i) for i in np.nonzero(usable)[0]]
-    if len(every) <= min(FEW * count, n_frames):
-        return every
+    first, last = float(rotation[0]), float(rotation[-1])
+    count = max(min(round((last - first) / KEYFRAME_STEP) + 1, n_frames), 1)
+    candidates = [int(i) for i in np.nonzero(usable)[0]]
+    if len(candidates) <= min(FRAMES_PER_WINDOW * count, n_frames):
+        return candidates
     step = (last - first) / max(count - 1, 1)
     kept: list[int] = []
     for k in range(count):
-        aim = first + k * step
-        near = np.nonzero(usable & (np.abs(total - aim) <= step / 4))[0]
+        target = first + k * step
+        near = np.nonzero(usable & (np.abs(rotation - target) <= step / 4))[0]
         if not len(near):
-            near = np.nonzero(usable & (np.abs(total - aim) <= step / 2))[0]
+            near = np.nonzero(usable & (np.abs(rotation - target) <= step / 2))[0]
         if len(near):
             kept.append(int(near[np.argmin(blurs[near])]))
     return sorted(set(kept))
 
 
-def largest_step(total: Float64[np.ndarray, " t"], kept: list[int]) -> float:
-    """The widest turn between neighbouring kept frames [radians]."""
-    return max((float(total[j] - total[i]) for i, j in pairwise(kept)), default=0.0)
+def largest_step(rotation: Float64[np.ndarray, " t"], kept: list[int]) -> float:
+    """Largest rotation between consecutive keyframes [radians]."""
+    return max((float(rotation[j] - rotation[i]) for i, j in pairwise(kept)), default=0.0)
 
 
 def _centre(inside: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "2"]:

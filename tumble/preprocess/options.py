@@ -1,58 +1,63 @@
-"""How footage becomes a capture: the options of `tumble check` and `tumble run`. Loads nothing, for `--help`."""
+"""Options of `tumble check` and `tumble run` for converting footage to a capture.
+
+The docstrings of the fields are the help texts of the command line; each line of a docstring is a line there. The
+module imports nothing heavy, so that `--help` is fast.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-SURVEYED = 400
-"""Frames that the survey keeps at most: every second, every fourth, ... of a longer film."""
-LEAST_SIDE = 64
-"""Smaller footage shows nothing to reconstruct [pixels]."""
-LEAST_FRAMES = 3
-"""A capture has at least this many."""
+MAX_SURVEY_FRAMES = 400
+"""Maximum number of frames that the survey keeps; of a longer video every second, every fourth, ... frame is kept."""
+MIN_SIDE = 64
+"""Minimum of width and height of footage, and minimum of `--size` [pixels]."""
+MIN_FRAMES = 3
+"""Minimum number of frames of a capture."""
 
 
 @dataclass(frozen=True)
 class FootageOptions:
-    """How footage becomes a capture."""
+    """How a video or images are converted to a capture."""
 
     box: tuple[int, int, int, int] | None = None
-    """Left, top, width, height around the object on frame `at` [pixels]. Left out: what moves and is no skin."""
+    """Box around the object on frame `--at`: left, top, width, height [pixels]. Default: found by motion."""
     click: tuple[int, int] | None = None
-    """A pixel on the object on frame `at`, instead of a box: column, row."""
+    """A pixel on the object on frame `--at`, in place of a box: column, row [pixels]."""
     at: int = 0
-    """The frame that box or click are on, counted from 0."""
+    """Number of the frame to which the box or the click refers, counted from 0."""
     masks: Path | None = None
-    """Folder of masks: white object, black background, grey unknown; one per frame, in order or by name."""
+    """Folder of mask images, one per frame in order or by name: white object, black background, grey unknown."""
     invert_masks: bool = False
-    """The masks' object is black."""
+    """Invert the masks: black object, white background."""
     segmenter: Literal["grabcut", "sam2", "sam3"] = "grabcut"
-    """Who makes masks when none are given; sam2 and sam3 are your own installation, with `weights`."""
+    """Segmentation method if there are no masks. sam2, sam3: packages that you install; they need `--weights`."""
     weights: Path | None = None
-    """Checkpoint of sam2 or sam3."""
+    """Checkpoint file of sam2 or sam3."""
     focal: float | None = None
-    """Focal length in pixels of the film. Left out: from `fov`, else the metadata, else found with the poses, from a
-    guess (a phone's 28 mm)."""
+    """Focal length [pixels of the video]. Default: from `--fov` or the metadata, else estimated, starting at 28 mm."""
     fov: float | None = None
-    """Horizontal field of view [degrees]."""
+    """Horizontal field of view of the video [degrees]; an alternative to `--focal`."""
     fisheye: tuple[float, float, float, float] | None = None
-    """A fisheye lens: OpenCV's k1 k2 k3 k4, zeros for the ideal one."""
+    """Fisheye lens: OpenCV's coefficients k1 k2 k3 k4; four zeros are an ideal equidistant lens."""
     distortion: tuple[float, ...] | None = None
-    """A normal lens that bends lines: OpenCV's k1 k2 p1 p2 [k3]."""
+    """Lens distortion, if the lens is not a fisheye: OpenCV's coefficients k1 k2 p1 p2 [k3]."""
     light: Literal["object", "camera"] = "object"
-    """Pictures with poses by COLMAP: what the light stood still with. object: the camera went round the object; camera:
-    the object turned, and the background was masked. (A film's light always stands still with the camera.)"""
+    """Only for images with a COLMAP model: what the light was fixed to. object: the camera moved around the object.
+    camera: the object was turned in front of the camera, and the background was masked. (Videos: always the camera.)"""
     frames: int = 144
-    """Frames to keep at most."""
+    """Maximum number of frames in the capture."""
     size: int = 256
-    """Longer side of the frames to write [pixels]; never more than the film has."""
+    """Longer side of the capture's images [pixels]; they are never larger than in the video."""
 
     def __post_init__(self) -> None:
         if self.box is not None and self.click is not None:
-            raise ValueError("--box and --click are two ways to say the same: give one")
+            raise ValueError("--box and --click both mark the object: give only one of them")
         if self.box is not None and min(self.box[2:]) < 2:
-            raise ValueError(f"--box is left, top, width, height; this one is {self.box[2]} x {self.box[3]}")
+            raise ValueError(
+                f"--box is left, top, width, height, at least 2 x 2 pixels; this one is {self.box[2]} x {self.box[3]}"
+            )
         if self.segmenter != "grabcut" and self.weights is None:
-            raise ValueError(f"--segmenter {self.segmenter} needs --weights, the path of its checkpoint")
-        if not LEAST_FRAMES <= self.frames <= SURVEYED or not LEAST_SIDE <= self.size <= 4096:
-            raise ValueError(f"--frames is {LEAST_FRAMES} to {SURVEYED}, --size {LEAST_SIDE} to 4096")
+            raise ValueError(f"--segmenter {self.segmenter} needs --weights, the path of its checkpoint file")
+        if not MIN_FRAMES <= self.frames <= MAX_SURVEY_FRAMES or not MIN_SIDE <= self.size <= 4096:
+            raise ValueError(f"--frames must be {MIN_FRAMES} to {MAX_SURVEY_FRAMES}, and --size {MIN_SIDE} to 4096")

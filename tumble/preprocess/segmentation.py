@@ -1,13 +1,14 @@
-"""Which pixels show the object: masks from a box or a click on one frame, without trained weights.
+"""Video object segmentation from a box or a click on one frame, without trained weights.
 
-The camera stands still, so what differs from the *backdrop* is the object or the hand that holds it. On the *seed*
-frame a graph cut (GrabCut) finds the object in the box. From there the mask is carried forwards and backwards by
-optical flow (DIS): what it predicts is the prior of the next frame, and colours and backdrop decide (`appearance`).
-What moves and is not the object is unknown: a hand, a sleeve, a shadow. So is a band of pixels along the silhouette.
+The camera stands still, so pixels that differ from the static *background* are the object or the hand that holds it. On
+the *seed* frame GrabCut finds the object in the box. From there the mask is propagated forwards and backwards by
+optical flow (DIS): the warped mask is the prior of the next frame, and the colour model and the static background
+decide (`colour_model`). Moving pixels that are not object are unknown: a hand, a sleeve, a shadow. So is a band of
+pixels along the silhouette.
 
-What this cannot do: tell a hand from an object of its colour; find an edge between object and background of one colour
-where the backdrop was never seen; follow a hand that was in front of the object from the first frame on as anything but
-skin. Frames in which it is unsure say so in their *confidence*: the overlap of what flow predicts with what is found.
+Limits: a hand of the object's colour is not separated from it; there is no edge between object and background of one
+colour where the background is unknown; a hand in front of the object from the first frame on is found only by the
+colour of skin. The *confidence* of a frame is the overlap of the mask predicted by flow with the final mask.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,338 +20,371 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 
 from tumble.maths import iou
-from tumble.preprocess.background import Backdrop
-from tumble.preprocess.colour_model import FIRST, Colours, at_first, object_odds, skin_coloured, smoothed, trimmed
+from tumble.preprocess.background import Background
+from tumble.preprocess.colour_model import (
+    SEED_WEIGHT,
+    ColourModel,
+    initial_colours,
+    mean_field_probability,
+    object_log_odds,
+    skin_coloured,
+    trim_rim,
+)
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
-SURE_OVERLAP = 0.85
-"""Overlap (IoU) of predicted and found mask below which a frame is flagged."""
-SURE_AREA = 1.2
-"""Change of area from frame to frame above which a frame is flagged (the same)."""
+CERTAIN_OVERLAP = 0.85
+"""Minimum overlap (IoU) of predicted and final mask; a frame below is marked uncertain."""
+MAX_AREA_RATIO = 1.2
+"""Maximum ratio of the areas of consecutive masks; a frame beyond is marked uncertain."""
 LOST_OVERLAP = 0.4
-"""Below this the found mask is not believed: the object is taken for hidden."""
-LEAST_PIXELS = 30
-"""Smaller masks show nothing to track."""
-REACH = 0.06
-"""How far a silhouette may be off from its prediction, as a share of the square root of its area."""
-LEAST_PRIOR, LARGEST_PRIOR = 0.01, 0.98
-"""What flow alone can make sure of."""
-HAND_EVIDENCE = 1.5
-"""Log likelihood ratio of the hand's colours against the object's from which a pixel may be hand."""
-TOUCH = 3
-"""A hand lies at most this far from the object [pixels]."""
-MOVED_SHARE = 0.03
-"""Of a hand that holds almost still, the share of pixels that differ from the backdrop: its edges."""
-REACHES_IN, WALL = 0.1, 0.5
-"""Share of a hand, at least, that lies beyond where the object is expected; share of all there that no hand fills."""
-LEAST_MOVING = 0.1
-"""Share of the box that must differ from the backdrop for it to be of use there before the object is known."""
-OTHER_PART = 0.15
-"""A second piece of the object, behind a finger, has at least this share of the largest one's area."""
-SMALL_HOLE = 0.03
-"""Share of the object's area up to which a hole in it is doubted; the handle of a mug is larger."""
+"""Minimum overlap (IoU) of predicted and final mask; below it the object counts as hidden in the frame."""
+MIN_PIXELS = 30
+"""Minimum area of the object; a smaller mask cannot be tracked [pixels]."""
+SEARCH_FRACTION = 0.06
+"""Maximum distance of a silhouette from its prediction, as a fraction of the square root of its area."""
+MIN_PRIOR = 0.01
+"""Lower limit of the prior probability, because optical flow alone is not conclusive."""
+MAX_PRIOR = 0.98
+"""Upper limit of the prior probability."""
+MIN_HAND_LOG_RATIO = 1.5
+"""Minimum log likelihood ratio of hand to object colours of a pixel that may be hand."""
+MAX_HAND_GAP = 3
+"""Maximum distance of a hand from the object [pixels]."""
+MIN_MOVED_FRACTION = 0.03
+"""Minimum fraction of pixels that differ from the background in a hand that holds still: its edges."""
+MIN_FRACTION_OUTSIDE = 0.1
+"""Minimum fraction of a hand that lies outside the region in which the object is expected."""
+MAX_COVER_OUTSIDE = 0.5
+"""Maximum fraction of the image outside the region in which the object is expected that one hand covers; a wall covers
+more."""
+MIN_MOVING_FRACTION = 0.1
+"""Minimum fraction of the box that differs from the background; with less, the background inside the box is not
+used."""
+MIN_PART_FRACTION = 0.15
+"""Minimum area of further components of the object (behind a finger), as a fraction of the largest one."""
+MAX_HOLE_FRACTION = 0.03
+"""Maximum area of a hole labelled unknown, as a fraction of the object's; the handle of a mug is larger."""
 GRABCUT_SEED = 7
-"""GrabCut starts its colour models at random."""
+"""Seed of OpenCV's random numbers, from which GrabCut initialises its colour models."""
 
 
 @dataclass(frozen=True)
 class Seed:
-    """Where a person says that the object is. One of box and click."""
+    """Position of the object on one frame, as a box or a click."""
 
     index: int
-    """Of the frame."""
+    """Index of the frame."""
     box: tuple[int, int, int, int] | None = None
-    """Left, top, width, height, around the whole object [pixels]."""
+    """Left, top, width, height of a box around the whole object [pixels]."""
     click: tuple[int, int] | None = None
-    """A pixel on the object: column, row."""
+    """Column and row of a pixel on the object [pixels]."""
 
 
 @dataclass(frozen=True)
 class Masks:
-    """Three-valued masks, and how far to trust them."""
+    """Three-valued masks of all frames, with their confidence."""
 
     labels: UInt8[np.ndarray, "t h w"]
     """OBJECT, UNKNOWN or BACKGROUND."""
     confidence: Float32[np.ndarray, " t"]
-    """Overlap of prediction and finding, in [0, 1]; 0 where the object was not found."""
-    unsure: Bool[np.ndarray, " t"]
-    """Frames a person should look at."""
+    """Overlap (IoU) of predicted and final mask; 0 where the object was not found."""
+    uncertain: Bool[np.ndarray, " t"]
+    """Frames whose mask should be checked by eye."""
 
 
 @dataclass(frozen=True)
-class _Cut:
-    """One frame, cut out."""
+class _Segmentation:
+    """Segmentation of one frame."""
 
     inside: Bool[np.ndarray, "h w"]
-    """The object."""
-    other: Bool[np.ndarray, "h w"]
-    """What moves besides, or holds it."""
-    likely: Float32[np.ndarray, "h w"]
-    """Probability of the object, 0 away from it."""
+    """Pixels of the object."""
+    unknown: Bool[np.ndarray, "h w"]
+    """Other pixels that are not certainly background: moving ones, hands, undecided ones."""
+    probability: Float32[np.ndarray, "h w"]
+    """Probability of the object; 0 far from it."""
 
 
-def segment(pictures: UInt8[np.ndarray, "t h w 3"], backdrop: Backdrop, seed: Seed) -> Masks:
-    """Masks of all frames from a hint on one.
+def segment(images: UInt8[np.ndarray, "t h w 3"], background: Background, seed: Seed) -> Masks:
+    """Masks of all frames from a box or a click on one.
 
     Raises:
-        ValueError: Nothing was found at the seed.
+        ValueError: No object was found at the seed.
     """
-    first, colours = _cut_seed(pictures[seed.index], backdrop, seed)
-    if first.inside.sum() < LEAST_PIXELS:
-        raise ValueError(f"shows no object at the hint on frame {seed.index}")
-    labels = np.zeros(pictures.shape[:3], np.uint8)
-    confidence, unsure = np.ones(len(pictures), np.float32), np.zeros(len(pictures), bool)
-    labels[seed.index] = three_valued(trimmed(first.inside, pictures[seed.index], backdrop), first.other, 1)
-    for order in (range(seed.index + 1, len(pictures)), range(seed.index - 1, -1, -1)):
-        for i, cut, agreement, doubtful in _follow(pictures, order, seed.index, first, backdrop, colours):
-            labels[i] = three_valued(trimmed(cut.inside, pictures[i], backdrop), cut.other, 1)
-            confidence[i], unsure[i] = agreement, doubtful
-    return Masks(labels, confidence, unsure)
+    first, colours = _segment_seed(images[seed.index], background, seed)
+    if first.inside.sum() < MIN_PIXELS:
+        raise ValueError(f"shows no object in the box, or at the click, on frame {seed.index}")
+    labels = np.zeros(images.shape[:3], np.uint8)
+    confidence, uncertain = np.ones(len(images), np.float32), np.zeros(len(images), bool)
+    labels[seed.index] = make_trimap(trim_rim(first.inside, images[seed.index], background), first.unknown, 1)
+    for order in (range(seed.index + 1, len(images)), range(seed.index - 1, -1, -1)):
+        for i, current, agreement, is_uncertain in _track(images, order, seed.index, first, background, colours):
+            labels[i] = make_trimap(trim_rim(current.inside, images[i], background), current.unknown, 1)
+            confidence[i], uncertain[i] = agreement, is_uncertain
+    return Masks(labels, confidence, uncertain)
 
 
-def trusted(backdrop: Backdrop, picture: UInt8[np.ndarray, "h w 3"], seed: Seed) -> Backdrop:
-    """The backdrop before anything is known of the object: without what may be the object itself.
+def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h w 3"], seed: Seed) -> Background:
+    """The background for the seed frame, without the pixels that may be the object itself.
 
-    An object of one colour that turns in place looks still. Inside the box, what looks like the backdrop is believed to
-    be the backdrop only where it reaches in from the box's border.
+    An object of one colour that rotates in place looks static. So inside the box, pixels that match the background are
+    accepted as background only if they are connected to the border of the box.
     """
-    same, moving = _opened(backdrop.same(picture), 1), _opened(backdrop.differs(picture), 1)
-    inside = _boxed(moving.shape, seed.box or _box_about(seed.click, moving))
-    _, pieces = _pieces(same & inside)
-    enclosed = same & inside & ~np.isin(pieces, np.unique(pieces[inside & ~_eroded(inside, 1)]))
-    hopeless = (moving & inside).sum() < LEAST_MOVING * inside.sum()
-    return replace(backdrop, known=backdrop.known & ~(inside if hopeless else enclosed))
+    static, moving = _opened(background.same(image), 1), _opened(background.differs(image), 1)
+    inside = _box_mask(moving.shape, seed.box or _box_around(seed.click, moving))
+    _, ids = _components(static & inside)
+    enclosed = static & inside & ~np.isin(ids, np.unique(ids[inside & ~_eroded(inside, 1)]))
+    mostly_static = (moving & inside).sum() < MIN_MOVING_FRACTION * inside.sum()
+    return replace(background, known=background.known & ~(inside if mostly_static else enclosed))
 
 
-def hands(picture: UInt8[np.ndarray, "h w 3"], backdrop: Backdrop) -> Bool[np.ndarray, "h w"]:
-    """Pieces of the colour of skin that are no part of the still background, before anything else is known.
+def moving_skin(image: UInt8[np.ndarray, "h w 3"], background: Background) -> Bool[np.ndarray, "h w"]:
+    """Connected components of skin colour that move, for the frames before the object is known.
 
-    A hand that holds still hides in the backdrop, all but its edges: a little motion is enough. A wooden table does not
-    move; an object of the colour of skin counts as a hand here.
+    A hand that holds still becomes part of the static background except for its edges, so a few moving pixels suffice.
+    A wooden table does not move; an object of the colour of skin is included.
     """
-    return _moved_pieces(_opened(skin_coloured(picture), 1), backdrop.differs(picture) | ~backdrop.known)
+    return _moved_components(_opened(skin_coloured(image), 1), background.differs(image) | ~background.known)
 
 
-def find_seed(pictures: UInt8[np.ndarray, "t h w 3"], backdrop: Backdrop) -> Seed | None:
-    """A box around what moves and has not the colour of skin, on the frame that shows most of it; None if nothing does.
+def find_seed(images: UInt8[np.ndarray, "t h w 3"], background: Background) -> Seed | None:
+    """A box around the largest moving component that is not skin-coloured, over nine frames; None if nothing moves.
 
-    A guess, for films that come without a hint: a sleeve or a platter moves, too.
+    The default for footage without box and click. It may be wrong: a sleeve or a turntable moves as well.
     """
-    best, most = None, LEAST_PIXELS
-    for i in np.unique(np.linspace(0, len(pictures) - 1, 9).round().astype(int)):
-        restless = backdrop.differs(pictures[i]) | ~backdrop.known
-        moving = _opened(restless & ~skin_coloured(pictures[i]), 2)
+    best, largest = None, MIN_PIXELS
+    for i in np.unique(np.linspace(0, len(images) - 1, 9).round().astype(int)):
+        changing = background.differs(images[i]) | ~background.known
+        moving = _opened(changing & ~skin_coloured(images[i]), 2)
         count, _, stats, _ = cv2.connectedComponentsWithStats(_closed(moving, 4).astype(np.uint8))
         if count < 2:
             continue
         left, top, width, height, area = stats[1:][stats[1:, cv2.CC_STAT_AREA].argmax()].tolist()
-        if area > most:
+        if area > largest:
             margin = 2 + round(0.05 * max(width, height))
             h, w = moving.shape
             left, top = max(left - margin, 0), max(top - margin, 0)
             box = (left, top, min(width + 2 * margin, w - left), min(height + 2 * margin, h - top))
-            best, most = Seed(int(i), box), area
+            best, largest = Seed(int(i), box), area
     return best
 
 
-def three_valued(
-    inside: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"], band: int
+def make_trimap(
+    inside: Bool[np.ndarray, "h w"], unknown: Bool[np.ndarray, "h w"], band: int
 ) -> UInt8[np.ndarray, "h w"]:
-    """Object with a band of unknown pixels along its silhouette, half inside, and other things that move unknown.
+    """Label a mask's inside OBJECT, and a band along its silhouette and other pixels UNKNOWN.
 
-    A small hole is unknown, too: a dark print before a dark wall looks like one, and would be carved out of the object.
+    Small holes are unknown as well: a dark texture in front of a dark wall looks like a hole, and would be carved out
+    of the visual hull.
 
     Args:
-        other: What moves and is not the object.
-        band: Half the width of the band [pixels].
+        inside: Pixels of the object.
+        unknown: Pixels that are neither object nor certainly background.
+        band: Half the width of the band, which straddles the silhouette [pixels].
     """
-    labels = np.where(_dilated(inside, band) | other, np.uint8(UNKNOWN), np.uint8(BACKGROUND))
+    labels = np.where(_dilated(inside, band) | unknown, np.uint8(UNKNOWN), np.uint8(BACKGROUND))
     labels[_eroded(inside, band)] = OBJECT
-    _, pieces, stats, _ = cv2.connectedComponentsWithStats((labels == BACKGROUND).astype(np.uint8), connectivity=4)
+    _, ids, stats, _ = cv2.connectedComponentsWithStats((labels == BACKGROUND).astype(np.uint8), connectivity=4)
     left, top, width, height, area = stats.T
-    within = (left > 0) & (top > 0) & (left + width < labels.shape[1]) & (top + height < labels.shape[0])
-    labels[(within & (area < SMALL_HOLE * inside.sum()))[pieces]] = UNKNOWN
+    enclosed = (left > 0) & (top > 0) & (left + width < labels.shape[1]) & (top + height < labels.shape[0])
+    labels[(enclosed & (area < MAX_HOLE_FRACTION * inside.sum()))[ids]] = UNKNOWN
     return labels
 
 
-def sharpened(
-    picture: UInt8[np.ndarray, "h w 3"], coarse: UInt8[np.ndarray, "h w"], reach: int
+def refine_mask(
+    image: UInt8[np.ndarray, "h w 3"], coarse: UInt8[np.ndarray, "h w"], radius: int
 ) -> UInt8[np.ndarray, "h w"]:
-    """A mask from a smaller picture, brought to this one's edges: a graph cut within `reach` of the coarse silhouette.
+    """Align an enlarged mask with the edges of the image, by GrabCut within `radius` of its silhouette.
 
     Args:
-        coarse: OBJECT, UNKNOWN or BACKGROUND, enlarged to the picture's size.
-        reach: Width of the uncertain band [pixels].
+        coarse: OBJECT, UNKNOWN or BACKGROUND, enlarged to the image's size.
+        radius: Width of the uncertain band [pixels].
     """
     inner, outer = coarse == OBJECT, coarse != BACKGROUND
-    near = _dilated(inner, reach)
+    near = _dilated(inner, radius)
     trimap = np.where(near, np.uint8(cv2.GC_PR_BGD), np.uint8(cv2.GC_BGD))
     trimap[inner] = cv2.GC_PR_FGD
-    trimap[_eroded(inner, reach)] = cv2.GC_FGD
+    trimap[_eroded(inner, radius)] = cv2.GC_FGD
     if not (trimap == cv2.GC_FGD).any() or not (trimap == cv2.GC_BGD).any():
         return coarse
-    return three_valued(_connected(_grabcut(picture, trimap, 2), inner), outer & ~near, 1)
+    return make_trimap(_main_components(_grabcut(image, trimap, 2), inner), outer & ~near, 1)
 
 
-def overlap(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
-    """Intersection over union; 0 for two empty masks."""
-    return float(iou(torch.from_numpy(one), torch.from_numpy(other)))
+def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union (IoU); 0 for two empty masks."""
+    return float(iou(torch.from_numpy(a), torch.from_numpy(b)))
 
 
 # One frame ------------------------------------------------------------------------------------------------------------
 
 
-def _cut_seed(picture: np.ndarray, backdrop: Backdrop, seed: Seed) -> tuple[_Cut, Colours]:
-    """The object on the seed frame; its colours, and the hand's from what moves outside the box."""
-    moving, still = _opened(backdrop.differs(picture), 1), _opened(backdrop.same(picture), 1)
-    inside = _boxed(moving.shape, seed.box or _box_about(seed.click, moving))
-    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
-    trimap = np.where(inside & ~still, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
+def _segment_seed(image: np.ndarray, background: Background, seed: Seed) -> tuple[_Segmentation, ColourModel]:
+    """Segmentation of the seed frame, and its colour model; moving pixels outside the box count as hand."""
+    moving, static = _opened(background.differs(image), 1), _opened(background.same(image), 1)
+    inside = _box_mask(moving.shape, seed.box or _box_around(seed.click, moving))
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    trimap = np.where(inside & ~static, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
     if seed.click is not None:
         disc = np.zeros(moving.shape, np.uint8)
         cv2.circle(disc, seed.click, max(3, round(0.05 * float(np.sqrt(inside.sum())))), 1, -1)
         trimap[disc > 0] = cv2.GC_FGD
-    away = ~_dilated(inside, 1) & ~moving
-    guess = at_first().learn(lab, object=inside & ~still, hand=moving & ~inside, background=away, weight=FIRST)
-    hand = _hand(guess.hand_evidence(lab), inside, moving, backdrop)
+    surroundings = ~_dilated(inside, 1) & ~moving
+    initial = initial_colours().updated(
+        lab, object=inside & ~static, hand=moving & ~inside, background=surroundings, weight=SEED_WEIGHT
+    )
+    hand = _hand_mask(initial.hand_log_ratio(lab), inside, moving, background)
     trimap[hand & (trimap == cv2.GC_PR_FGD)] = cv2.GC_PR_BGD
     if not (trimap & 1).any() or (trimap & 1).all():
-        nothing = np.zeros(moving.shape, bool)
-        return _Cut(nothing, nothing, nothing.astype(np.float32)), guess
-    rough = _connected(_grabcut(picture, trimap, 5), inside)
-    outside = (moving | hand) & ~inside
-    colours = at_first().learn(lab, object=rough, hand=outside, background=away & ~hand, weight=FIRST)
-    prior = np.where(inside, np.where(rough, np.float32(0.9), np.float32(0.3)), np.float32(LEAST_PRIOR))
-    cut = _decided(picture, prior, rough, backdrop, colours)
-    away &= ~cut.other
-    return cut, at_first().learn(lab, object=cut.inside, hand=cut.other & ~inside, background=away, weight=FIRST)
+        empty = np.zeros(moving.shape, bool)
+        return _Segmentation(empty, empty, empty.astype(np.float32)), initial
+    rough = _main_components(_grabcut(image, trimap, 5), inside)
+    around = (moving | hand) & ~inside
+    colours = initial_colours().updated(
+        lab, object=rough, hand=around, background=surroundings & ~hand, weight=SEED_WEIGHT
+    )
+    prior = np.where(inside, np.where(rough, np.float32(0.9), np.float32(0.3)), np.float32(MIN_PRIOR))
+    current = _segment_frame(image, prior, rough, background, colours)
+    surroundings &= ~current.unknown
+    return current, initial_colours().updated(
+        lab, object=current.inside, hand=current.unknown & ~inside, background=surroundings, weight=SEED_WEIGHT
+    )
 
 
-def _follow(
-    pictures: np.ndarray, order: Iterable[int], start: int, first: _Cut, backdrop: Backdrop, colours: Colours
-) -> Iterator[tuple[int, _Cut, float, bool]]:
-    """Index, cut, overlap with the prediction and doubt of every frame in order, from the cut of the start."""
+def _track(
+    images: np.ndarray,
+    order: Iterable[int],
+    start: int,
+    first: _Segmentation,
+    background: Background,
+    colours: ColourModel,
+) -> Iterator[tuple[int, _Segmentation, float, bool]]:
+    """Index, segmentation, overlap with the prediction and uncertainty of every frame, tracked from `start`."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    cut, area, gray = first, int(first.inside.sum()), cv2.cvtColor(pictures[start], cv2.COLOR_RGB2GRAY)
+    current, area, gray = first, int(first.inside.sum()), cv2.cvtColor(images[start], cv2.COLOR_RGB2GRAY)
     for i in order:
-        before, gray = gray, cv2.cvtColor(pictures[i], cv2.COLOR_RGB2GRAY)
-        hidden = not cut.inside.any()
-        likely = _candidates(pictures[i], backdrop, colours) if hidden else _carried(dis, gray, before, cut.likely)
-        predicted = likely > 0.5
-        cut = _decided(pictures[i], _prior(likely), predicted, backdrop, colours)
-        agreement, found = overlap(predicted, cut.inside), int(cut.inside.sum())
-        if found < LEAST_PIXELS or agreement < LOST_OVERLAP:
-            nothing = np.zeros(predicted.shape, bool)
-            cut, agreement = _Cut(nothing, cut.other | cut.inside, nothing.astype(np.float32)), 0.0
+        previous, gray = gray, cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY)
+        lost = not current.inside.any()
+        probability = (
+            _reappearance(images[i], background, colours) if lost else _warped(dis, gray, previous, current.probability)
+        )
+        predicted = probability > 0.5
+        current = _segment_frame(images[i], _spread_prior(probability), predicted, background, colours)
+        agreement, new_area = overlap(predicted, current.inside), int(current.inside.sum())
+        if new_area < MIN_PIXELS or agreement < LOST_OVERLAP:
+            empty = np.zeros(predicted.shape, bool)
+            current, agreement = _Segmentation(empty, current.unknown | current.inside, empty.astype(np.float32)), 0.0
         else:
-            lab = cv2.cvtColor(pictures[i], cv2.COLOR_RGB2LAB)
-            background = ~_dilated(cut.inside | cut.other, 2)
-            # Only what surely covers the backdrop teaches: else one mistake would teach the next.
-            sure = cut.inside & backdrop.differs(pictures[i])
-            colours = colours.learn(lab, object=sure, hand=_nowhere(predicted), background=background)
-        doubtful = hidden or agreement < SURE_OVERLAP or not 1 / SURE_AREA < found / max(area, 1) < SURE_AREA
-        area = found
-        yield i, cut, agreement, doubtful
+            lab = cv2.cvtColor(images[i], cv2.COLOR_RGB2LAB)
+            outside = ~_dilated(current.inside | current.unknown, 2)
+            # Only pixels that certainly differ from the background, so that a wrong mask does not reinforce itself.
+            certain = current.inside & background.differs(images[i])
+            colours = colours.updated(lab, object=certain, hand=_empty_like(predicted), background=outside)
+        uncertain = (
+            lost or agreement < CERTAIN_OVERLAP or not 1 / MAX_AREA_RATIO < new_area / max(area, 1) < MAX_AREA_RATIO
+        )
+        area = new_area
+        yield i, current, agreement, uncertain
 
 
-def _decided(
-    picture: np.ndarray, prior: np.ndarray, predicted: np.ndarray, backdrop: Backdrop, colours: Colours
-) -> _Cut:
-    """Where the object is, given where it may be."""
-    moving = _opened(backdrop.differs(picture), 1)
-    likely = np.zeros(predicted.shape, np.float32)
-    if predicted.sum() < LEAST_PIXELS:
-        return _Cut(_nowhere(predicted), moving, likely)
-    evidence = colours.hand_evidence(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB))
-    hand = _hand(evidence, predicted, moving, backdrop)
-    part = _window(predicted, 4 * _reach(predicted))
-    cropped = Backdrop(backdrop.picture[part], backdrop.noise[part], backdrop.known[part])
-    odds = object_odds(picture[part], prior[part], hand[part], cropped, colours)
-    likely[part] = smoothed(odds, picture[part])
-    found = _connected(likely > 0.5, predicted)
-    likely = np.where(found, np.maximum(likely, np.float32(0.5)), np.minimum(likely, np.float32(0.3)))
-    # Near the object, where the backdrop was never seen, only colour speaks: not enough to call it background.
-    doubt = _dilated(predicted, _reach(predicted)) & ~backdrop.known
-    return _Cut(found, (moving | hand | doubt) & ~found, likely)
+def _segment_frame(
+    image: np.ndarray, prior: np.ndarray, predicted: np.ndarray, background: Background, colours: ColourModel
+) -> _Segmentation:
+    """Segmentation of a frame, given the prior and the predicted mask."""
+    moving = _opened(background.differs(image), 1)
+    probability = np.zeros(predicted.shape, np.float32)
+    if predicted.sum() < MIN_PIXELS:
+        return _Segmentation(_empty_like(predicted), moving, probability)
+    log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
+    hand = _hand_mask(log_ratio, predicted, moving, background)
+    window = _window(predicted, 4 * _search_radius(predicted))
+    cropped = Background(background.image[window], background.noise[window], background.known[window])
+    odds = object_log_odds(image[window], prior[window], hand[window], cropped, colours)
+    probability[window] = mean_field_probability(odds, image[window])
+    inside = _main_components(probability > 0.5, predicted)
+    probability = np.where(inside, np.maximum(probability, np.float32(0.5)), np.minimum(probability, np.float32(0.3)))
+    # Near the object, where the static background is unknown, colour alone is not enough to label a pixel background.
+    undecided = _dilated(predicted, _search_radius(predicted)) & ~background.known
+    return _Segmentation(inside, (moving | hand | undecided) & ~inside, probability)
 
 
-def _hand(evidence: np.ndarray, about: np.ndarray, moving: np.ndarray, backdrop: Backdrop) -> np.ndarray:
-    """Pieces of the hand's colour that moved, touch the object and reach in from outside: one within it is a print."""
-    pieces = _moved_pieces(_opened(evidence > HAND_EVIDENCE, 1), moving | ~backdrop.known)
-    count, numbers = _pieces(pieces)
-    touching = np.bincount(numbers[_dilated(about, TOUCH)], minlength=count) > 0
-    outside = ~_dilated(about, _reach(about))
-    beyond = np.bincount(numbers[outside], minlength=count)
-    # A wall is taught as hand where a silhouette moves past it.
-    touching &= (beyond > REACHES_IN * np.bincount(numbers.ravel(), minlength=count)) & (beyond < WALL * outside.sum())
+def _hand_mask(log_ratio: np.ndarray, expected: np.ndarray, moving: np.ndarray, background: Background) -> np.ndarray:
+    """Components of hand colour that moved, touch the object and extend beyond it (else they are its texture)."""
+    candidates = _moved_components(_opened(log_ratio > MIN_HAND_LOG_RATIO, 1), moving | ~background.known)
+    count, ids = _components(candidates)
+    touching = np.bincount(ids[_dilated(expected, MAX_HAND_GAP)], minlength=count) > 0
+    outside = ~_dilated(expected, _search_radius(expected))
+    beyond = np.bincount(ids[outside], minlength=count)
+    # Where a silhouette moves past a wall, the colour model learns the wall as hand.
+    touching &= (beyond > MIN_FRACTION_OUTSIDE * np.bincount(ids.ravel(), minlength=count)) & (
+        beyond < MAX_COVER_OUTSIDE * outside.sum()
+    )
     touching[0] = False
-    return touching[numbers]
+    return touching[ids]
 
 
-def _moved_pieces(mask: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """The connected pieces of a mask of which a little has moved."""
-    count, numbers = _pieces(mask)
-    sizes = np.bincount(numbers.ravel(), minlength=count)
-    keep = np.bincount(numbers[moved], minlength=count) > MOVED_SHARE * sizes
+def _moved_components(mask: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Connected components of a mask of which at least `MIN_MOVED_FRACTION` moved."""
+    count, ids = _components(mask)
+    sizes = np.bincount(ids.ravel(), minlength=count)
+    keep = np.bincount(ids[moved], minlength=count) > MIN_MOVED_FRACTION * sizes
     keep[0] = False
-    return keep[numbers]
+    return keep[ids]
 
 
-def _carried(dis: cv2.DISOpticalFlow, gray: np.ndarray, before: np.ndarray, likely: np.ndarray) -> np.ndarray:
-    """The probabilities of the frame before, moved along the optical flow to this one."""
-    flow = dis.calc(gray, before, np.zeros((*gray.shape, 2), np.float32))
+def _warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, probability: np.ndarray) -> np.ndarray:
+    """Probabilities of the previous frame, warped to this one along the optical flow."""
+    flow = dis.calc(gray, previous, np.zeros((*gray.shape, 2), np.float32))
     rows, columns = np.indices(gray.shape, np.float32)
-    return cv2.remap(likely, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
+    return cv2.remap(probability, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
 
 
-def _prior(likely: np.ndarray) -> np.ndarray:
-    """What flow says, spread by how far flow and rotation may be off."""
-    reach = _reach(likely > 0.5)
-    spread = 0.5 * likely + 0.5 * cv2.GaussianBlur(likely, (0, 0), reach / 2)
-    return spread.clip(LEAST_PRIOR, LARGEST_PRIOR)
+def _spread_prior(probability: np.ndarray) -> np.ndarray:
+    """The warped probability, blurred by the uncertainty of flow and rotation."""
+    radius = _search_radius(probability > 0.5)
+    spread = 0.5 * probability + 0.5 * cv2.GaussianBlur(probability, (0, 0), radius / 2)
+    return spread.clip(MIN_PRIOR, MAX_PRIOR)
 
 
-def _reach(mask: np.ndarray) -> int:
-    return max(2, round(REACH * float(np.sqrt(mask.sum()))))
+def _search_radius(mask: np.ndarray) -> int:
+    return max(2, round(SEARCH_FRACTION * float(np.sqrt(mask.sum()))))
 
 
-def _candidates(picture: np.ndarray, backdrop: Backdrop, colours: Colours) -> np.ndarray:
-    """Where a hidden object may have come back: what moves and has its colours more than the hand's."""
-    evidence = colours.hand_evidence(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB))
-    return _opened(backdrop.differs(picture) & (evidence < -HAND_EVIDENCE), 2).astype(np.float32)
+def _reappearance(image: np.ndarray, background: Background, colours: ColourModel) -> np.ndarray:
+    """Pixels where a hidden object may have reappeared: moving, and closer in colour to the object than to the hand."""
+    log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
+    return _opened(background.differs(image) & (log_ratio < -MIN_HAND_LOG_RATIO), 2).astype(np.float32)
 
 
-def _boxed(shape: tuple[int, ...], box: tuple[int, int, int, int]) -> np.ndarray:
+def _box_mask(shape: tuple[int, ...], box: tuple[int, int, int, int]) -> np.ndarray:
     left, top, width, height = box
     inside = np.zeros(shape, bool)
     inside[max(top, 0) : max(top + height, 0), max(left, 0) : max(left + width, 0)] = True
     return inside
 
 
-def _box_about(click: tuple[int, int] | None, moving: np.ndarray) -> tuple[int, int, int, int]:
-    """A square about a clicked pixel, as wide as what moves around it, a quarter of the picture when nothing does."""
+def _box_around(click: tuple[int, int] | None, moving: np.ndarray) -> tuple[int, int, int, int]:
+    """Square around a clicked pixel, sized by the moving component there, at least a quarter of the image wide."""
     if click is None:
         raise ValueError("a seed needs a box or a click")
     h, w = moving.shape
     column, row = min(max(click[0], 0), w - 1), min(max(click[1], 0), h - 1)
-    _, components = _pieces(_closed(moving, 4))
-    blob = (components == components[row, column]) & (components[row, column] > 0)
+    _, ids = _components(_closed(moving, 4))
+    component = (ids == ids[row, column]) & (ids[row, column] > 0)
     half = round(0.125 * min(h, w))
-    if blob.any():
-        rows, columns = np.nonzero(blob)
+    if component.any():
+        rows, columns = np.nonzero(component)
         spans = [column - columns.min(), columns.max() - column, row - rows.min(), rows.max() - row]
         half = max(half, round(1.1 * float(np.median(spans))))
     return column - half, row - half, 2 * half + 1, 2 * half + 1
 
 
-# Graph cut and shapes -------------------------------------------------------------------------------------------------
+# GrabCut and morphology -----------------------------------------------------------------------------------------------
 
 
-def _grabcut(picture: np.ndarray, trimap: np.ndarray, steps: int) -> np.ndarray:
+def _grabcut(image: np.ndarray, trimap: np.ndarray, steps: int) -> np.ndarray:
     cv2.setRNGSeed(GRABCUT_SEED)
     trimap = np.ascontiguousarray(trimap)
     mixtures = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(picture), trimap, (0, 0, 0, 0), *mixtures, steps, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(np.ascontiguousarray(image), trimap, (0, 0, 0, 0), *mixtures, steps, cv2.GC_INIT_WITH_MASK)
     return (trimap & 1) > 0
 
 
@@ -360,23 +394,23 @@ def _window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
     return slice(top, int(rows[-1]) + margin + 1), slice(left, int(columns[-1]) + margin + 1)
 
 
-def _connected(cut: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """The piece that overlaps most with where the object is expected, other large ones, without small holes."""
-    count, components = _pieces(cut)
-    overlaps = np.bincount(components[expected], minlength=count)
+def _main_components(mask: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """The component that overlaps the expected object most, and other large ones, with small holes closed."""
+    count, ids = _components(mask)
+    overlaps = np.bincount(ids[expected], minlength=count)
     overlaps[0] = 0
     if not overlaps.any():
-        return _nowhere(cut)
-    return _closed((overlaps > OTHER_PART * overlaps.max())[components], 1)
+        return _empty_like(mask)
+    return _closed((overlaps > MIN_PART_FRACTION * overlaps.max())[ids], 1)
 
 
-def _pieces(mask: np.ndarray) -> tuple[int, np.ndarray]:
-    """How many numbers there are, and the number of the connected piece at every pixel; 0 is none."""
-    count, numbers = cv2.connectedComponents(mask.astype(np.uint8))
-    return count, np.asarray(numbers, np.int32)
+def _components(mask: np.ndarray) -> tuple[int, np.ndarray]:
+    """Number of labels, and the label of the connected component of every pixel; label 0 is outside the mask."""
+    count, ids = cv2.connectedComponents(mask.astype(np.uint8))
+    return count, np.asarray(ids, np.int32)
 
 
-def _nowhere(mask: np.ndarray) -> np.ndarray:
+def _empty_like(mask: np.ndarray) -> np.ndarray:
     return np.zeros(mask.shape, bool)
 
 
@@ -389,7 +423,7 @@ def _dilated(mask: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
-    """The border of the picture does not eat into the mask."""
+    """Erosion that does not shrink the mask at the image border."""
     return cv2.erode(mask.astype(np.uint8), _disc(radius)) > 0
 
 

@@ -1,11 +1,11 @@
-"""From Gaussians to pictures: rasterizer, ray tracer, BRDF, deferred shading, relighting.
+"""Rendering of Gaussians: rasterizer, ray tracer, BRDF, deferred shading and relighting.
 
-The only caller of `backends`. Knows no loss and no model.
+The only room that calls `backends`. It contains no losses and no training.
 """
 
 from tumble.backends import threads_for_kernels, usable_device
 from tumble.rendering import relight
-from tumble.rendering.gbuffer import antialiased, buffers_of
+from tumble.rendering.gbuffer import antialiased_gbuffer, render_gbuffer
 from tumble.rendering.prefiltered_light import Prefiltered, prefilter
 from tumble.rendering.rasterizer import Buffers, rasterize
 from tumble.rendering.shading import (
@@ -20,7 +20,7 @@ from tumble.rendering.shading import (
 from tumble.rendering.trace import (
     Tracer,
     Visibility,
-    build,
+    build_tracer,
     displacement,
     surface_points,
     transfer,
@@ -36,21 +36,21 @@ __all__ = [
     "Surface",
     "Tracer",
     "Visibility",
-    "antialiased",
-    "buffers_of",
-    "build",
-    "self_shadowed_irradiance",
+    "antialiased_gbuffer",
+    "build_tracer",
     "displacement",
-    "unoccluded",
     "prefilter",
     "rasterize",
     "relight",
+    "render_gbuffer",
+    "self_shadowed_irradiance",
     "shade",
     "shade_split",
     "surface",
     "surface_points",
     "threads_for_kernels",
     "transfer",
+    "unoccluded",
     "usable_device",
     "visibility",
 ]

@@ -1,8 +1,8 @@
-"""Final pictures: light by samples drawn where the surface scatters it and where it comes from.
+"""Monte Carlo shading of final images by multiple importance sampling of BRDF and light; not differentiable.
 
-Both kinds of samples are weighted by the balance heuristic, so that a mirror under a cloudy sky and chalk under the
-sun converge alike. Every sample is a ray through the Gaussians; light that is blocked is replaced by what the blocking
-Gaussians send on (`GlossyBounce`). Not differentiable.
+Samples of both kinds are combined by the balance heuristic (Veach and Guibas 1995), so that narrow lobes under a
+uniform light and diffuse surfaces under a small light converge equally well. Every sample is a ray traced through the
+Gaussians; occluded light is replaced by the radiance of the occluding Gaussians (`GlossyBounce`).
 """
 
 from dataclasses import dataclass
@@ -18,39 +18,42 @@ from tumble.rendering.shading import Bounce, Surface, specular
 from tumble.rendering.trace import Tracer, trace
 from tumble.scene import Environment
 
-RAYS = 1 << 18
-"""Rays at once: bounds memory to some 300 MB, changes nothing else."""
+MAX_RAYS = 1 << 18
+"""Maximum number of rays traced at once; limits memory to some 300 MB and does not affect the result."""
 CELL_ROWS = 512
-"""Rows of cells aimed at; a map of as many or more has twice as many: two million cells in all."""
+"""Target number of rows of a light sampler's cells; maps with as many rows or more get twice as many, which is two
+million cells in all."""
 BOUNCE_DIRECTIONS = 256
-"""Of the light of what stands in the way, in harmonics to degree 2."""
-HARMONIOUS = 1.2207440846057596
-"""Root of x^4 = x + 1: the fractions of its powers fill the unit cube evenly."""
+"""Directions in which the light is sampled for the diffuse indirect radiance."""
+GOLDEN_RATIO_3D = 1.2207440846057596
+"""Root of x^4 = x + 1; the fractional parts of multiples of its negative powers fill the unit cube evenly."""
 
 
 @dataclass(frozen=True)
 class LightSampler:
-    """Directions in proportion to the radiance that arrives from them.
+    """Sampler of directions with a density proportional to an environment's radiance.
 
-    The density is constant on *cells*, four and more to a texel of maps of up to `CELL_ROWS` rows: it is nowhere zero
-    where the bilinear map is not. The finer the cells, the less noise a bright texel leaves.
+    The density is constant on *cells*, at least four per texel of maps of up to `CELL_ROWS` rows. It is nonzero
+    wherever the bilinear map is nonzero. Finer cells reduce the noise that bright texels cause.
     """
 
     environment: Environment
+    """The light that is sampled."""
     density: Float[Tensor, "cells_h cells_w"]
-    """[1 / steradian], env frame."""
+    """Density of each cell [1 / steradian], env frame."""
     cumulative: Float64[Tensor, " cells"]
-    """Probability of this cell or one before it, row by row. In 64 bits: a bright sun shares a million cells."""
+    """Cumulative probability of the cells, row by row; in 64 bits, because of the dynamic range over a million
+    cells."""
 
     def sample(self, u: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
-        """Unit directions, env frame, from uniform numbers in [0, 1): `u[0]` picks the row, `u[1]` the place in it."""
+        """Unit directions, env frame, from uniform numbers in [0, 1): `u[0]` chooses the row, `u[1]` the column."""
         rows, columns = self.density.shape
         ends = self.cumulative[columns - 1 :: columns].contiguous()
-        row, down, start, share = _place(ends, u[..., 0].double())
-        cell, along, _, _ = _place(self.cumulative, start + u[..., 1] * share)
-        # Rounding may end a row in the next.
+        row, down, start, probability = _locate(ends, u[..., 0].double())
+        cell, along, _, _ = _locate(self.cumulative, start + u[..., 1] * probability)
+        # Rounding may give a cell of the next row.
         column = (cell - row * columns).clamp(0, columns - 1)
-        # Even by area: down a cell, in the cosine of the polar angle.
+        # Uniform in solid angle: within a cell, uniform in the cosine of the polar angle.
         top, bottom = ((torch.pi / rows * (row + i)).cos() for i in (0, 1))
         cosine = top + (bottom - top) * down
         phi = 2 * torch.pi * ((column + along) / columns - 0.5)
@@ -66,10 +69,10 @@ class LightSampler:
         return self.density[row, column][..., None]
 
 
-def _place(
+def _locate(
     ends: Float64[Tensor, " bins"], x: Float64[Tensor, "*b"]
 ) -> tuple[Int64[Tensor, "*b"], Float64[Tensor, "*b"], Float64[Tensor, "*b"], Float64[Tensor, "*b"]]:
-    """The bin in which x lies, how far in it is from 0 to 1, and the bin's start and width."""
+    """Index of the bin that contains x, relative position of x in it (0 to 1), and start and width of the bin."""
     bin_ = torch.searchsorted(ends, x.contiguous(), right=True).clamp(max=len(ends) - 1)
     start = torch.where(bin_ > 0, ends[(bin_ - 1).clamp(min=0)], 0.0)
     width = ends[bin_] - start
@@ -78,9 +81,9 @@ def _place(
 
 @torch.no_grad()
 def light_sampler(environment: Environment) -> LightSampler:
-    """A sampler of an environment, by the mean of its channels."""
+    """Build the sampler of an environment, with a density proportional to the mean of the colour channels."""
     h, w, _ = environment.log_radiance.shape
-    # Means of a map that is finer still: they, too, are nowhere zero where it is not.
+    # Averages of a finer map are also nonzero wherever the map is nonzero.
     coarse = environment if h <= CELL_ROWS else environment.resampled(CELL_ROWS, w * CELL_ROWS // h)
     h, w, _ = coarse.log_radiance.shape
     h, w = (x * max(2, min(8, CELL_ROWS // h)) for x in (h, w))
@@ -93,11 +96,14 @@ def light_sampler(environment: Environment) -> LightSampler:
 
 @dataclass(frozen=True)
 class GlossyBounce:
-    """What Gaussians in the way send on: the diffuse lobe in their own shade, the other by the split sum."""
+    """Indirect light of relighting: shadowed diffuse radiance, and the specular lobe by the split sum."""
 
     diffuse: Bounce
+    """Diffuse radiance of the Gaussians."""
     roughness: Float[Tensor, "n 1"]
+    """Perceptual roughness of the Gaussians."""
     prefiltered: Prefiltered
+    """The light, prefiltered for the specular lobes."""
 
 
 @torch.no_grad()
@@ -115,18 +121,24 @@ def relight_surface(
     n_light: int = 512,
     bounce: GlossyBounce | None = None,
 ) -> Float[Tensor, "p 3"]:
-    """Reflected radiance of points under a light (paper section 4.4); unbiased in direct light.
+    """Reflected radiance of points under a light (paper section 4.4); unbiased for direct light.
 
     Args:
-        f0: Reflectance at normal incidence, of surface and bounce.
-        generator: One draw per point shifts a fixed, even pattern of samples.
-        n_brdf: Samples per point drawn like the surface scatters.
-        n_light: Samples per point drawn like the light arrives.
-        bounce: What stands in the way; black when None.
+        surface: Surface points.
+        albedo: Linear albedo of the points.
+        roughness: Perceptual roughness of the points.
+        light: Sampler of the light.
+        R_env_obj: Rotation from the object frame to the env frame.
+        tracer: Tracer of the Gaussians, for visibility.
+        f0: Reflectance at normal incidence, of points and indirect light.
+        generator: Random numbers, which shift a fixed low-discrepancy pattern of samples for each point.
+        n_brdf: Samples per point by importance sampling of the BRDF.
+        n_light: Samples per point by importance sampling of the light.
+        bounce: Indirect light; occluded directions are black when None.
     """
     shift = torch.rand(len(surface.points), 1, 3, generator=generator, dtype=albedo.dtype, device=generator.device)
     diffuse = None if bounce is None else _diffuse(bounce, R_env_obj)
-    chunk = max(1, RAYS // (n_brdf + n_light))
+    chunk = max(1, MAX_RAYS // (n_brdf + n_light))
     parts = [albedo.new_zeros(0, 3)]
     for at in torch.arange(len(surface.points), device=albedo.device).split(chunk):
         normals, views, rough = surface.normals[at, None], surface.views[at, None], roughness[at, None]
@@ -138,17 +150,17 @@ def relight_surface(
         density = n_brdf * brdf.pdf(wi, views, normals, roughness=rough) + n_light * pdf_light
         value = brdf.evaluate(wi, views, normals, albedo=albedo[at, None], roughness=rough, f0=f0)
         weight = torch.where(density > 0, value * cosine / density, 0.0)
-        origins = tracer.lifted(surface.points[at], surface.normals[at])[:, None].expand_as(wi)
+        origins = tracer.ray_origins(surface.points[at], surface.normals[at])[:, None].expand_as(wi)
         useful = cosine[..., 0] > 0
         arriving = torch.zeros_like(wi)
-        arriving[useful] = _arriving(
+        arriving[useful] = _arriving_radiance(
             origins[useful], wi[useful], light.environment, R_env_obj, tracer, f0=f0, bounce=bounce, diffuse=diffuse
         )
         parts.append((weight * arriving).sum(1))
     return torch.cat(parts)
 
 
-def _arriving(
+def _arriving_radiance(
     origins: Float[Tensor, "r 3"],
     wi: Float[Tensor, "r 3"],
     environment: Environment,
@@ -159,25 +171,25 @@ def _arriving(
     bounce: GlossyBounce | None,
     diffuse: Float[Tensor, "n 3"] | None,
 ) -> Float[Tensor, "r 3"]:
-    """Radiance along rays: of the environment as far as it shows through, and of what is in front of it."""
+    """Incident radiance along rays: environment times transmittance, plus the radiance of occluding Gaussians."""
     hits = trace(tracer, origins, wi, diffuse)
     arriving = hits.transmittance[:, None] * environment.lookup(wi @ R_env_obj.mT) + hits.radiance
     if bounce is None:
         return arriving
-    met = torch.where(hits.hit >= 0)[0]
-    which = hits.hit[met].long()
-    normals = tracer.gaussians.normals[which]
-    shine = specular(normals, -wi[met], bounce.roughness[which], bounce.prefiltered, R_env_obj, f0)
-    return arriving.index_add(0, met, (1 - hits.transmittance[met])[:, None] * shine)
+    occluded = torch.where(hits.hit >= 0)[0]
+    index = hits.hit[occluded].long()
+    normals = tracer.gaussians.normals[index]
+    glossy = specular(normals, -wi[occluded], bounce.roughness[index], bounce.prefiltered, R_env_obj, f0)
+    return arriving.index_add(0, occluded, (1 - hits.transmittance[occluded])[:, None] * glossy)
 
 
 def _diffuse(bounce: GlossyBounce, R_env_obj: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3"]:
-    """Diffuse radiance of every Gaussian."""
+    """Diffuse radiance of every Gaussian under the light of one frame."""
     directions = fibonacci_sphere(BOUNCE_DIRECTIONS).to(R_env_obj)
-    return bounce.diffuse.radiance(directions, bounce.prefiltered.cells(directions @ R_env_obj.mT))
+    return bounce.diffuse.radiance(directions, bounce.prefiltered.cell_radiance(directions @ R_env_obj.mT))
 
 
 def _lattice(n: int) -> Float64[Tensor, "n 3"]:
-    """An even pattern in the unit cube."""
-    steps = torch.tensor([HARMONIOUS**-1, HARMONIOUS**-2, HARMONIOUS**-3], dtype=torch.float64)
+    """Kronecker sequence, a low-discrepancy sequence in the unit cube: multiples of irrational numbers modulo 1."""
+    steps = torch.tensor([GOLDEN_RATIO_3D**-1, GOLDEN_RATIO_3D**-2, GOLDEN_RATIO_3D**-3], dtype=torch.float64)
     return torch.arange(n, dtype=torch.float64)[:, None] * steps % 1

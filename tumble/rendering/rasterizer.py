@@ -1,7 +1,7 @@
-"""What a camera sees of the Gaussians, before light: the one place where nouns become the tensors of a backend.
+"""Rasterization of Gaussians into buffers of one view: passes them to a backend as tensors.
 
-*Features* are whatever varies over a Gaussian's plane, given at its four corners (`material`): callers name them and
-get images of the same names back.
+*Features* are quantities that vary over a Gaussian's plane, given at its four corners (`scene.material`). Callers pass
+them by name and get images with the same names.
 """
 
 from dataclasses import dataclass
@@ -17,26 +17,26 @@ from tumble.scene import Camera, Gaussians, opacity
 
 @dataclass(frozen=True)
 class Buffers:
-    """Images of one view. Per-pixel means are over what covers the pixel (divided by alpha); 0 where nothing does."""
+    """Images of one view. Means are weighted by blending weight and divided by alpha; 0 where alpha is 0."""
 
     alpha: Float[Tensor, "h w"]
     """Coverage in [0, 1]."""
     depth: Float[Tensor, "h w"]
-    """Expected z-depth, camera frame [object radius]."""
+    """Mean z-depth, camera frame [object radius]."""
     depth_var: Float[Tensor, "h w"]
-    """Variance of that depth along the ray [object radius^2]."""
+    """Variance of the z-depth along the ray [object radius^2]."""
     normal: Float[Tensor, "h w 3"]
     """Mean outward normal, object frame; not of unit length."""
     rgb: Float[Tensor, "h w 3"]
-    """Linear radiance over black (not divided by alpha)."""
+    """Linear radiance over black, not divided by alpha."""
     features: dict[str, Float[Tensor, "h w _"]]
-    """Images of the features handed to `rasterize`, under the same names."""
+    """Images of the features passed to `rasterize`, under the same names."""
     weight: Float[Tensor, " n"]
     """Blending weight of every Gaussian, summed over the view's pixels."""
     touched: Int32[Tensor, " n"]
-    """Number of pixels under the mask that every Gaussian contributes to."""
+    """Number of masked pixels that each Gaussian contributes to."""
     dominant: Int32[Tensor, "h w"]
-    """The Gaussian of largest weight in each pixel, -1 where there is none."""
+    """Index of the Gaussian with the largest blending weight in each pixel, -1 where there is none."""
 
 
 def rasterize(
@@ -47,13 +47,16 @@ def rasterize(
     features: dict[str, Float[Tensor, "n 4 _"]],
     mask: Float[Tensor, "h w"] | None = None,
 ) -> Buffers:
-    """One view of the Gaussians (paper section 4.2); differentiable in all of them, in `gamma`, features and pose.
+    """Rasterize one view of the Gaussians (paper section 4.2).
 
-    Not differentiable: the camera (intrinsics are known), the mask, and `weight`, `touched`, `dominant`.
+    Differentiable in Gaussians, `gamma`, features and pose, but not in camera and mask. The outputs `weight`, `touched`
+    and `dominant` have no gradient.
 
     Args:
+        gaussians: Gaussians, object frame.
         gamma: Sharpness of the opacity [1 / object radius].
-        T_cam_obj: One pose, without batch axes.
+        T_cam_obj: Pose of the object, without batch axes.
+        camera: Intrinsics and image size.
         features: Values at the corners of every Gaussian's plane, by name; may be empty.
         mask: Pixels that count in `Buffers.touched`, where > 0.5; all when None.
     """

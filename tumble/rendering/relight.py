@@ -1,6 +1,6 @@
-"""Pictures of a decomposed object under any light (paper section 4.4): BRDF and light importance sampling.
+"""Relighting: images of an asset under any environment map (paper section 4.4).
 
-Two grades of the same: `relight` draws 512 + 512 rays per pixel; `preview` takes the split sum, without rays.
+`relight` traces rays by importance sampling of BRDF and light; `preview` uses the split sum and traces no rays.
 """
 
 import math
@@ -12,48 +12,50 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.maths import SE3, SO3, fibonacci_sphere
-from tumble.rendering.gbuffer import antialiased
+from tumble.rendering.gbuffer import antialiased_gbuffer
 from tumble.rendering.importance_sampling import GlossyBounce, light_sampler, relight_surface
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.shading import Bounce, Surface, shade_split, surface
-from tumble.rendering.trace import Tracer, build, surface_points, transfer, unoccluded, visibility
+from tumble.rendering.trace import Tracer, build_tracer, surface_points, transfer, unoccluded, visibility
 from tumble.scene import TEMPERATURE, Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
-SEEN_FROM = 64
-"""Most frames from which the points are found that Gaussians stand for."""
-SKY_DIRECTIONS = 512
-"""In which what a Gaussian sees is traced."""
+SURFACE_VIEWS = 64
+"""Maximum number of frames that are rendered to find the Gaussians' surface points."""
+VISIBILITY_DIRECTIONS = 512
+"""Number of directions over which light is integrated at each Gaussian, and in which its visibility is traced."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Values of the paper's appendix A."""
+    """Settings of relighting; numbers of samples from the paper's appendix A."""
 
     brdf_samples: int = 512
-    """Rays per pixel drawn like the surface scatters."""
+    """Rays per pixel by importance sampling of the BRDF."""
     light_samples: int = 512
-    """Rays per pixel drawn like the light arrives."""
+    """Rays per pixel by importance sampling of the light."""
     alpha_min: float = 0.1
-    """Least coverage of a pixel that is shaded; what covers less is left black."""
+    """Minimum coverage of a pixel that is shaded; other pixels are black."""
     preview_directions: int = 256
-    """Directions of the diffuse light in a preview."""
+    """Number of directions over which a preview integrates the light."""
 
 
 @torch.no_grad()
 def relight(
     cfg: Config, asset: Asset, environment: Environment, trajectory: Trajectory, camera: Camera, *, seed: int = 0
 ) -> Iterator[Float[Tensor, "h w 3"]]:
-    """The object along a trajectory under a light: linear radiance over black, view by view.
+    """Images of the object along a trajectory, under a light: linear radiance over black, one view at a time.
 
     Args:
-        asset: With material.
-        environment: In the env frame of `trajectory`.
-        trajectory: Whose word `light` says what the new light stands still with.
-        seed: Of the samples.
+        cfg: Numbers of samples.
+        asset: Geometry and material.
+        environment: Light in the env frame of `trajectory`.
+        trajectory: Poses; its field `light` defines whether the light is fixed to the camera or to the object.
+        camera: Intrinsics and image size.
+        seed: Seed of the random samples.
     """
     material = asset.material
-    tracer = build(asset.gaussians, asset.gamma)
+    tracer = build_tracer(asset.gaussians, asset.gamma)
     sampler = light_sampler(environment)
     diffuse = Bounce(material.albedo.mean(1), _transfer(asset, tracer))
     bounce = GlossyBounce(diffuse, material.roughness.mean(1, keepdim=True), prefilter(environment))
@@ -79,7 +81,7 @@ def relight(
 def preview(
     cfg: Config, asset: Asset, environment: Environment, trajectory: Trajectory, camera: Camera
 ) -> Iterator[Float[Tensor, "h w 3"]]:
-    """As `relight`, at once: no shadows, no bounce, highlights as in training."""
+    """Images as by `relight`, but faster: without shadows and indirect light, with the estimator of training."""
     material = asset.material
     prefiltered = prefilter(environment)
     directions = fibonacci_sphere(cfg.preview_directions).to(asset.gaussians.means)
@@ -98,45 +100,45 @@ def preview(
 
 @torch.no_grad()
 def gaussian_colours(asset: Asset, frame: int = 0) -> Float[Tensor, "n 3"]:
-    """Linear radiance of every Gaussian under the recovered light of one training frame, unshadowed, seen head-on."""
+    """Linear radiance of every Gaussian along its normal, unshadowed, under the asset's light in one training frame."""
     material, normals, n = asset.material, asset.gaussians.normals, len(asset.gaussians)
     points = Surface(torch.arange(n, device=normals.device), asset.gaussians.means, normals, normals)
-    sky = unoccluded(fibonacci_sphere(SKY_DIRECTIONS).to(normals), n)
+    unshadowed = unoccluded(fibonacci_sphere(VISIBILITY_DIRECTIONS).to(normals), n)
     return shade_split(
         points,
         material.albedo.mean(1),
         material.roughness.mean(1, keepdim=True),
         prefilter(asset.environment),
         asset.trajectory.R_env_obj[frame],
-        sky,
+        unshadowed,
         f0=float(material.f0),
     )
 
 
-def turntable(seen: Trajectory, n: int, elevation: float) -> tuple[Float[Tensor, "3 3"], Trajectory]:
-    """One turn about the object's +y axis before a camera that stands still, as does the light.
+def turntable(reference: Trajectory, n: int, elevation: float) -> tuple[Float[Tensor, "3 3"], Trajectory]:
+    """One revolution of the object about its +y axis, in front of a fixed camera and a fixed light.
 
     Args:
-        seen: The middle distance of its cameras is kept.
+        reference: Trajectory whose median camera distance is used.
         n: Number of frames.
-        elevation: How far the camera looks down on the object [radians].
+        elevation: Angle by which the camera looks down on the object [radians].
 
     Returns:
-        Object to env rotation of the first frame (`Environment.rotated`), and the trajectory.
+        Object to env rotation of the first frame (for `Environment.rotated`), and the trajectory.
     """
-    like = seen.T_cam_obj.xyz
-    lean = SO3.exp(like.new_tensor([elevation, 0.0, 0.0])).matrix()
-    turn = like.new_zeros(n, 3)
-    turn[:, 1] = 2 * math.pi * torch.arange(n).to(like) / n
-    T_gl_obj = SE3.from_rotation_matrix(lean) @ SE3.from_rotation(SO3.exp(turn), torch.zeros_like(turn))
-    shift = like.new_tensor([0.0, 0.0, float(seen.camera_positions.norm(dim=-1).median())])
+    like = reference.T_cam_obj.xyz
+    tilt = SO3.exp(like.new_tensor([elevation, 0.0, 0.0])).matrix()
+    omega = like.new_zeros(n, 3)
+    omega[:, 1] = 2 * math.pi * torch.arange(n).to(like) / n
+    T_gl_obj = SE3.from_rotation_matrix(tilt) @ SE3.from_rotation(SO3.exp(omega), torch.zeros_like(omega))
+    shift = like.new_tensor([0.0, 0.0, float(reference.camera_positions.norm(dim=-1).median())])
     flip = opengl_from_opencv(like)
     T_cam_gl = SE3.from_rotation(SO3.from_matrix(flip), shift)
-    return lean, Trajectory(T_cam_gl @ T_gl_obj, "camera")
+    return tilt, Trajectory(T_cam_gl @ T_gl_obj, "camera")
 
 
-def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
-    """The asset with its albedo times a factor per channel, at most 0.999."""
+def scale_albedo(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
+    """The asset with its albedo multiplied by a factor per channel, limited to 0.999."""
     material = asset.material
     albedo = (material.albedo * albedo_scale).clamp(1e-4, 0.999)
     logits = TEMPERATURE * torch.logit(albedo)
@@ -144,19 +146,19 @@ def scaled(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
 
 
 def _transfer(asset: Asset, tracer: Tracer) -> Float[Tensor, "n 9"]:
-    """What every Gaussian sees of the light, from the surface that it stands for in frames of the capture."""
-    frames = range(0, len(asset.trajectory), -(-len(asset.trajectory) // SEEN_FROM))
+    """Transfer vectors of all Gaussians, traced from their surface points in the frames of the capture."""
+    frames = range(0, len(asset.trajectory), -(-len(asset.trajectory) // SURFACE_VIEWS))
     poses = [asset.trajectory.T_cam_obj[i] for i in frames]
     points = surface_points(asset.gaussians, asset.gamma, poses, asset.camera)
-    directions = fibonacci_sphere(SKY_DIRECTIONS).to(points)
+    directions = fibonacci_sphere(VISIBILITY_DIRECTIONS).to(points)
     return transfer([visibility(tracer, points, asset.gaussians.normals, directions)], asset.gaussians.normals)
 
 
 def _surfaces(
     cfg: Config, asset: Asset, trajectory: Trajectory, camera: Camera
 ) -> Iterator[tuple[Buffers, Surface, Float[Tensor, "3 3"]]]:
-    """What each frame shows, and how its light is turned."""
+    """For each frame: buffers, surface points, and rotation from the object frame to the env frame."""
     for i, R_env_obj in enumerate(trajectory.R_env_obj):
         T_cam_obj = trajectory.T_cam_obj[i]
-        view = antialiased(asset, T_cam_obj, camera)
+        view = antialiased_gbuffer(asset, T_cam_obj, camera)
         yield view, surface(view, T_cam_obj, camera, alpha_min=cfg.alpha_min), R_env_obj

@@ -1,14 +1,13 @@
-"""Deferred shading: what a camera sees of the surface, lit by the environment of one frame.
+"""Deferred shading of surface points under the environment map of one frame.
 
-Everything happens in the object frame, under one set of directions for the whole view: the light of a frame is
-`environment.lookup(R_env_obj @ w)`, one lookup per direction and frame. *Surface*: the points behind some pixels.
-*Bounce*: light that Gaussians standing in the way send on, of the same frame, since light and object turn apart.
+All computations are in the object frame, with one set of directions for the whole view: the light of a frame is
+`environment.lookup(R_env_obj @ w)`, one lookup per direction and frame. *Bounce* is indirect light: radiance of the
+Gaussians that occlude a direction, under the light of the same frame.
 
-Two estimators for training. `shade` sums both lobes over the shared directions: unbiased, but a few hundred cannot
-resolve a narrow lobe. `shade_split` sums the diffuse lobe and a wide specular one, and takes a narrow one (`NARROW`)
-from a prefiltered light. On a sphere under real light, 256 directions, the first errs by 1.6 to 3.9 at roughness 0.1,
-by 0.4 to 1.5 at 0.2 and by 0.01 to 0.24 from 0.5 up; the second, which sees the light of whole cells, by 0.01 to 0.11
-everywhere (`benchmarks`). Training takes the second. `importance.relight_surface` is for final pictures.
+There are two estimators. `shade` sums both lobes over the shared directions; it is unbiased, but a few hundred
+directions cannot resolve a narrow specular lobe. `shade_split`, which is used in training, sums the diffuse lobe and
+wide specular lobes, and takes narrow specular lobes (`NARROW_ROUGHNESS`) from a prefiltered environment map. Final
+images use `importance_sampling.relight_surface` instead.
 """
 
 import math
@@ -28,25 +27,26 @@ from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.trace import Visibility
 from tumble.scene import Camera, Environment
 
-NARROW = (0.3, 0.45)
-"""Roughness up to which a few hundred directions cannot resolve the specular lobe, and from which they can."""
+NARROW_ROUGHNESS = (0.3, 0.45)
+"""Range of roughness over which `shade_split` blends from the prefiltered lobe to the sum over directions; below it, a
+few hundred directions cannot resolve the lobe."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Points that a camera sees, object frame."""
+    """Surface points behind some pixels of a view, object frame."""
 
     pixels: Int64[Tensor, " p"]
-    """Which pixels, counted row by row."""
+    """Indices of the pixels, counted row by row."""
     points: Float[Tensor, "p 3"]
-    """[object radius]"""
+    """Positions [object radius]."""
     normals: Float[Tensor, "p 3"]
-    """Outward, unit."""
+    """Outward unit normals."""
     views: Float[Tensor, "p 3"]
     """Unit directions to the camera."""
 
     def sample(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "p c"]:
-        """An image of the same view at the points."""
+        """Values of an image of the same view at the points."""
         return image.flatten(0, 1)[self.pixels]
 
     def paint(self, values: Float[Tensor, "p c"], height: int, width: int) -> Float[Tensor, "{height} {width} c"]:
@@ -63,13 +63,14 @@ def surface(
     alpha_min: float = 0.5,
     pixels: Int64[Tensor, " p"] | None = None,
 ) -> Surface:
-    """The points behind pixels, at their mean depth; differentiable in buffers and pose.
-
-    To shade detail of the normal (`Material.normal_offset`), add its image to `Buffers.normal` beforehand.
+    """Surface points behind pixels, at their mean depth; differentiable in buffers and pose.
 
     Args:
-        alpha_min: Coverage from which a pixel counts as surface: at a depth edge the mean depth is in mid-air.
-        pixels: Only these, counted row by row, each with a coverage above zero; all with `alpha_min` when None.
+        buffers: Buffers of the view. `normal` must already contain `Material.normal_offset` if it is to be shaded.
+        T_cam_obj: Pose of the view.
+        camera: Intrinsics of the view.
+        alpha_min: Minimum coverage of a pixel, since the mean depth at a depth edge is on neither surface.
+        pixels: Indices of the pixels, counted row by row, with coverage above 0; all with `alpha_min` when None.
     """
     if pixels is None:
         pixels = torch.where(buffers.alpha.flatten() >= alpha_min)[0]
@@ -84,19 +85,18 @@ def surface(
 
 @dataclass(frozen=True)
 class Bounce:
-    """Diffuse light from whatever stands in the way, itself in its own shade."""
+    """Indirect light from the shadowed diffuse radiance of every Gaussian under the light of the frame."""
 
     albedo: Float[Tensor, "n 3"]
     """Linear base colour of every Gaussian."""
     transfer: Float[Tensor, "n 9"]
-    """What every Gaussian sees of the light: `trace.transfer`."""
+    """Transfer vector of every Gaussian (`trace.transfer`)."""
 
     def radiance(self, directions: Float[Tensor, "D 3"], light: Float[Tensor, "D 3"]) -> Float[Tensor, "n 3"]:
-        """Radiance of every Gaussian under light from directions of equal area.
+        """Radiance of every Gaussian under a light given in evenly distributed directions.
 
-        Irradiance is that of harmonics to degree 2, within 1 % of the integral for most lights (Ramamoorthi and
-        Hanrahan 2001). What a Gaussian does not see of the sky is taken to be as bright as itself, which sums all
-        bounces (Jimenez et al. 2016): in grooves one bounce alone is too dark, and an open sky too bright.
+        The light is projected onto harmonics up to degree 2, which is accurate to 1 % of the irradiance for most lights
+        (Ramamoorthi and Hanrahan 2001). Shadows and all bounces are included, see `self_shadowed_irradiance`.
         """
         coefficients = 4 * math.pi / len(directions) * (spherical_harmonics.basis(directions, 2).mT @ light)
         return self.albedo / math.pi * self_shadowed_irradiance(self.transfer, coefficients, self.albedo)
@@ -105,22 +105,26 @@ class Bounce:
 def self_shadowed_irradiance(
     transfer: Float[Tensor, "n 9"], coefficients: Float[Tensor, "9 3"], albedo: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Irradiance of surfaces under light in harmonics to degree 2, with all bounces between them: `Bounce.radiance`."""
-    # Under a single lamp the truncated series dips below zero on the far side.
+    """Shadowed irradiance of surfaces, with all bounces, under light in harmonics up to degree 2.
+
+    The occluding surface is assumed to be as bright as the occluded point, which makes the bounces a geometric series
+    (Jimenez et al. 2016).
+    """
+    # Under a single small light the truncated series is negative on the opposite side.
     irradiance = (transfer @ coefficients).clamp(min=0)
-    sky = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
-    return irradiance / (1 - albedo * (1 - sky)).clamp(min=1e-3)
+    visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+    return irradiance / (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
 
 
 @dataclass(frozen=True)
 class AveragedBounce:
-    """The paper's indirect light: what stands in the way sends on its mean colour over all frames."""
+    """The paper's indirect light: the mean radiance of every Gaussian over all frames."""
 
     colour: Float[Tensor, "n 3"]
-    """Linear radiance of every Gaussian."""
+    """Mean linear radiance of every Gaussian."""
 
     def radiance(self, directions: Float[Tensor, "D 3"], light: Float[Tensor, "D 3"]) -> Float[Tensor, "n 3"]:
-        """The same under every light."""
+        """Radiance of every Gaussian, the same under every light."""
         return self.colour
 
 
@@ -140,9 +144,14 @@ def shade(
     Differentiable in everything but directions and visibility. Unbiased if the directions are rotated at random.
 
     Args:
-        visibility: What the points see; `trace.unoccluded` for everything.
+        surface: Surface points.
+        albedo: Linear albedo of the points.
+        roughness: Perceptual roughness of the points.
+        environment: Light, env frame.
+        R_env_obj: Rotation from the object frame to the env frame.
+        visibility: Visibility from the points; `trace.unoccluded` for no shadows.
         f0: Reflectance at normal incidence.
-        bounce: What stands in the way, where the visibility keeps blockers; black when None.
+        bounce: Indirect light, used if the visibility has blockers; occluded directions are black when None.
     """
     light = environment.lookup(visibility.directions @ R_env_obj.mT)
     return _sum(surface.normals, albedo, roughness, surface.views, visibility, light, bounce, f0)
@@ -157,7 +166,7 @@ def diffuse(
     *,
     bounce: Bounce | AveragedBounce | None = None,
 ) -> Float[Tensor, "p 3"]:
-    """The diffuse lobe of `shade` alone."""
+    """The diffuse lobe of `shade`."""
     light = environment.lookup(visibility.directions @ R_env_obj.mT)
     return _diffuse(surface, albedo, visibility, light, bounce)
 
@@ -173,20 +182,20 @@ def shade_split(
     f0: float | Float[Tensor, "*c"],
     bounce: Bounce | AveragedBounce | None = None,
 ) -> Float[Tensor, "p 3"]:
-    """Reflected radiance, the diffuse lobe summed over the directions, the specular one too where it is wide.
+    """Reflected radiance with wide lobes summed over the directions, and narrow specular lobes by the split sum.
 
-    A narrow lobe (`NARROW`), which the directions cannot resolve, is found by the split sum, its mirrored light dimmed
-    by the share of the lobe that is visible. The split sum alone sends back 1.6 times too much at grazing angles, where
-    the horizon cuts the lobe (test_a_wide_lobe_is_that_of_the_path_tracer). Arguments as for `shade`.
+    The split sum is multiplied by the visible fraction of the specular lobe. It is not used for wide lobes
+    (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the lobe
+    (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
     """
-    light = prefiltered.cells(visibility.directions @ R_env_obj.mT)
+    light = prefiltered.cell_radiance(visibility.directions @ R_env_obj.mT)
     narrow = specular(surface.normals, surface.views, roughness, prefiltered, R_env_obj, f0)
     narrow = lobe_visibility(surface, roughness, visibility) * narrow
     black = torch.zeros_like(albedo)
-    # The kernel's lobe is linear in f0, which may be learnt.
+    # The lobe is linear in f0, and the kernel does not differentiate f0, which may be learnt.
     wide = f0 * _sum(surface.normals, black, roughness, surface.views, visibility, light, bounce, 1.0)
-    share = ((roughness - NARROW[0]) / (NARROW[1] - NARROW[0])).clamp(0, 1)
-    return _diffuse(surface, albedo, visibility, light, bounce) + torch.lerp(narrow, wide, share)
+    wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
+    return _diffuse(surface, albedo, visibility, light, bounce) + torch.lerp(narrow, wide, wideness)
 
 
 def specular(
@@ -197,21 +206,30 @@ def specular(
     R_env_obj: Float[Tensor, "3 3"],
     f0: float | Float[Tensor, "*c"],
 ) -> Float[Tensor, "p 3"]:
-    """The specular lobe by the split sum, nothing in the way; unit normals and directions to the eye, object frame."""
+    """The specular lobe by the split sum, without occlusion.
+
+    Args:
+        normals: Unit normals, object frame.
+        views: Unit directions to the camera, object frame.
+        roughness: Perceptual roughness.
+        prefiltered: Light, env frame.
+        R_env_obj: Rotation from the object frame to the env frame.
+        f0: Reflectance at normal incidence.
+    """
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
-    share = f0 * brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
-    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * share
+    reflectance = f0 * brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
+    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * reflectance
 
 
 @torch.no_grad()
 def lobe_visibility(surface: Surface, roughness: Float[Tensor, "p 1"], visibility: Visibility) -> Float[Tensor, "p 1"]:
-    """Visible share of the specular lobe above the horizon; not differentiable.
+    """Visible fraction of the specular lobe above the horizon; not differentiable.
 
-    Directions are weighted as `prefilter` does, by a lobe no narrower than they lie apart. On a torus it errs by 0.02
-    to 0.07, where the one nearest bit errs by 0.10 to 0.18 and the visible share of the sky by 0.05 to 0.19.
+    Directions are weighted by the lobe of `prefilter`, widened to at least the distance between neighbouring
+    directions.
     """
     cosine = reflect(surface.views, surface.normals) @ visibility.directions.T
-    # GGX falls to a quarter 2 a from its peak; neighbours lie sqrt(4 pi / D) apart.
+    # GGX falls to a quarter at a distance of 2 a from its peak; neighbouring directions are sqrt(4 pi / D) apart.
     a = roughness.square().clamp(min=math.sqrt(math.pi / len(visibility.directions)) / 2)
     t = 0.5 * (1 - cosine) + a * a * 0.5 * (1 + cosine)
     above = surface.normals @ visibility.directions.T > 0
@@ -222,6 +240,7 @@ def lobe_visibility(surface: Surface, roughness: Float[Tensor, "p 1"], visibilit
 
 @cache
 def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size"]:
+    """The split-sum table, cached per device."""
     return brdf.split_sum_table().to(device, dtype)
 
 
@@ -232,7 +251,8 @@ def _diffuse(
     light: Float[Tensor, "D 3"],
     bounce: Bounce | AveragedBounce | None,
 ) -> Float[Tensor, "p 3"]:
-    # An eye behind the surface sees no highlight.
+    """The diffuse lobe summed over the directions."""
+    # For a camera behind the surface the kernel's specular lobe is 0.
     behind, unused = -surface.normals.detach(), torch.ones_like(albedo[:, :1])
     return _sum(surface.normals, albedo, unused, behind, visibility, light, bounce, 0.0)
 
@@ -247,17 +267,17 @@ def _sum(
     bounce: Bounce | AveragedBounce | None,
     f0: float,
 ) -> Float[Tensor, "p 3"]:
-    """Both lobes through the backend's kernel."""
-    blocker, sent = _in_the_way(visibility, light, bounce)
+    """Sum of both lobes over the directions, by the backend's kernel."""
+    blocker, indirect = _blocker_radiance(visibility, light, bounce)
     backend = backends.choose(normals.device, normals.dtype)
     directions, bits = visibility.directions, visibility.bits
-    return backend.shade(normals, albedo, roughness[:, 0], views, directions, light, bits, blocker, sent, f0)
+    return backend.shade(normals, albedo, roughness[:, 0], views, directions, light, bits, blocker, indirect, f0)
 
 
-def _in_the_way(
+def _blocker_radiance(
     visibility: Visibility, light: Float[Tensor, "D 3"], bounce: Bounce | AveragedBounce | None
 ) -> tuple[Int32[Tensor, "#p #D"], Float[Tensor, "n 3"]]:
-    """What stands in each direction, and the radiance that it sends on."""
+    """Index of the Gaussian that occludes each direction, -1 for none, and the radiance of every Gaussian."""
     if bounce is None or visibility.blocker is None:
         return torch.full((1, 1), -1, dtype=torch.int32, device=light.device), light.new_zeros(0, 3)
     return visibility.blocker, bounce.radiance(visibility.directions, light)

@@ -1,4 +1,4 @@
-"""The page of a run: what was found, how far to trust it, and a live view; one HTML file that loads nothing."""
+"""Report of a run: results, quality measures and a live relighting view in one self-contained HTML file."""
 
 from tumble.report.figures import panorama, small_camera
 from tumble.report.page import write_report

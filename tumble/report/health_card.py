@@ -1,4 +1,4 @@
-"""The health card: what was measured of a run, how bad that is, and what to do about it, in plain sentences."""
+"""Health card of a run: quality measures without ground truth, each with a rating and advice in plain sentences."""
 
 import math
 import statistics
@@ -6,167 +6,182 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from tumble.export import LAMPS, Confidence
+from tumble.export import N_LIGHTS, Confidence
 from tumble.poses import PoseQuality
 from tumble.report.training_views import RenderedFrame
 
-CardVerdict = Literal["good", "warn", "bad", "none"]
-WORDS: dict[CardVerdict, str] = {"good": "Good", "warn": "Watch", "bad": "Poor", "none": "Not known"}
-OVERALL: dict[CardVerdict, tuple[str, str]] = {
-    "good": ("Good", "Nothing stands out; the asset can be used."),
-    "warn": ("Usable", "Something is worth a look before the asset is used: "),
-    "bad": ("Doubtful", "Something went wrong: "),
+CardRating = Literal["good", "warn", "bad", "none"]
+"""Rating of a row, or of one frame within a row; "none" where nothing could be measured."""
+RATING_LABELS: dict[CardRating, str] = {"good": "Good", "warn": "Check", "bad": "Poor", "none": "No data"}
+"""Text of each rating."""
+OVERALL: dict[CardRating, tuple[str, str]] = {
+    "good": ("Good", "No problem was found; the asset can be used."),
+    "warn": ("Usable", "Please check before you use the asset: "),
+    "bad": ("Poor", "Please fix before you use the asset: "),
 }
+"""Word and sentence for the worst rating of a card; the names of the rows with this rating follow."""
 LIMITS = {
-    "fit": (26.0, 21.0),
-    "outline": (0.95, 0.90),
+    "psnr": (26.0, 21.0),
+    "iou": (0.95, 0.90),
     "exposure": (0.2, 0.5),
     "lost": (0.0, 0.1),
-    "match": (1.5, 3.0),
-    "variety": (0.2, 0.6),
+    "residual": (1.5, 3.0),
+    "few_lights": (0.2, 0.6),
 }
-"""Where a row turns yellow, and where red: [dB], IoU, [stops], share of frames, [pixels], share of the surface.
-
-Rules of thumb: synthetic captures with exact poses and the draft recipe lie on the good side of all of them.
-"""
-FEW_LIGHTS = LAMPS + 1
-"""Light directions under which a point had no more than light that turns with the object would have given it."""
+"""Limits beyond which a row is rated "warn" and "bad", rules of thumb: median PSNR [dB], median IoU, range of exposure
+[stops], fraction of lost frames, median match residual [pixels], fraction of the surface lit from few directions."""
+MIN_LIGHT_DIRECTIONS = N_LIGHTS + 1
+"""Number of light directions below which a point counts as lit from few directions: light that is fixed to the object
+gives at most one per bright light, `N_LIGHTS` in all."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the card."""
+    """One measure of the card."""
 
     name: str
     value: str
-    verdict: CardVerdict
+    """The measured value with its unit."""
+    rating: CardRating
     sentence: str
+    """Meaning of the rating, and what to do about it."""
     bars: tuple[float, ...] = ()
-    """One value per frame, NaN where there is none."""
-    marks: tuple[CardVerdict, ...] = ()
-    """One per bar."""
+    """One value per frame for the bar chart; NaN where there is none."""
+    marks: tuple[CardRating, ...] = ()
+    """Rating of each bar."""
 
 
-def card(frames: Sequence[RenderedFrame], quality: PoseQuality | None, seen: Confidence) -> list[Row]:
-    """All rows, in order."""
-    return [_fit(frames), _outline(frames), _exposure(frames), _lost(quality), _match(quality), _variety(seen)]
+def card(frames: Sequence[RenderedFrame], quality: PoseQuality | None, confidence: Confidence) -> list[Row]:
+    """All rows of the card, in the order of the page; `quality` is None if the poses came with the capture."""
+    return [
+        _photo_row(frames),
+        _silhouette_row(frames),
+        _exposure_row(frames),
+        _lost_row(quality),
+        _match_row(quality),
+        _light_row(confidence),
+    ]
 
 
-def overall(rows: Sequence[Row]) -> tuple[CardVerdict, str, str]:
-    """The worst verdict, a word and a sentence for it."""
-    found = {row.verdict for row in rows}
-    worst: CardVerdict = "bad" if "bad" in found else "warn" if "warn" in found else "good"
+def overall(rows: Sequence[Row]) -> tuple[CardRating, str, str]:
+    """The worst rating of all rows, with a word and a sentence for it."""
+    ratings = {row.rating for row in rows}
+    worst: CardRating = "bad" if "bad" in ratings else "warn" if "warn" in ratings else "good"
     word, sentence = OVERALL[worst]
-    names = ", ".join(row.name.lower() for row in rows if row.verdict == worst)
-    return worst, word, sentence if worst == "good" else f"{sentence}{names}. The health card says more."
+    names = ", ".join(row.name.lower() for row in rows if row.rating == worst)
+    return worst, word, sentence if worst == "good" else f"{sentence}{names}. The section Health gives the details."
 
 
-def _fit(frames: Sequence[RenderedFrame]) -> Row:
+def _photo_row(frames: Sequence[RenderedFrame]) -> Row:
     values = tuple(frame.psnr for frame in frames)
-    middle, limits = _median(values), LIMITS["fit"]
-    verdict = _low(middle, limits)
+    median, limits = _median(values), LIMITS["psnr"]
+    rating = _higher_is_better(median, limits)
     sentence = {
-        "good": "The renders match the photographs.",
-        "warn": "The renders differ visibly from the photographs. A longer recipe (--quality) often helps.",
-        "bad": "The renders do not look like the photographs. Suspect the poses first, then the masks, then a surface "
-        "that is not opaque or moves.",
+        "good": "The renders match the photos.",
+        "warn": "The renders differ visibly from the photos. Reconstructing with a higher --quality often helps.",
+        "bad": "The renders do not look like the photos. Check the poses first, then the masks; the method also fails "
+        "on objects that are transparent or not rigid.",
         "none": "No frame shows the object.",
-    }[verdict]
-    # A frame is an outlier against its own run: a dark object scores well everywhere.
-    off = [frame.name for frame, value in zip(frames, values, strict=True) if value < middle - 6]
-    verdict = "warn" if off and verdict == "good" else verdict
-    sentence += _list(off, "far worse than the rest; their poses may be wrong")
-    marks: tuple[CardVerdict, ...] = tuple("bad" if value < middle - 6 else "good" for value in values)
-    return Row("Fit to the photographs", f"{middle:.1f} dB", verdict, sentence, values, marks)
+    }[rating]
+    # Outliers are relative to the run's median, because PSNR depends on the object: it is high for any dark one.
+    outliers = [frame.name for frame, value in zip(frames, values, strict=True) if value < median - 6]
+    rating = "warn" if outliers and rating == "good" else rating
+    sentence += _frame_list(outliers, "more than 6 dB below the median; the poses there may be wrong")
+    marks: tuple[CardRating, ...] = tuple("bad" if value < median - 6 else "good" for value in values)
+    return Row("Renders against photos", f"{median:.1f} dB", rating, sentence, values, marks)
 
 
-def _outline(frames: Sequence[RenderedFrame]) -> Row:
+def _silhouette_row(frames: Sequence[RenderedFrame]) -> Row:
     values = tuple(frame.iou for frame in frames)
-    middle, limits = _median(values), LIMITS["outline"]
-    verdict = _low(middle, limits)
+    median, limits = _median(values), LIMITS["iou"]
+    rating = _higher_is_better(median, limits)
     sentence = {
-        "good": "The object's outline lies on the masks.",
-        "warn": "The outline misses parts of the masks: look for background in the masks, or thin parts that are gone.",
-        "bad": "The outline does not lie on the masks: poses or masks are wrong. Look at the mask preview of tumble "
-        "check.",
+        "good": "The rendered silhouettes match the masks.",
+        "warn": "The rendered silhouettes differ from the masks in places. Look for background inside the masks, and "
+        "for thin parts that are missing from the reconstruction.",
+        "bad": "The rendered silhouettes do not match the masks, so poses or masks are wrong. Look at the mask preview "
+        "of tumble check.",
         "none": "No frame has a mask.",
-    }[verdict]
-    off = [frame.name for frame, value in zip(frames, values, strict=True) if value < limits[1]]
-    sentence += _list(off, f"with an overlap under {limits[1]:.2f}")
-    return Row("Outline against mask", f"{middle:.3f} IoU", verdict, sentence, values, _lows(values, limits))
+    }[rating]
+    outliers = [frame.name for frame, value in zip(frames, values, strict=True) if value < limits[1]]
+    sentence += _frame_list(outliers, f"with an IoU below {limits[1]:.2f}")
+    return Row("Silhouettes against masks", f"{median:.3f} IoU", rating, sentence, values, _ratings(values, limits))
 
 
-def _exposure(frames: Sequence[RenderedFrame]) -> Row:
-    values = [frame.stops for frame in frames]
+def _exposure_row(frames: Sequence[RenderedFrame]) -> Row:
+    values = [frame.exposure_stops for frame in frames]
     known = sorted(value for value in values if not math.isnan(value))
     if len(known) < 4:
-        return Row("Exposure drift", "-", "none", "Too few frames to tell.")
-    # Nine frames in ten: one with a finger in front is no drift.
+        return Row("Exposure drift", "-", "none", "There are too few frames to measure it.")
+    # Range of the middle 90 % of the frames: a single frame with a finger in front of the object is no drift.
     margin = len(known) // 20
     drift = known[-1 - margin] - known[margin]
-    verdict, middle = _high(drift, LIMITS["exposure"]), statistics.median(known)
+    rating, median = _lower_is_better(drift, LIMITS["exposure"]), statistics.median(known)
     sentence = {
-        "good": "All photographs are about equally bright for what they show.",
-        "warn": "Some photographs are brighter than others for what they show: lock exposure and white balance.",
-        "bad": "The brightness wanders: exposure was automatic, or the light changed while filming. Lock exposure and "
-        "white balance, and film again.",
-    }[verdict]
-    bars = tuple(abs(value - middle) for value in values)
-    marks: tuple[CardVerdict, ...] = tuple(_high(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars)
-    return Row("Exposure drift", f"{drift:.2f} stops", verdict, sentence, bars, marks)
+        "good": "All photos are about equally bright, compared with their renders.",
+        "warn": "Some photos are brighter than others, compared with their renders. Lock exposure and white balance "
+        "when you record.",
+        "bad": "The brightness of the photos changes: exposure was automatic, or the light changed while recording. "
+        "Lock exposure and white balance, and record again.",
+    }[rating]
+    bars = tuple(abs(value - median) for value in values)
+    marks: tuple[CardRating, ...] = tuple(
+        _lower_is_better(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars
+    )
+    return Row("Exposure drift", f"{drift:.2f} stops", rating, sentence, bars, marks)
 
 
-def _lost(quality: PoseQuality | None) -> Row:
+def _lost_row(quality: PoseQuality | None) -> Row:
     if quality is None:
-        return Row("Lost frames", "-", "none", "The poses came with the capture; none was estimated.")
+        return Row("Lost frames", "-", "none", "The poses came with the capture, so none were estimated.")
     lost, limits = [bool(x) for x in quality.lost], LIMITS["lost"]
-    verdict = _high(sum(lost) / max(1, len(lost)), limits)
+    rating = _lower_is_better(sum(lost) / max(1, len(lost)), limits)
     sentence = {
-        "good": "Every frame was located.",
-        "warn": "A few frames could not be located; they are left out.",
-        "bad": "Many frames could not be located. Turn the object more slowly, and keep fingers off its texture.",
-        "none": "No frames.",
-    }[verdict]
-    marks: tuple[CardVerdict, ...] = tuple("bad" if x else "good" for x in lost)
+        "good": "A pose was found for every frame.",
+        "warn": "No pose was found for a few frames; they are left out.",
+        "bad": "No pose was found for many frames. Turn the object more slowly, and keep your fingers off its texture.",
+        "none": "There are no frames.",
+    }[rating]
+    marks: tuple[CardRating, ...] = tuple("bad" if x else "good" for x in lost)
     return Row(
-        "Lost frames", f"{sum(lost)} of {len(lost)}", verdict, sentence, tuple(0.15 + 0.85 * x for x in lost), marks
+        "Lost frames", f"{sum(lost)} of {len(lost)}", rating, sentence, tuple(0.15 + 0.85 * x for x in lost), marks
     )
 
 
-def _match(quality: PoseQuality | None) -> Row:
+def _match_row(quality: PoseQuality | None) -> Row:
     if quality is None:
-        return Row("Match residual", "-", "none", "The poses came with the capture; no matches were made.")
+        return Row("Match residual", "-", "none", "The poses came with the capture, so no matches were made.")
     values = tuple(float(x) for x in quality.residual)
-    middle, limits = _median(values), LIMITS["match"]
-    verdict = _high(middle, limits)
+    median, limits = _median(values), LIMITS["residual"]
+    rating = _lower_is_better(median, limits)
     sentence = {
-        "good": "The same points are found again in other frames, close to where they should be.",
-        "warn": "Points are found again some way off where they should be: the focal length may be wrong, or the "
-        "object is shiny.",
-        "bad": "Points do not fall where they should: the object may not be rigid, or it looks the same from several "
-        "sides.",
-        "none": "There were no matches; the poses rest on outlines alone.",
-    }[verdict]
+        "good": "Matched points lie close to where the poses predict them.",
+        "warn": "Matched points lie off from where the poses predict them. The focal length may be wrong (give --focal "
+        "or --fov if you know it), or the object is shiny.",
+        "bad": "Matched points lie far from where the poses predict them. The object may not be rigid, or may look the "
+        "same from several sides.",
+        "none": "There were no matches; the poses come from silhouettes alone.",
+    }[rating]
     sentence = f"{sentence} {quality.sentence}"
-    # Matches may agree with each other on a wrong turn; the health of the poses knows more.
-    if quality.verdict == "bad" or (quality.verdict == "warn" and verdict in ("good", "none")):
-        verdict = quality.verdict
-    value = "-" if math.isnan(middle) else f"{middle:.2f} px"
-    return Row("Match residual", value, verdict, sentence, values, tuple(_high(v, limits) for v in values))
+    # Consistent matches do not exclude wrong rotations; the rating of the poses uses more than the residual.
+    if quality.rating == "bad" or (quality.rating == "warn" and rating in ("good", "none")):
+        rating = quality.rating
+    value = "-" if math.isnan(median) else f"{median:.2f} px"
+    return Row("Match residual", value, rating, sentence, values, tuple(_lower_is_better(v, limits) for v in values))
 
 
-def _variety(seen: Confidence) -> Row:
-    shown = seen.views > 0
-    few = float((seen.lights[shown] < FEW_LIGHTS).float().mean()) if shown.any() else math.nan
-    verdict = _high(few, LIMITS["variety"])
+def _light_row(confidence: Confidence) -> Row:
+    visible = confidence.views > 0
+    few = float((confidence.lights[visible] < MIN_LIGHT_DIRECTIONS).float().mean()) if visible.any() else math.nan
+    rating = _lower_is_better(few, LIMITS["few_lights"])
     sentence = {
-        "good": "Nearly the whole surface was lit from many sides.",
-        "warn": "Parts of the surface were lit from few sides; there shading may have gone into the colour.",
-        "bad": "Much of the surface was lit from few sides: colour and light cannot be told apart there. Turn the "
-        "object about more than one axis.",
-        "none": "Nothing was seen.",
-    }[verdict]
-    return Row("Lit from few sides", "-" if math.isnan(few) else f"{few:.0%} of the surface", verdict, sentence)
+        "good": "Nearly the whole surface was lit from many directions.",
+        "warn": "Parts of the surface were lit from few directions; shading may be mixed into the colour there.",
+        "bad": "Much of the surface was lit from few directions, and colour and light cannot be separated there. Turn "
+        "the object about more than one axis when you record.",
+        "none": "No part of the surface is visible in any frame.",
+    }[rating]
+    return Row("Lit from few directions", "-" if math.isnan(few) else f"{few:.0%} of the surface", rating, sentence)
 
 
 def _median(values: Sequence[float]) -> float:
@@ -174,23 +189,25 @@ def _median(values: Sequence[float]) -> float:
     return statistics.median(known) if known else math.nan
 
 
-def _high(value: float, limits: tuple[float, float]) -> CardVerdict:
+def _lower_is_better(value: float, limits: tuple[float, float]) -> CardRating:
+    """Rating of a value that should stay below both limits, ("warn", "bad"); "none" for NaN."""
     if math.isnan(value):
         return "none"
     return "bad" if value > limits[1] else "warn" if value > limits[0] else "good"
 
 
-def _low(value: float, limits: tuple[float, float]) -> CardVerdict:
-    return _high(-value, (-limits[0], -limits[1]))
+def _higher_is_better(value: float, limits: tuple[float, float]) -> CardRating:
+    """Rating of a value that should stay above both limits, ("warn", "bad"); "none" for NaN."""
+    return _lower_is_better(-value, (-limits[0], -limits[1]))
 
 
-def _lows(values: Sequence[float], limits: tuple[float, float]) -> tuple[CardVerdict, ...]:
-    return tuple(_low(value, limits) for value in values)
+def _ratings(values: Sequence[float], limits: tuple[float, float]) -> tuple[CardRating, ...]:
+    return tuple(_higher_is_better(value, limits) for value in values)
 
 
-def _list(names: Sequence[str], what: str) -> str:
-    """A sentence that names at most four frames."""
+def _frame_list(names: Sequence[str], description: str) -> str:
+    """A sentence that names at most four frames; "" without names."""
     if not names:
         return ""
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return f" {len(names)} {'frame' if len(names) == 1 else 'frames'} {what}: {', '.join(names[:4])}{more}."
+    return f" {len(names)} {'frame' if len(names) == 1 else 'frames'} {description}: {', '.join(names[:4])}{more}."

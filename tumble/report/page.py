@@ -1,7 +1,7 @@
-"""The report of a run: one HTML file that is complete in itself and loads nothing.
+"""Report of a run: one self-contained HTML file with results, quality measures and a live relighting view.
 
-Every picture, the object, the lights and the scripts are embedded; a content security policy in the page forbids the
-rest. It shows what was found and how far to trust it, and never reads the truth of a capture.
+All images, the mesh, the lights and the scripts are embedded; a content security policy in the page forbids loading
+anything else. The report never uses the ground truth of a capture.
 """
 
 import base64
@@ -23,7 +23,7 @@ import torch
 from torch.nn.functional import normalize
 
 from tumble import __version__
-from tumble.datasets import which
+from tumble.datasets import reader_for
 from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
 from tumble.io import BadFile, files
@@ -33,13 +33,15 @@ from tumble.report import figures, health_card, preset_lights, svg, training_vie
 from tumble.report.training_views import RenderedFrame
 from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
 
-PAIRS, VIEWS = 6, 4
-"""Frames shown beside their renders, and views of the maps."""
+N_COMPARISONS = 6
+"""Number of photos shown beside their renders."""
+N_VIEWS = 4
+"""Number of views of the material and confidence maps."""
 MESH = Preset(triangles=12_000, texture=1024, cells=192, views=48, pixels=512)
-"""Of the object in the page: about two megabytes."""
+"""Settings of the mesh in the page, about two megabytes."""
 SECTIONS: dict[str, str] = {
     "relight": "Relight",
-    "frames": "Input against render",
+    "frames": "Photos and renders",
     "maps": "Material",
     "light": "Light and motion",
     "health": "Health",
@@ -47,62 +49,63 @@ SECTIONS: dict[str, str] = {
     "timings": "Timings",
     "configuration": "Configuration",
 }
+"""Title of each section, by the id of its element."""
 
 
 @dataclass(frozen=True)
-class Story:
-    """What is known of how a run went."""
+class RunSummary:
+    """Name, log and settings of a run."""
 
     name: str
-    """Of the object, or of the run."""
+    """Name of the object or the run."""
     records: Sequence[dict[str, Any]]
-    """Lines of the run's log."""
+    """Records of the run's log."""
     recipe: dict[str, Any]
     """Settings by stage."""
-    guess: float | None = None
-    """The capture's focal length where it is a guess [pixels]."""
+    assumed_focal: float | None = None
+    """The capture's focal length if it was assumed, else None [pixels]."""
 
 
 def write_report(out: Path, *, capture: Path | None = None) -> Path:
     """Write `report.html` into a finished run's folder; returns its path.
 
     Args:
-        capture: Where the capture is now, if not where the run found it.
+        capture: Path of the run's capture, if it was moved since the run.
 
     Raises:
-        BadFile: The run is not finished, or its capture is gone, or `capture` is not that of the run.
+        BadFile: The run is not finished, its capture is missing, or `capture` is not the capture of the run.
     """
-    asset, path = run.asset(out, Asset), capture or run.source(out)
+    asset, path = run.asset(out, Asset), capture or run.capture_source(out)
     if not path.exists():
-        raise BadFile(path, "is the run's capture and is gone", "say where it is: --capture")
-    whole = which(path).load(path)
-    taken = of_run(whole, asset, list(files.read_json(out / run.POSES)), path)
+        raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
+    full_capture = reader_for(path).load(path)
+    run_capture = frames_of_run(full_capture, asset, list(files.read_json(out / run.POSES)), path)
     tracked = run.output(out, run.TRACK, PoseResult)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
-    guess = float(whole.camera.fx_fy_cx_cy[0]) if whole.focal_guessed else None
-    story = Story(name, run.records(out), run.recipe(out), guess)
+    assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None
+    summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
     with tempfile.TemporaryDirectory() as folder:
-        glb = model(asset, Path(folder))
-        build(asset, taken, glb, story, tracked.quality if tracked else None, out / run.REPORT)
+        glb = write_model(asset, Path(folder))
+        build(asset, run_capture, glb, summary, tracked.quality if tracked else None, out / run.REPORT)
     return out / run.REPORT
 
 
-def of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Path) -> Capture:
+def frames_of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Path) -> Capture:
     """The frames of a capture that a run used, in the run's order.
 
     Raises:
-        BadFile: They are not all there.
+        BadFile: Frames of the run are missing, or their size differs.
     """
-    places = {name: place for place, name in enumerate(capture.names)}
+    index_of = {name: i for i, name in enumerate(capture.names)}
     size = (asset.camera.height, asset.camera.width)
-    if not set(names) <= places.keys() or tuple(capture.images.shape[1:3]) != size:
-        raise BadFile(path, "is not the capture of this run", "say which it is: --capture")
-    index = [places[name] for name in names]
+    if not set(names) <= index_of.keys() or tuple(capture.images.shape[1:3]) != size:
+        raise BadFile(path, "is not the capture of this run", "give the right one with --capture")
+    index = [index_of[name] for name in names]
     return Capture(capture.images[index], capture.masks[index], asset.camera, tuple(names), capture.light)
 
 
-def model(asset: Asset, folder: Path) -> Path | None:
-    """A small GLB of the asset in a folder; None where the Gaussians show no surface, or xatlas is not installed."""
+def write_model(asset: Asset, folder: Path) -> Path | None:
+    """Write a small GLB of the asset to a folder; None if the Gaussians have no surface or xatlas is not installed."""
     try:
         shape = extract_mesh(asset, MESH)
     except ValueError:
@@ -110,60 +113,60 @@ def model(asset: Asset, folder: Path) -> Path | None:
     try:
         write_textured_mesh(asset, shape, MESH, 1.0, folder / "asset.glb")
     except ModuleNotFoundError as error:
-        warnings.warn(f"{error}; the report shows no mesh", stacklevel=2)
+        warnings.warn(f"{error}; the report has no live view without a mesh", stacklevel=2)
         return None
     return folder / "asset.glb"
 
 
 @torch.no_grad()
 def build(
-    asset: Asset, capture: Capture, glb: Path | None, story: Story, quality: PoseQuality | None, out: Path
+    asset: Asset, capture: Capture, glb: Path | None, summary: RunSummary, quality: PoseQuality | None, out: Path
 ) -> list[health_card.Row]:
-    """Write the page; returns the health card that it shows.
+    """Write the page; returns the rows of its health card.
 
     Args:
-        asset: With material and light, on the CPU.
-        capture: Its training frames, in the order of the asset's trajectory.
-        glb: The object for the live view, which is left out without one.
-        quality: Of the poses, where they were estimated.
+        asset: Asset with material and light, on the CPU.
+        capture: The asset's training frames, in the order of its trajectory.
+        glb: Mesh for the live view; without one the live view is left out.
+        quality: Quality of the poses, if they were estimated.
     """
-    scene = training_views.scene(asset)
+    scene = training_views.prepare(asset)
     frames = list(training_views.frames(scene, capture))
-    chosen = figures.spread(asset, frames, PAIRS)
-    views = chosen[:VIEWS]
-    seen = confidence_of(asset, figures.small_camera(asset.camera))
-    rows = health_card.card(frames, quality, seen)
-    verdict, word, sentence = health_card.overall(rows)
-    hero = figures.hero(scene, views[0])
+    selected = figures.select_diverse(asset, frames, N_COMPARISONS)
+    views = selected[:N_VIEWS]
+    confidence = confidence_of(asset, figures.small_camera(asset.camera))
+    rows = health_card.card(frames, quality, confidence)
+    rating, word, sentence = health_card.overall(rows)
+    hero = figures.hero_image(scene, views[0])
     parts = {
-        "name": html.escape(story.name),
-        "verdict": verdict,
-        "verdict_word": word,
-        "verdict_sentence": html.escape(sentence),
+        "name": html.escape(summary.name),
+        "rating": rating,
+        "rating_word": word,
+        "rating_sentence": html.escape(sentence),
         "hero": figures.webp(hero),
-        "facts": _facts(asset, capture, story),
+        "facts": _facts(asset, capture, summary),
         "links": "".join(
-            f'<a href="#{key}">{words}</a>' for key, words in SECTIONS.items() if glb is not None or key != "relight"
+            f'<a href="#{key}">{title}</a>' for key, title in SECTIONS.items() if glb is not None or key != "relight"
         ),
-        "pairs": "".join(figures.pair(frame) for frame in sorted(chosen, key=lambda frame: frame.number)),
-        "maps": figures.maps(asset, views),
+        "pairs": "".join(figures.comparison(frame) for frame in sorted(selected, key=lambda frame: frame.number)),
+        "maps": figures.material_maps(asset, views),
         "panorama": figures.webp(figures.panorama(_environment(asset), 256)),
         "light_caption": LIGHT_CAPTIONS[asset.trajectory.light],
         "path": svg.globes(asset.trajectory.camera_positions.cpu().numpy()),
         "path_caption": _path_caption(asset),
-        "health_lead": f"Measured on all {len(frames)} training frames, without any truth: the finished asset is "
-        "rendered again at every pose and compared with the photograph.",
+        "health_lead": f"Measured on all {len(frames)} training frames, without ground truth: the finished asset is "
+        "rendered at the pose of each frame and compared with the photo.",
         "health": "".join(_row(row) for row in rows),
-        "confidence": figures.confidence(asset, views, seen),
-        "timings": _timings(story.records),
-        "configuration": _configuration(story.recipe),
+        "confidence": figures.confidence_maps(asset, views, confidence),
+        "timings": _timings(summary.records),
+        "configuration": _configuration(summary.recipe),
         "version": __version__,
         "css": _read("page.css"),
         "relight": "" if glb is None else _fill(_read("panel.html"), {"lights": _buttons(asset, views[0])}),
         "scripts": "" if glb is None else _scripts(asset, views[0], glb.read_bytes()),
     }
     page = _fill(_read("page.html"), parts)
-    files.write_whole(out, lambda partial: partial.write_text(page, "utf-8"))
+    files.write_atomically(out, lambda partial: partial.write_text(page, "utf-8"))
     return rows
 
 
@@ -175,21 +178,25 @@ def _read(name: str) -> str:
 
 
 def _fill(template: str, parts: dict[str, str]) -> str:
-    """The template with every `{{name}}` replaced at once: what is put in is not looked at again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)
+    """The template with every `{{name}}` replaced in one pass, so that inserted text is not expanded again."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 
 
-def _facts(asset: Asset, capture: Capture, story: Story) -> str:
-    seconds = sum(_seconds(story.records).values())
+def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> str:
+    seconds = sum(_seconds(summary.records).values())
     camera = asset.camera
     focal = float(camera.fx_fy_cx_cy[0])
-    said = "" if story.guess is None else ", a guess"
-    said = f" (estimated; the guess was {story.guess:.0f})" if story.guess not in (None, focal) else said
+    source = "" if summary.assumed_focal is None else ", assumed"
+    source = (
+        f" (estimated; {summary.assumed_focal:.0f} was assumed at the start)"
+        if summary.assumed_focal not in (None, focal)
+        else source
+    )
     facts = {
         "Frames": f"{len(capture)}",
         "Size": f"{camera.width} x {camera.height}",
-        "Focal length": f"{focal:.0f} pixels{said}",
-        "Light stands still with": {"camera": "the camera", "object": "the object"}[asset.trajectory.light],
+        "Focal length": f"{focal:.0f} pixels{source}",
+        "Light is fixed to": {"camera": "the camera", "object": "the object"}[asset.trajectory.light],
         "Gaussians": f"{len(asset.gaussians):,}".replace(",", " "),
         "Time": _duration(seconds) if seconds else "-",
     }
@@ -199,11 +206,13 @@ def _facts(asset: Asset, capture: Capture, story: Story) -> str:
 # Light and motion -----------------------------------------------------------------------------------------------------
 
 LIGHT_CAPTIONS = {
-    "camera": "The recovered light, tone-mapped. Its centre lies behind the object as the camera sees it, its left and "
-    "right edges behind the camera, its top above. What never shone on the object is a guess.",
-    "object": "The recovered light, tone-mapped, in the object's axes: its centre is -z, its right quarter +x, its top "
-    "+y. What never shone on the object is a guess.",
+    "camera": "The recovered light as a panorama, tone-mapped. The centre shows what is behind the object as seen from "
+    "the camera, the left and right edges what is behind the camera, the top what is above. Directions from which no "
+    "light reached the object are not reliable.",
+    "object": "The recovered light as a panorama, tone-mapped, in the object's axes: the centre is -z, the right "
+    "quarter is +x, the top is +y. Directions from which no light reached the object are not reliable.",
 }
+"""Caption of the panorama, by the frame to which the light is fixed."""
 
 
 def _environment(asset: Asset) -> Environment:
@@ -212,10 +221,10 @@ def _environment(asset: Asset) -> Environment:
 
 def _path_caption(asset: Asset) -> str:
     d = normalize(asset.trajectory.camera_positions, dim=-1)
-    touched = len((d @ fibonacci_sphere(64).to(d).T).argmax(-1).unique())
+    covered = len((d @ fibonacci_sphere(64).to(d).T).argmax(-1).unique())
     return (
-        "Where the camera stood about the object, in the object's own axes, from two opposite sides; blue is the first "
-        f"frame, orange the last. The {len(d)} frames touch {touched} of 64 equal parts of the sphere."
+        "Directions from which the camera saw the object, in the object's axes, on a globe drawn from two opposite "
+        f"sides. Blue is the first frame, orange the last. The {len(d)} frames cover {covered} of 64 equal parts of it."
     )
 
 
@@ -224,14 +233,15 @@ def _path_caption(asset: Asset) -> str:
 
 def _row(row: health_card.Row) -> str:
     return (
-        f'<div class="row {row.verdict}"><span class="mark {row.verdict}">{health_card.WORDS[row.verdict]}</span>'
+        f'<div class="row {row.rating}"><span class="mark {row.rating}">'
+        f"{health_card.RATING_LABELS[row.rating]}</span>"
         f"<div><small>{row.name}</small><b>{row.value}</b></div><p>{html.escape(row.sentence)}</p>"
         f'<div class="bars">{svg.bars(row.bars, row.marks)}</div></div>'
     )
 
 
 def _seconds(records: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Seconds of every finished stage, in order."""
+    """Duration of every finished stage, in order [s]."""
     return {record["name"]: record["seconds"] for record in records if record.get("event") == "done"}
 
 
@@ -244,7 +254,7 @@ def _duration(seconds: float) -> str:
 def _timings(records: Sequence[dict[str, Any]]) -> str:
     done = _seconds(records)
     if not done:
-        return '<p class="lead">No finished stage is in the log.</p>'
+        return '<p class="lead">The log contains no finished stage.</p>'
     lines = ""
     for name, seconds in done.items():
         steps = [record for record in records if record.get("name") == name and record.get("metrics")]
@@ -281,8 +291,8 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 # The live view --------------------------------------------------------------------------------------------------------
 
 
-def _shown_lights(asset: Asset, frame: RenderedFrame) -> dict[str, tuple[str, Environment]]:
-    """The lights of the live view by key, with their names; axes are the camera's of a frame, x right, y up."""
+def _live_view_lights(asset: Asset, frame: RenderedFrame) -> dict[str, tuple[str, Environment]]:
+    """Name and light of each button of the live view, by key, in a frame's camera axes (OpenGL: x right, y up)."""
     recovered = _environment(asset)
     if asset.trajectory.light == "object":
         R_cam_obj = asset.trajectory.T_cam_obj[frame.number].rotation.matrix()
@@ -300,7 +310,7 @@ def _buttons(asset: Asset, frame: RenderedFrame) -> str:
         f'<button type="button" data-light="{key}" aria-pressed="false">'
         f'<img src="{figures.webp(figures.panorama(light, 64))}" alt="">'
         f"{name}</button>"
-        for key, (name, light) in _shown_lights(asset, frame).items()
+        for key, (name, light) in _live_view_lights(asset, frame).items()
     )
 
 
@@ -311,17 +321,17 @@ def _rgbe(light: Environment) -> bytes:
 
 def _scripts(asset: Asset, frame: RenderedFrame, glb: bytes) -> str:
     pose = asset.trajectory.T_cam_obj[frame.number].rotation
-    # From OpenCV to OpenGL axes is half a turn about x: (w, x, y, z) -> (-x, w, -z, y), here written x, y, z, w.
+    # From OpenCV to OpenGL axes: rotation by pi about x, (w, x, y, z) -> (-x, w, -z, y); three.js orders x, y, z, w.
     w, x, y, z = pose.wxyz.tolist()
     camera = asset.camera
     fov = math.degrees(2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1])))
-    about = {"fov": fov, "object_to_camera": [w, -z, y, -x]}
-    parts = {"glb": glb} | {key: _rgbe(light) for key, (_, light) in _shown_lights(asset, frame).items()}
+    view = {"fov": fov, "object_to_camera": [w, -z, y, -x]}
+    parts = {"glb": glb} | {key: _rgbe(light) for key, (_, light) in _live_view_lights(asset, frame).items()}
     embedded = "".join(
         f'<script type="text/plain" id="{key}">{base64.b64encode(data).decode()}</script>\n'
         for key, data in parts.items()
     )
     return (
-        f'<script type="application/json" id="about">{json.dumps(about)}</script>\n{embedded}'
+        f'<script type="application/json" id="about">{json.dumps(view)}</script>\n{embedded}'
         f"<script>{_read('three.js')}</script>\n<script>{_read('panel.js')}</script>"
     )

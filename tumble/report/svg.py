@@ -1,4 +1,4 @@
-"""Small pictures made of lines, as SVG that takes its colours from the page."""
+"""Small line graphics as SVG whose colours come from the page's style sheet: bars, curves, camera paths."""
 
 import math
 from collections.abc import Sequence
@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 RADIUS = 100
-"""Of a drawn globe [SVG units]."""
+"""Radius of a globe [SVG units]."""
 
 
 def bars(values: Sequence[float], marks: Sequence[str]) -> str:
-    """One bar per frame from 0 to the largest value, coloured by its mark; empty without values."""
+    """Bar chart with one bar per frame, coloured by its mark; "" without a positive value. NaN leaves a gap."""
     top = max((value for value in values if not math.isnan(value)), default=0.0)
     if top <= 0:
         return ""
@@ -21,15 +21,15 @@ def bars(values: Sequence[float], marks: Sequence[str]) -> str:
         for i, (value, mark) in enumerate(zip(values, marks, strict=True))
         if not math.isnan(value)
     ]
-    about = f"One bar per frame, up to {top:.3g}"
+    title = f"One bar per frame; the highest is {top:.3g}"
     return (
-        f'<svg viewBox="0 0 {len(values)} 100" preserveAspectRatio="none" role="img"><title>{about}</title>'
+        f'<svg viewBox="0 0 {len(values)} 100" preserveAspectRatio="none" role="img"><title>{title}</title>'
         f"{''.join(shapes)}</svg>"
     )
 
 
 def curve(values: Sequence[float]) -> str:
-    """A line through values at equal distances, on a logarithmic scale when all are above zero; empty under two."""
+    """Line chart of equally spaced values, on a logarithmic scale if all are positive; "" for less than two values."""
     if len(values) < 2:
         return ""
     y = np.log(values) if min(values) > 0 else np.asarray(values)
@@ -39,38 +39,40 @@ def curve(values: Sequence[float]) -> str:
 
 
 def globes(positions: Float[np.ndarray, "t 3"]) -> str:
-    """Where the camera stood about the object, in the object frame, as seen from two opposite sides, +y up."""
+    """Camera path around the object in the object frame, on a globe drawn from two opposite sides, +y up."""
     d = positions / np.linalg.norm(positions, axis=-1, keepdims=True)
     width = 4 * RADIUS + 60
-    sides = "".join(_globe(d, turn, 15 + RADIUS + i * (2 * RADIUS + 30)) for i, turn in enumerate((0.5, 0.5 + math.pi)))
+    sides = "".join(
+        _globe(d, azimuth, 15 + RADIUS + i * (2 * RADIUS + 30)) for i, azimuth in enumerate((0.5, 0.5 + math.pi))
+    )
     return f'<svg viewBox="0 0 {width} {2 * RADIUS + 40}" role="img"><title>Camera path</title>{sides}</svg>'
 
 
-def _globe(d: Float[np.ndarray, "t 3"], turn: float, centre: float) -> str:
-    lean = 0.35
-    cos, sin = math.cos(turn), math.sin(turn)
-    R = np.array([[1, 0, 0], [0, math.cos(lean), -math.sin(lean)], [0, math.sin(lean), math.cos(lean)]]) @ np.array(
+def _globe(d: Float[np.ndarray, "t 3"], azimuth: float, centre: float) -> str:
+    tilt = 0.35
+    cos, sin = math.cos(azimuth), math.sin(azimuth)
+    R = np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]) @ np.array(
         [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]
     )
 
     def at(x: np.ndarray) -> str:
         return f"{centre + RADIUS * x[0]:.1f} {RADIUS + 12 - RADIUS * x[1]:.1f}"
 
-    around = np.linspace(0, 2 * math.pi, 73)
+    angles = np.linspace(0, 2 * math.pi, 73)
     rings = [
-        np.stack([math.cos(v) * np.cos(around), np.full_like(around, math.sin(v)), math.cos(v) * np.sin(around)], -1)
+        np.stack([math.cos(v) * np.cos(angles), np.full_like(angles, math.sin(v)), math.cos(v) * np.sin(angles)], -1)
         for v in (-math.pi / 3, -math.pi / 6, 0.0, math.pi / 6, math.pi / 3)
     ]
     rings += [
-        np.stack([np.cos(around) * math.cos(u), np.sin(around), np.cos(around) * math.sin(u)], -1)
+        np.stack([np.cos(angles) * math.cos(u), np.sin(angles), np.cos(angles) * math.sin(u)], -1)
         for u in np.arange(6) * math.pi / 6
     ]
-    lines = "".join(f'<path d="{_front(ring @ R.T, at)}"/>' for ring in rings)
-    shown = d @ R.T
-    track = f'<path d="{_front(shown, at)}"/>'
+    lines = "".join(f'<path d="{_near_side_path(ring @ R.T, at)}"/>' for ring in rings)
+    camera_path = d @ R.T
+    track = f'<path d="{_near_side_path(camera_path, at)}"/>'
     dots = "".join(
         f'<circle cx="{at(x).split()[0]}" cy="{at(x).split()[1]}" r="3.6" fill="{_colour(i / max(1, len(d) - 1))}"/>'
-        for i, x in enumerate(shown)
+        for i, x in enumerate(camera_path)
         if x[2] >= 0
     )
     return (
@@ -80,17 +82,17 @@ def _globe(d: Float[np.ndarray, "t 3"], turn: float, centre: float) -> str:
     )
 
 
-def _front(points: Float[np.ndarray, "n 3"], at) -> str:
-    """The parts of a line that lie on the near side."""
-    words, before = [], False
+def _near_side_path(points: Float[np.ndarray, "n 3"], at) -> str:
+    """SVG path of the parts of a polyline that lie on the near side of the globe."""
+    commands, before = [], False
     for x in points:
         near = bool(x[2] >= 0)
         if near:
-            words.append(("L" if before else "M") + at(x))
+            commands.append(("L" if before else "M") + at(x))
         before = near
-    return "".join(words)
+    return "".join(commands)
 
 
-def _colour(share: float) -> str:
-    """From blue (first frame) over green to orange (last): readable on light and dark."""
-    return f"hsl({215 - 185 * share:.0f} 65% 52%)"
+def _colour(fraction: float) -> str:
+    """Colour by time, from blue (first frame) over green to orange (last); readable on light and dark pages."""
+    return f"hsl({215 - 185 * fraction:.0f} 65% 52%)"

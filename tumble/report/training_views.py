@@ -1,6 +1,6 @@
-"""The training frames rendered again from the finished asset, each in a window around the object.
+"""Renders of the training frames from the finished asset, each in a window around the object.
 
-Photograph and render of a frame are compared in that window alone: what lies outside is black in both.
+Photo and render of a frame are compared within this window only; outside it both are black.
 """
 
 from collections.abc import Iterator
@@ -16,8 +16,8 @@ from tumble.rendering import (
     Buffers,
     Prefiltered,
     Tracer,
-    antialiased,
-    build,
+    antialiased_gbuffer,
+    build_tracer,
     prefilter,
     shade_split,
     surface,
@@ -25,61 +25,64 @@ from tumble.rendering import (
 )
 from tumble.scene import OBJECT, UNKNOWN, Asset, Camera, Capture, env_from_obj
 
-SIDE = 256
-"""Longer side of a window, at most [pixels]: enough for a page, and for numbers of a whole frame."""
-DIRECTIONS = 256
-SOLID = 0.5
-"""Coverage from which a pixel counts as object."""
+MAX_SIDE = 256
+"""Maximum longer side of a window's images [pixels]: enough for display, and for scores close to those at full size."""
+N_DIRECTIONS = 256
+"""Number of directions in which visibility is traced."""
+MIN_OBJECT_COVERAGE = 0.5
+"""Coverage from which a pixel belongs to the object."""
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One training frame and what the asset says of it, in one window."""
+    """One training frame and its render from the asset, in the same window."""
 
     number: int
+    """Index in the asset's trajectory."""
     name: str
     camera: Camera
-    """That sees the window, at the photograph's resolution."""
-    photograph: Float[Tensor, "h w 3"]
+    """Intrinsics of the window at the photo's full resolution."""
+    photo: Float[Tensor, "h w 3"]
     """sRGB in [0, 1]."""
     mask: Bool[Tensor, "h w"]
-    counted: Bool[Tensor, "h w"]
+    """Pixels that the capture's mask assigns to the object."""
+    valid: Bool[Tensor, "h w"]
     """Pixels whose mask is known."""
     rendered: Float[Tensor, "h w 3"]
     """sRGB in [0, 1], over black."""
     alpha: Float[Tensor, "h w"]
-    """Coverage by the asset."""
+    """Coverage by the rendered asset."""
 
     @property
-    def solid(self) -> Bool[Tensor, "h w"]:
-        """Pixels that the asset covers."""
-        return self.alpha >= SOLID
+    def silhouette(self) -> Bool[Tensor, "h w"]:
+        """Pixels that the rendered asset covers."""
+        return self.alpha >= MIN_OBJECT_COVERAGE
 
     @property
     def psnr(self) -> float:
-        """Of the object's pixels [dB]; NaN where the mask shows none."""
+        """PSNR over the object's pixels [dB]; NaN if the mask is empty."""
         if not self.mask.any():
             return float("nan")
-        return metrics.psnr(self.rendered, self.photograph, self.mask)
+        return metrics.psnr(self.rendered, self.photo, self.mask)
 
     @property
     def iou(self) -> float:
-        """Agreement of silhouette and mask; NaN where the mask shows nothing."""
-        return metrics.iou(self.solid, self.mask, self.counted) if self.mask.any() else float("nan")
+        """Intersection over union of the rendered silhouette and the mask; NaN if the mask is empty."""
+        return metrics.iou(self.silhouette, self.mask, self.valid) if self.mask.any() else float("nan")
 
     @property
-    def stops(self) -> float:
-        """How much brighter the photograph is than the render, over the pixels that neither clips [stops]."""
-        x, y = self.photograph, self.rendered
-        fair = (self.mask & self.solid & (x < 0.98).all(-1) & (y < 0.98).all(-1))[..., None].expand_as(x)
-        if not fair.any():
+    def exposure_stops(self) -> float:
+        """Exposure of the photo relative to the render, over unclipped pixels [stops]; NaN without such pixels."""
+        x, y = self.photo, self.rendered
+        unclipped = (self.mask & self.silhouette & (x < 0.98).all(-1) & (y < 0.98).all(-1))[..., None].expand_as(x)
+        if not unclipped.any():
             return float("nan")
-        ratio = linear_from_srgb(x[fair]).mean() / linear_from_srgb(y[fair]).mean().clamp(min=1e-6)
+        ratio = linear_from_srgb(x[unclipped]).mean() / linear_from_srgb(y[unclipped]).mean().clamp(min=1e-6)
         return float(ratio.clamp(min=1e-6).log2())
 
 
 def window(mask: Tensor) -> Box:
-    """A square around the object with a tenth to spare, as far as the picture reaches; all of it for an empty mask."""
+    """A square around the object with a margin of a tenth, clipped to the image; the whole image for an empty mask."""
     h, w = mask.shape
     if not mask.any():
         return 0, 0, h, w
@@ -93,26 +96,28 @@ def window(mask: Tensor) -> Box:
 
 @dataclass(frozen=True)
 class LitScene:
-    """An asset made ready to be rendered under its own light."""
+    """An asset with the structures for rendering it under its own light."""
 
     asset: Asset
     tracer: Tracer
+    """Ray tracer for visibility."""
     prefiltered: Prefiltered
+    """The asset's light, prefiltered for shading."""
 
 
-def scene(asset: Asset) -> LitScene:
-    """Of an asset with material and light."""
-    return LitScene(asset, build(asset.gaussians, asset.gamma), prefilter(asset.environment))
+def prepare(asset: Asset) -> LitScene:
+    """Build the tracer and prefilter the light of an asset, which needs material and light."""
+    return LitScene(asset, build_tracer(asset.gaussians, asset.gamma), prefilter(asset.environment))
 
 
 @torch.no_grad()
 def render(scene: LitScene, number: int, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Buffers]:
-    """One training pose through any camera, with shadows and without bounce: linear radiance over black."""
+    """Linear radiance over black of a training pose through any camera, with shadows but without indirect light."""
     material, trajectory = scene.asset.material, scene.asset.trajectory
     T_cam_obj = trajectory.T_cam_obj[number]
-    view = antialiased(scene.asset, T_cam_obj, camera)
+    view = antialiased_gbuffer(scene.asset, T_cam_obj, camera)
     points = surface(view, T_cam_obj, camera, alpha_min=0.1)
-    directions = fibonacci_sphere(DIRECTIONS).to(view.alpha)
+    directions = fibonacci_sphere(N_DIRECTIONS).to(view.alpha)
     shaded = shade_split(
         points,
         points.sample(view.features["albedo"]),
@@ -127,12 +132,12 @@ def render(scene: LitScene, number: int, camera: Camera) -> tuple[Float[Tensor, 
 
 @torch.no_grad()
 def frames(scene: LitScene, capture: Capture) -> Iterator[RenderedFrame]:
-    """All training frames of a capture whose frames are those of the asset's trajectory."""
+    """Renders of all frames of a capture, which must be those of the asset's trajectory."""
     for number, name in enumerate(capture.names):
         mask = capture.masks[number]
         box = window(mask == OBJECT)
         camera = scene.asset.camera.cropped(*box)
-        scale = min(1.0, SIDE / max(camera.height, camera.width))
+        scale = min(1.0, MAX_SIDE / max(camera.height, camera.width))
         size = (round(scale * camera.height), round(scale * camera.width))
         linear, view = render(scene, number, camera.resized(*size))
         is_object, unknown = (
@@ -142,9 +147,9 @@ def frames(scene: LitScene, capture: Capture) -> Iterator[RenderedFrame]:
             number=number,
             name=name,
             camera=camera,
-            photograph=resize_area(crop(capture.images[number], box).float() / 255, *size),
-            mask=is_object >= SOLID,
-            counted=unknown == 0,
+            photo=resize_area(crop(capture.images[number], box).float() / 255, *size),
+            mask=is_object >= MIN_OBJECT_COVERAGE,
+            valid=unknown == 0,
             rendered=srgb_from_linear(linear).clamp(0, 1).cpu(),
             alpha=view.alpha.cpu(),
         )

@@ -1,6 +1,6 @@
-"""What all rooms speak of: camera, trajectory, Gaussians, material, environment, capture, match, asset, visual hull.
+"""Data types of the project: camera, trajectory, Gaussians, material, environment, capture, match, asset, visual hull.
 
-Frozen dataclasses of tensors; a method computes from them and never writes to them.
+They are frozen dataclasses of tensors; methods compute from the fields and never modify them.
 """
 
 from tumble.scene import visual_hull
@@ -16,14 +16,14 @@ from tumble.scene.capture import (
     TargetView,
     Truth,
     content_key,
-    decoded_mask,
+    decode_mask,
     mask_from_alpha,
-    no_views,
     target_view,
+    truth_without_views,
 )
 from tumble.scene.environment import Environment, bilinear
-from tumble.scene.gaussians import Gaussians, constant_sh, facing, opacity, sdf_from_opacity
-from tumble.scene.match import Match, View, no_match
+from tumble.scene.gaussians import Gaussians, constant_sh, opacity, quats_from_normals, sdf_from_opacity
+from tumble.scene.match import Match, View, empty_match
 from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
 from tumble.scene.trajectory import LIGHTS, Light, Trajectory, env_from_obj, opengl_from_opencv
 
@@ -51,12 +51,12 @@ __all__ = [
     "bilinear",
     "constant_sh",
     "content_key",
-    "decoded_mask",
+    "decode_mask",
     "env_from_obj",
-    "facing",
+    "quats_from_normals",
     "mask_from_alpha",
-    "no_match",
-    "no_views",
+    "empty_match",
+    "truth_without_views",
     "opacity",
     "opengl_from_opencv",
     "sdf_from_opacity",

@@ -1,4 +1,4 @@
-"""What a user keeps of a run: the object, its material, the light it was seen under, and how it moved."""
+"""The reconstructed asset: geometry, material, environment light and motion of an object."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,13 @@ from tumble.scene.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Asset:
-    """A relightable object, as stage 3 puts it out."""
+    """A relightable object, the result of stage 3."""
 
     gaussians: Gaussians
     gamma: Float[Tensor, ""]
     """Sharpness of the opacity, shared by all Gaussians [1 / object radius] (eq. 8)."""
     material: Material
     environment: Environment
-    """The light of the capture, env frame of the trajectory."""
+    """Light of the capture, in the env frame of the trajectory."""
     trajectory: Trajectory
     camera: Camera

@@ -1,8 +1,8 @@
-"""What was filmed, and, for benchmarks, what is true about it.
+"""Captures (images, masks and camera of a recorded object) and their ground truth for benchmarks.
 
-A *mask* has three values: `OBJECT`, `BACKGROUND`, and `UNKNOWN` (a hand, an uncertain border), which no loss and no
-metric counts. *Evaluation views* are never trained on; their *region* is "shared" where every capture setting has seen
-what they show, else "sphere" (format.md).
+A *mask* has three values: `OBJECT`, `BACKGROUND`, and `UNKNOWN` (a hand, an uncertain border), which losses and metrics
+ignore. *Evaluation views* are held out from training. Their *region* is "shared" if the training frames of every
+capture setting show the same part of the object, else "sphere" (docs/format.md).
 """
 
 import hashlib
@@ -20,22 +20,29 @@ from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Light, Trajectory
 
-OBJECT, UNKNOWN, BACKGROUND = 255, 128, 0
+OBJECT = 255
+"""Mask value of pixels that show the object."""
+UNKNOWN = 128
+"""Mask value of pixels that losses and metrics ignore."""
+BACKGROUND = 0
+"""Mask value of pixels that do not show the object."""
 REGIONS = ("shared", "sphere")
+"""Regions of evaluation views."""
 Units = Literal["m", "arbitrary"]
 UNITS: tuple[str, ...] = get_args(Units)
 
 
 def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Opaque pixels are the object, clear ones background, what lies between is unknown."""
+    """Mask from an alpha channel: opaque pixels are OBJECT, transparent ones BACKGROUND, all others UNKNOWN."""
     return np.select([alpha >= 250, alpha <= 5], [OBJECT, BACKGROUND], UNKNOWN).astype(np.uint8)
 
 
-def decoded_mask(values: UInt8[np.ndarray, "h w"], *, invert: bool = False) -> UInt8[np.ndarray, "h w"]:
-    """A mask picture's code values as OBJECT, UNKNOWN and BACKGROUND; a picture of only 0 and 1 counts as 0 and 255.
+def decode_mask(values: UInt8[np.ndarray, "h w"], *, invert: bool = False) -> UInt8[np.ndarray, "h w"]:
+    """Mask with the values OBJECT, UNKNOWN and BACKGROUND from the code values of a mask image.
 
     Args:
-        invert: The object is black.
+        values: Code values; if the largest is 1, they count as 0 and 255.
+        invert: The object is black instead of white.
     """
     if values.max(initial=0) == 1:
         values = values * np.uint8(OBJECT)
@@ -44,35 +51,35 @@ def decoded_mask(values: UInt8[np.ndarray, "h w"], *, invert: bool = False) -> U
 
 @dataclass(frozen=True)
 class Capture:
-    """The training frames of one object: all that the method may see."""
+    """The training frames of one object: the complete input of the method."""
 
     images: UInt8[Tensor, "t h w 3"]
-    """Photographs, sRGB code values over black."""
+    """Photos, sRGB code values over black."""
     masks: UInt8[Tensor, "t h w"]
     """OBJECT, UNKNOWN or BACKGROUND."""
     camera: Camera
     names: tuple[str, ...]
     """File names of the frames, unique."""
     light: Light
-    """What the light stands still with."""
+    """Frame in which the light is static: "camera" or "object"."""
     trajectory: Trajectory | None = None
-    """Object poses where they are known, one per frame."""
-    focal_guessed: bool = False
-    """Whether nobody stated the camera's focal length: estimated poses bring a better one."""
+    """Known object poses, one per frame; None if the poses are unknown."""
+    focal_assumed: bool = False
+    """Whether the focal length is only assumed; pose estimation then refines it."""
 
     def __post_init__(self) -> None:
         t, h, w, _ = self.images.shape
-        assert self.masks.shape == (t, h, w), "one mask per image, of its size"
-        assert (self.camera.height, self.camera.width) == (h, w), "the camera has the images' size"
-        assert len(set(self.names)) == len(self.names) == t, "one name per frame, all different"
-        assert self.trajectory is None or len(self.trajectory) == t, "one pose per frame"
-        assert self.trajectory is None or self.trajectory.light == self.light, "one light"
+        assert self.masks.shape == (t, h, w), "there must be one mask per image, of the same size"
+        assert (self.camera.height, self.camera.width) == (h, w), "camera and images must have the same size"
+        assert len(set(self.names)) == len(self.names) == t, "there must be one name per frame, all different"
+        assert self.trajectory is None or len(self.trajectory) == t, "there must be one pose per frame"
+        assert self.trajectory is None or self.trajectory.light == self.light, "light must match the trajectory's"
 
     def __len__(self) -> int:
         return len(self.names)
 
     def select(self, frames: list[int]) -> "Capture":
-        """Some of the frames, in the order given."""
+        """The capture reduced to the given frames, in the given order."""
         names = tuple(self.names[i] for i in frames)
         trajectory = self.trajectory.select(frames) if self.trajectory else None
         images, masks = self.images[frames], self.masks[frames]
@@ -81,18 +88,18 @@ class Capture:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known about a capture and must not be trained on. Every part but the views is optional."""
+    """Ground truth of a capture, for evaluation only. Everything except the evaluation views is optional."""
 
     images: UInt8[Tensor, "v h w 3"]
-    """Photographs of the evaluation views, sRGB code values over black."""
+    """Photos of the evaluation views, sRGB code values over black."""
     masks: UInt8[Tensor, "v h w"]
-    """Of the evaluation views."""
+    """Masks of the evaluation views."""
     names: tuple[str, ...]
     """File names of the evaluation views, in order."""
     regions: tuple[str, ...]
     """"shared" or "sphere", one per evaluation view."""
     trajectory: Trajectory | None = None
-    """Object poses of the evaluation views; None when there are no such views."""
+    """Object poses of the evaluation views; None if there are no views."""
     albedo: Float[Tensor, "v h w 3"] | None = None
     """Linear base colour, 0 outside the object."""
     roughness: Float[Tensor, "v h w"] | None = None
@@ -102,29 +109,29 @@ class Truth:
     depth: Float[Tensor, "v h w"] | None = None
     """z-depth in the camera frame [object radius], 0 outside the object."""
     relit: dict[str, UInt8[Tensor, "v h w 3"]] = field(default_factory=dict)
-    """The evaluation views under other lights, sRGB code values over black, by the light's name."""
+    """Evaluation views under other lights, sRGB code values over black, by name of the light."""
     light: Environment | None = None
-    """The light of the capture, env frame of the capture."""
+    """Light of the capture, env frame of the capture."""
     lights: dict[str, Environment] = field(default_factory=dict)
-    """The lights of `relit`, object frame."""
+    """Lights of `relit`, object frame."""
     poses: Trajectory | None = None
     """True poses of the training frames."""
     pose_names: tuple[str, ...] = ()
-    """Names of the training frames that `poses` belong to, in order; empty: of all."""
+    """Names of the training frames that `poses` belong to, in order; empty if they belong to all training frames."""
     units: Units = "arbitrary"
-    """Of the poses: metres, or nobody knows."""
+    """Unit of the poses: metres, or unknown."""
     setting: str | None = None
-    """A label for reports: "handheld", "turntable", "dome"."""
+    """Label for reports: "handheld", "turntable" or "dome"."""
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def posed(self, capture: Capture) -> dict[str, int]:
-        """The training frames of its capture that have a true pose, in order, with their place in `poses`."""
+    def pose_indices(self, capture: Capture) -> dict[str, int]:
+        """Index in `poses` of every training frame with a true pose, by frame name in the order of the capture."""
         if self.poses is None:
             return {}
-        places = {name: place for place, name in enumerate(self.pose_names or capture.names)}
-        return {name: places[name] for name in capture.names if name in places}
+        indices = {name: index for index, name in enumerate(self.pose_names or capture.names)}
+        return {name: indices[name] for name in capture.names if name in indices}
 
     def views(self, region: str) -> list[int]:
         """Indices of the evaluation views of one region, in order."""
@@ -132,22 +139,21 @@ class Truth:
 
     @property
     def foreground(self) -> Tensor:
-        """Pixels that surely show the object, `bool[v h w]`."""
+        """Pixels whose mask is OBJECT, `bool[v h w]`."""
         return self.masks == OBJECT
 
 
-def no_views(camera: Camera) -> Truth:
-    """A truth without evaluation views, to hang light and poses on."""
+def truth_without_views(camera: Camera) -> Truth:
+    """Ground truth without evaluation views, to which light and poses can be added."""
     shape = (0, camera.height, camera.width)
     return Truth(torch.zeros(*shape, 3, dtype=torch.uint8), torch.zeros(shape, dtype=torch.uint8), (), ())
 
 
 def content_key(capture: Capture) -> str:
-    """A hash of what a capture shows: images, masks, camera, poses, names of the frames, and who carries the light; and
-    of whether its focal length is a guess."""
+    """SHA-256 of everything in a capture: images, masks, camera, poses, frame names, light and `focal_assumed`."""
     digest = hashlib.sha256()
     facts = {"names": capture.names, "light": capture.light, "size": (capture.camera.height, capture.camera.width)}
-    facts |= {"focal": "guess"} if capture.focal_guessed else {}
+    facts |= {"focal": "guess"} if capture.focal_assumed else {}
     digest.update(json.dumps(facts, sort_keys=True).encode())
     for name, x in tree.named_tensors(capture).items():
         digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
@@ -157,18 +163,18 @@ def content_key(capture: Capture) -> str:
 
 @dataclass(frozen=True)
 class TargetView:
-    """One photograph as losses compare with it."""
+    """One training image in the form that losses compare a rendered image with."""
 
     image: Float[Tensor, "h w 3"]
     """sRGB in [0, 1]."""
     mask: Float[Tensor, "h w"]
-    """1 where the pixel surely shows the object."""
+    """1 at OBJECT pixels, else 0."""
     valid: Float[Tensor, "h w 1"]
-    """0 where nobody knows what the pixel shows."""
+    """0 at UNKNOWN pixels, else 1."""
 
 
 def target_view(capture: Capture, number: int, like: Tensor) -> TargetView:
-    """Photograph `number` of a capture in the dtype and on the device of `like`."""
+    """Training image `number` of a capture, with the dtype and device of `like`."""
     mask = capture.masks[number].to(like.device)
     image = capture.images[number].to(like) / 255
     return TargetView(image, (mask == OBJECT).to(like), (mask != UNKNOWN).to(like)[..., None])

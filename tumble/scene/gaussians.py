@@ -1,7 +1,7 @@
-"""3D Gaussians whose opacity is tied to a signed distance (paper section 4.2).
+"""3D Gaussians whose opacity is a function of a signed distance (paper section 4.2).
 
-Object frame, object radius = 1. The third local axis is the *normal*, signed outward at birth; its scale is the
-*thickness* (a deviation from the paper's axis of the smallest scale: an argmin flips while training).
+Object frame, object radius = 1. The third local axis is the *normal*, which initially points outwards; its scale is the
+*thickness*. The paper takes the axis of the smallest scale instead, whose argmin may change during training.
 """
 
 import math
@@ -18,12 +18,12 @@ from tumble.maths import SO3
 
 @dataclass(frozen=True)
 class Gaussians:
-    """The geometry and the stage-2 colour of an object; raw parameters, as trained."""
+    """Geometry and stage-2 colour of an object; raw parameters, as trained."""
 
     means: Float[Tensor, "n 3"]
     """Centres [object radius]."""
     quats: Float[Tensor, "n 4"]
-    """Local to object rotations, wxyz, not necessarily of unit length."""
+    """Rotations from local to object frame, wxyz, not necessarily of unit length."""
     log_scales: Float[Tensor, "n 3"]
     """Logarithms of the standard deviations along the local axes [log object radius]."""
     sdf: Float[Tensor, " n"]
@@ -33,7 +33,7 @@ class Gaussians:
 
     @property
     def R_obj_local(self) -> Float[Tensor, "n 3 3"]:
-        """Local to object rotations."""
+        """Rotations from local to object frame."""
         return SO3(torch.nn.functional.normalize(self.quats, dim=-1)).matrix()
 
     @property
@@ -51,7 +51,7 @@ class Gaussians:
 
 
 class _ThirdAxis(torch.autograd.Function):
-    """The third column of the rotations of quaternions of any length but 0: quadratic in q, over |q|^2."""
+    """Third column of the rotation matrices of quaternions of any non-zero length: a quadratic form of q over |q|^2."""
 
     @staticmethod
     def forward(ctx: Any, quats: Tensor) -> Tensor:
@@ -86,20 +86,20 @@ def opacity(sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor,
 
 
 def sdf_from_opacity(opacity: Float[Tensor, " n"], gamma: Float[Tensor, ""]) -> Float[Tensor, " n"]:
-    """The non-negative signed distance [object radius] with a given opacity in (0, 1]: the inverse of eq. 8."""
+    """Non-negative signed distance [object radius] of a given opacity in (0, 1], the inverse of `opacity` (eq. 8)."""
     return 2 / gamma * torch.acosh(opacity.rsqrt())
 
 
 def constant_sh(radiance: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
-    """Harmonics of degree 0 that look the same from everywhere: linear radiance computed elsewhere, as a colour.
+    """Spherical harmonics of degree 0 that represent a given linear radiance, the same in all directions.
 
-    What a rasterizer reads back is `max(0, radiance)`.
+    The rasterizer evaluates them to `max(0, radiance)`.
     """
     return radiance[:, None] * math.sqrt(4 * math.pi)
 
 
-def facing(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Shortest rotations that take the third axis to given normals, wxyz."""
+def quats_from_normals(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Quaternions wxyz of the shortest rotations that take the third axis to given unit normals."""
     z = normals[:, 2:]
     w = 1 + z
     axis = torch.stack([-normals[:, 1], normals[:, 0], torch.zeros_like(normals[:, 0])], -1)

@@ -1,4 +1,4 @@
-"""What two frames show of the same surface points: pairs of pixels, the food of stage 1."""
+"""Pixel correspondences between two frames, the input of stage 1."""
 
 from dataclasses import dataclass
 
@@ -9,48 +9,48 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class View:
-    """One frame as it is handed to a matcher; a virtual camera's frame serves as well as a photograph."""
+    """One frame as input of a matcher: a frame of the capture or of a virtual camera."""
 
     number: int
-    """Index of the frame, repeated in the Match."""
+    """Index of the frame, which becomes `i` or `j` of the `Match`."""
     image: UInt8[Tensor, "h w 3"]
     """sRGB code values."""
     mask: UInt8[Tensor, "h w"]
-    """OBJECT, UNKNOWN or BACKGROUND: only what is surely object is matched."""
+    """OBJECT, UNKNOWN or BACKGROUND; only OBJECT pixels are matched."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Corresponding pixels of two frames; may be empty."""
+    """Pixel correspondences between two frames; may be empty."""
 
     i: int
-    """Index of the one frame."""
+    """Index of the first frame."""
     j: int
-    """Index of the other."""
+    """Index of the second frame."""
     uv_i: Float[Tensor, "m 2"]
     """Positions in frame i [pixels, centres at +0.5]."""
     uv_j: Float[Tensor, "m 2"]
-    """Of the same surface points in frame j."""
+    """Positions of the same surface points in frame j [pixels, centres at +0.5]."""
     confidence: Float[Tensor, " m"]
-    """In [0, 1], comparable within one matcher only."""
+    """Confidence in [0, 1], comparable only within one matcher."""
 
     def __post_init__(self) -> None:
         m = len(self.confidence)
-        assert self.i != self.j, "two frames"
-        assert self.uv_i.shape == self.uv_j.shape == (m, 2), "one position in each frame per correspondence"
+        assert self.i != self.j, "a match needs two different frames"
+        assert self.uv_i.shape == self.uv_j.shape == (m, 2), "a correspondence needs one position in each frame"
 
     def __len__(self) -> int:
         return len(self.confidence)
 
     def reversed(self) -> "Match":
-        """The same correspondences, named the other way round."""
+        """The same correspondences with both frames swapped."""
         return Match(self.j, self.i, self.uv_j, self.uv_i, self.confidence)
 
     def select(self, keep: Tensor) -> "Match":
-        """Some of the correspondences, by index or mask."""
+        """The match reduced to the given correspondences (indices or boolean mask)."""
         return Match(self.i, self.j, self.uv_i[keep], self.uv_j[keep], self.confidence[keep])
 
 
-def no_match(i: int, j: int) -> Match:
-    """Two frames that have nothing in common."""
+def empty_match(i: int, j: int) -> Match:
+    """A match without correspondences."""
     return Match(i, j, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0))

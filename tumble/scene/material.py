@@ -1,6 +1,6 @@
-"""Albedo, roughness and normal detail at the four corners of every Gaussian's plane (paper section 4.3).
+"""Albedo, roughness and normal offsets at the four corners of the plane of every Gaussian (paper section 4.3).
 
-Corner order: (-,-), (+,-), (-,+), (+,+) along the Gaussian's first and second local axis.
+Corner order: (-,-), (+,-), (-,+), (+,+) along the first and second local axis of the Gaussian.
 """
 
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 DIELECTRIC = 0.04
-"""Reflectance at normal incidence of most things that are not metal (paper section 4.3)."""
+"""Reflectance at normal incidence (f0) of most non-metals (paper section 4.3)."""
 TEMPERATURE = 2.0
-"""Appendix A: sigmoid with temperature 2. Read as sigmoid(x / 2), whose tails keep a gradient further out."""
+"""Temperature of the sigmoid activations (appendix A), taken as sigmoid(x / 2), whose gradient vanishes later."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,13 @@ class Material:
     roughness_logits: Float[Tensor, "n 4"]
     """Perceptual roughness r before activation; GGX alpha = r^2."""
     normal_offset: Float[Tensor, "n 4 3"]
-    """Added to the Gaussian's normal before it is normalised, object frame."""
+    """Offset added to the normal of the Gaussian before normalisation, object frame."""
     f0_logit: Float[Tensor, ""]
-    """Reflectance at normal incidence before activation, one for the object."""
+    """Reflectance at normal incidence before activation, shared by the whole object."""
 
     @staticmethod
     def constant(n: int, albedo: Float[Tensor, "3"], roughness: float) -> "Material":
-        """`n` Gaussians of one material: linear albedo and roughness in (0, 1), no normal detail."""
+        """Uniform material of `n` Gaussians: linear albedo and roughness in (0, 1), no normal offset."""
         albedo_logits = (TEMPERATURE * torch.logit(albedo)).expand(n, 4, 3).clone()
         rough = TEMPERATURE * torch.logit(albedo.new_tensor(roughness))
         f0_logit = albedo.new_zeros(())
@@ -48,5 +48,5 @@ class Material:
 
     @property
     def f0(self) -> Float[Tensor, ""]:
-        """Reflectance at normal incidence: 0.04, the paper's dielectric, where the logit is 0; at most twice that."""
+        """Reflectance at normal incidence in (0, 2 * DIELECTRIC); a logit of 0 gives DIELECTRIC."""
         return 2 * DIELECTRIC * torch.sigmoid(self.f0_logit)

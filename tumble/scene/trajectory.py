@@ -1,8 +1,8 @@
-"""How the object moved before the camera, and with whom the light stands still.
+"""The trajectory: object poses in the camera frame, and the frame in which the light is static.
 
-Frames: `obj` (the object, inside the unit ball), `cam` (OpenCV), `env` (where the light map does not move). With
-`light == "camera"` the env frame is the camera in OpenGL axes (x right, y up, z backwards), so that the map's top is up
-in the picture; with `light == "object"` it is the object frame (format.md).
+Frames: `obj` (the object, inside the unit sphere), `cam` (OpenCV), `env` (the frame of the environment map). With
+`light == "camera"` the env frame is the camera with OpenGL axes (x right, y up, z backwards), so that the top of the
+map is up in the image; with `light == "object"` it is the object frame (docs/format.md).
 """
 
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from torch import Tensor
 from tumble.maths import SE3
 
 Light = Literal["camera", "object"]
+"""Frame in which the light is static."""
 LIGHTS: tuple[str, ...] = get_args(Light)
 
 
@@ -25,7 +26,7 @@ def opengl_from_opencv(like: Tensor) -> Float[Tensor, "3 3"]:
 
 
 def env_from_obj(T_cam_obj: SE3, light: Light) -> Float[Tensor, "*b 3 3"]:
-    """`R_env_obj` of any poses: what the word `light` means; rotation only, because the light is far away (eq. 3)."""
+    """`R_env_obj` of given poses; rotation only, because the light is distant (eq. 3)."""
     R_cam_obj = T_cam_obj.rotation.matrix()
     if light == "camera":
         return opengl_from_opencv(R_cam_obj) @ R_cam_obj
@@ -34,39 +35,39 @@ def env_from_obj(T_cam_obj: SE3, light: Light) -> Float[Tensor, "*b 3 3"]:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Object pose per frame, and the frame in which the environment does not move."""
+    """Object pose per frame, and the frame in which the light is static."""
 
     T_cam_obj: SE3
     """Object to camera (OpenCV axes), one per frame [object radius]."""
     light: Light
-    """Hand-held and turntable captures: "camera". Static dome: "object"."""
+    """"camera" for hand-held and turntable captures, "object" for a static dome."""
 
     @staticmethod
     def from_camera_to_object(matrices: Float[Tensor, "t 4 4"], light: Light) -> "Trajectory":
-        """From the `transform_matrix` of format.md: camera to object, OpenGL camera axes."""
+        """From the `transform_matrix` of docs/format.md: camera to object, OpenGL camera axes."""
         T_obj_gl = SE3.from_matrix(matrices)
         T_gl_cam = SE3.from_rotation_matrix(opengl_from_opencv(matrices))
         return Trajectory((T_obj_gl @ T_gl_cam).inverse(), light)
 
     def camera_to_object(self) -> Float[Tensor, "t 4 4"]:
-        """The `transform_matrix` of format.md: camera to object, OpenGL camera axes."""
+        """The `transform_matrix` of docs/format.md: camera to object, OpenGL camera axes."""
         T_cam_gl = SE3.from_rotation_matrix(opengl_from_opencv(self.T_cam_obj.xyz))
         return (self.T_cam_obj.inverse() @ T_cam_gl).matrix()
 
     @property
     def R_env_obj(self) -> Float[Tensor, "t 3 3"]:
-        """Object to environment; rotation only, because the light is far away (eq. 3)."""
+        """Object to environment; rotation only, because the light is distant (eq. 3)."""
         return env_from_obj(self.T_cam_obj, self.light)
 
     @property
     def camera_positions(self) -> Float[Tensor, "t 3"]:
-        """Where the camera stands, object frame [object radius]."""
+        """Camera centres, object frame [object radius]."""
         return self.T_cam_obj.inverse().xyz
 
     def __len__(self) -> int:
         return self.T_cam_obj.xyz.shape[0]
 
     def select(self, frames: Sequence[int] | Tensor) -> "Trajectory":
-        """The poses of some frames, in the order given."""
+        """The trajectory reduced to the given frames, in the given order."""
         index = torch.as_tensor(frames, dtype=torch.long, device=self.T_cam_obj.xyz.device)
         return Trajectory(self.T_cam_obj[index], self.light)

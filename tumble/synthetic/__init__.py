@@ -1,33 +1,34 @@
-"""Captures with exact truth: any GLB under any light map in one of the three settings, path traced by Mitsuba."""
+"""Synthetic captures with ground truth: a GLB model under an environment map in one of the three capture settings,
+path traced by Mitsuba."""
 
 from typing import TYPE_CHECKING
 
-from tumble._lazy import lazily
+from tumble._lazy import lazy_getattr
 
 if TYPE_CHECKING:
-    from tumble.synthetic.demo_object import environment, other_environment, write_object
+    from tumble.synthetic.demo_object import room_environment, sunset_environment, write_pot
     from tumble.synthetic.options import SynthOptions
-    from tumble.synthetic.pathtracer import OLDEST_LLVM, find_llvm
+    from tumble.synthetic.pathtracer import MIN_LLVM, find_llvm
     from tumble.synthetic.synthesize import SETTINGS_FILE, render_capture, render_captures
 
 __all__ = [
+    "MIN_LLVM",
     "SETTINGS_FILE",
-    "OLDEST_LLVM",
     "SynthOptions",
-    "environment",
     "find_llvm",
-    "other_environment",
     "render_capture",
     "render_captures",
-    "write_object",
+    "room_environment",
+    "sunset_environment",
+    "write_pot",
 ]
 
-__getattr__ = lazily(
+__getattr__ = lazy_getattr(
     __name__,
     {
-        "demo_object": ("environment", "other_environment", "write_object"),
+        "demo_object": ("room_environment", "sunset_environment", "write_pot"),
         "options": ("SynthOptions",),
-        "pathtracer": ("OLDEST_LLVM", "find_llvm"),
+        "pathtracer": ("MIN_LLVM", "find_llvm"),
         "synthesize": ("SETTINGS_FILE", "render_capture", "render_captures"),
     },
 )

@@ -1,4 +1,4 @@
-"""How a synthetic capture is made: the options of `tumble synth`. Loads nothing, for `--help`."""
+"""Options of `tumble synth`. The module imports only the standard library, so that `--help` is fast."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,49 +9,51 @@ Setting = Literal["dome", "turntable", "handheld"]
 
 @dataclass(frozen=True)
 class SynthOptions:
-    """How a capture is made."""
+    """How a synthetic capture is rendered."""
 
     env: str
-    """The light: a lat-long .hdr or .exr file (+y up), or the word "white" for a uniform one."""
+    """Environment map: a lat-long .hdr or .exr file (+y up), or "white" for uniform light."""
     setting: Setting = "handheld"
-    """dome (still object), turntable, or handheld."""
+    """Capture setting. dome: the camera moves around a still object; turntable: the object rotates about the vertical
+    in front of a still camera; handheld: it rotates about changing axes in front of a still camera."""
     views: int = 64
-    """Training frames."""
+    """Number of training frames."""
     resolution: int = 128
-    """Height and width [pixels]."""
+    """Height and width of all images [pixels]."""
     fov: float = 30.0
-    """Field of view [degrees]; the object fills it."""
+    """Field of view [degrees]; the camera's distance is set so that the object fills it."""
     samples: int = 400
-    """Paths per pixel of a photograph."""
+    """Samples per pixel of the training and evaluation images."""
     truth_samples: int = 1024
-    """Paths per pixel of a relit picture: a score near 40 dB must not measure the truth's noise."""
+    """Samples per pixel of the relit ground truth; many, because noise there limits the PSNR that can be measured."""
     path_depth: int = 5
-    """Path segments: 2 is direct light alone, each further one adds a bounce between parts of the object."""
+    """Maximum number of path segments: 2 is direct light only, each further one adds one interreflection."""
     material: Literal["original", "diffuse"] = "original"
-    """original: the file's base colour and roughness as a dielectric (F0 = 0.04); diffuse: Lambertian."""
+    """original: base colour and roughness of the file as a dielectric (F0 = 0.04); diffuse: Lambertian."""
     roughness: float | None = None
-    """Replaces the file's roughness everywhere."""
+    """Constant roughness that replaces the one of the file."""
     env_rotation: float = 0.0
-    """Turns the light about the vertical [degrees]."""
+    """Rotation of the environment map about the vertical [degrees]."""
     up: Literal["y", "z"] = "y"
-    """The object file's upward axis."""
+    """Upward axis of the object file."""
     relight: tuple[str, ...] = ()
-    """Lights for relit truth, like `env`; their frame is the object's, their names are the files' stems."""
+    """Environment maps for relit ground truth, given like `env` and stored under the stem of the file name. They are
+    fixed to the object frame."""
     eval_shared: int = 12
-    """Evaluation views 15 to 35 degrees above the horizon."""
+    """Number of evaluation views 15 to 35 degrees above the horizon (region "shared")."""
     eval_sphere: int = 6
-    """Evaluation views from anywhere."""
+    """Number of evaluation views from all directions (region "sphere")."""
     exposure: float | None = None
-    """Factor on the light; None lets about one percent of the object's pixels saturate."""
+    """Factor on the light; if None, it is set so that about one percent of the object's pixels saturate."""
     pose_free: bool = False
-    """Leave the poses of training frames out of transforms.json (they are kept in truth/poses.json)."""
+    """Omit the poses of the training frames from transforms.json; truth/poses.json still contains them."""
     video: bool = False
-    """Also write the training frames as clip.mp4 (H.264), as a user would bring them."""
+    """Also write the training frames as a video, clip.mp4 (H.264)."""
     seed: int = 0
-    """Of the tumble and of the path tracer."""
+    """Seed of the hand-held trajectory and of the path tracer."""
 
     def __post_init__(self) -> None:
-        rules = {
+        in_range = {
             "views": self.views >= 1,
             "resolution": 8 <= self.resolution <= 4096 and self.resolution % 2 == 0,
             "fov": 1 <= self.fov <= 120,
@@ -61,8 +63,10 @@ class SynthOptions:
             "exposure": self.exposure is None or self.exposure > 0,
             "eval_shared": self.eval_shared >= 0 and self.eval_sphere >= 0,
         }
-        if broken := [name for name, kept in rules.items() if not kept]:
-            raise ValueError(f"{broken[0]} is out of range: {getattr(self, broken[0])} (see tumble synth --help)")
+        if invalid := [name for name, valid in in_range.items() if not valid]:
+            raise ValueError(f"{invalid[0]} is out of range: {getattr(self, invalid[0])} (see tumble synth --help)")
         stems = [Path(name).stem for name in self.relight]
         if len(set(stems)) < len(stems):
-            raise ValueError(f"relight needs lights of different names, these are {', '.join(stems)}: rename one")
+            raise ValueError(
+                f"the file names of the relight maps must differ, these are {', '.join(stems)}: rename one of them"
+            )

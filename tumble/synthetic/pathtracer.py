@@ -1,7 +1,7 @@
-"""Ground truth by an independent renderer: Mitsuba 3 path traces a GLB under a lat-long light (extra `synth`).
+"""Ground truth from an independent renderer: Mitsuba 3 path traces a GLB under an environment map (extra `synth`).
 
-The world of a Mitsuba scene is the object frame: the object never moves, camera and light do. Every radiance is linear
-RGB over black, every map is the mean over the part of a pixel that the object covers.
+The world frame of a Mitsuba scene is the object frame: the object stays still, camera and light move. Radiance is
+linear RGB over black. A ground-truth map is the mean over the part of each pixel that the object covers.
 """
 
 import ctypes
@@ -22,8 +22,9 @@ from tumble.io import BadFile
 from tumble.maths import SE3, direction_from_equirect
 from tumble.scene import Camera, Environment
 
-OLDEST_LLVM = 17
-"""LLVM 15 and 16 abort the process on some processors while they compile Dr.Jit's kernels."""
+MIN_LLVM = 17
+"""Oldest major version of libLLVM that is used: LLVM 15 and 16 abort the process on some processors while they compile
+Dr.Jit's kernels."""
 LLVM_FOLDERS = (
     "/usr/lib/*-linux-gnu",
     "/usr/lib64",
@@ -31,8 +32,9 @@ LLVM_FOLDERS = (
     "/opt/homebrew/opt/llvm*/lib",
     "/usr/local/opt/llvm*/lib",
 )
+"""Glob patterns of the folders that are searched for libLLVM."""
 MAX_TRIANGLES = 5_000_000
-"""Largest object read: beyond it a render needs more memory than a laptop has."""
+"""Maximum number of triangles of a model; a larger one needs more memory to render than a laptop has."""
 
 Shading = Literal["original", "diffuse"]
 
@@ -41,14 +43,15 @@ Shading = Literal["original", "diffuse"]
 
 
 def find_llvm() -> tuple[Path, int] | None:
-    """The newest libLLVM that Dr.Jit can use safely, with its major version; None when there is none."""
-    found = [(path, version) for path in _llvm_candidates() if (version := llvm_version(path)) >= OLDEST_LLVM]
-    return max(found, key=lambda item: item[1], default=None)
+    """Path and major version of the newest libLLVM of at least `MIN_LLVM`; None if there is none."""
+    usable = [(path, version) for path in _llvm_candidates() if (version := llvm_version(path)) >= MIN_LLVM]
+    return max(usable, key=lambda item: item[1], default=None)
 
 
 def _llvm_candidates() -> Iterator[Path]:
-    if named := os.environ.get("DRJIT_LIBLLVM_PATH"):
-        yield Path(named)
+    """The library named by DRJIT_LIBLLVM_PATH if that is set, else all in `LLVM_FOLDERS`."""
+    if configured := os.environ.get("DRJIT_LIBLLVM_PATH"):
+        yield Path(configured)
         return
     for pattern in LLVM_FOLDERS:
         for folder in sorted(Path("/").glob(pattern.lstrip("/"))):
@@ -56,22 +59,22 @@ def _llvm_candidates() -> Iterator[Path]:
 
 
 def llvm_version(path: Path) -> int:
-    """Major version of a libLLVM by its file name, else by asking the library; 0 when it will not say."""
+    """Major version of a libLLVM, from its file name or else from the library itself; 0 if neither contains it."""
     if match := re.match(r"libLLVM(?:-|\.so\.)(\d+)", path.name):
         return int(match[1])
     major = ctypes.c_uint(0)
     try:
         ctypes.CDLL(str(path)).LLVMGetVersion(ctypes.byref(major), None, None)
-    except (OSError, AttributeError):  # the call came with LLVM 16
+    except (OSError, AttributeError):  # LLVMGetVersion exists since LLVM 16
         return 0
     return major.value
 
 
 def mitsuba() -> Any:
-    """Mitsuba with a variant set: LLVM when a safe libLLVM is there, else scalar (about seven times slower).
+    """The Mitsuba module with a variant set: LLVM if `find_llvm` finds a library, else scalar (about 7 times slower).
 
     Raises:
-        ModuleNotFoundError: The extra `synth` is not installed; the message says how.
+        ModuleNotFoundError: The extra `synth` is not installed; the message contains the command that installs it.
     """
     if importlib.util.find_spec("mitsuba") is None:
         raise ModuleNotFoundError("this needs Mitsuba: pip install 'tumble[synth]'")
@@ -91,37 +94,41 @@ def mitsuba() -> Any:
 
 @dataclass(frozen=True)
 class Part:
-    """A triangle mesh with one material, object frame."""
+    """A triangle mesh with one material, in the object frame."""
 
     vertices: Float[np.ndarray, "v 3"]
-    """[object radius]"""
+    """Positions [object radius]."""
     normals: Float[np.ndarray, "v 3"]
+    """Unit vertex normals."""
     faces: Int[np.ndarray, "f 3"]
+    """Vertex indices."""
     uv: Float[np.ndarray, "v 2"]
-    """glTF texture coordinates: the origin is the top left corner of the texture."""
+    """glTF texture coordinates; the origin is the top left corner of the texture."""
     albedo: Float[np.ndarray, "h w 3"]
-    """Linear base colour."""
+    """Base colour texture, linear RGB."""
     roughness: Float[np.ndarray, "rows columns 1"]
-    """Perceptual roughness."""
+    """Perceptual roughness texture."""
 
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """An object as an artist made it, moved into the unit ball with +y up."""
+    """A model file, transformed into the object frame: inside the unit sphere, +y up."""
 
     parts: tuple[Part, ...]
+    """All triangle meshes of the file."""
     T_obj_file: Float[np.ndarray, "4 4"]
-    """File to object frame: turn, shift and scale."""
+    """Similarity transform from the file's coordinates to the object frame."""
 
 
 def read_model(path: Path, up: str = "y") -> ObjectModel:
-    """The parts of a GLB with base colour and roughness; metalness, normal maps and emission are left out.
+    """Read a GLB with its base colour and roughness; metalness, normal maps and emission are ignored.
 
     Args:
-        up: The file's upward axis, "y" (glTF) or "z" (scans).
+        path: The GLB file.
+        up: Upward axis of the file, "y" (glTF) or "z" (scans).
 
     Raises:
-        BadFile: Not a readable glTF with triangles.
+        BadFile: The file is missing, is not readable, or has no triangles or more than `MAX_TRIANGLES`.
     """
     import trimesh
 
@@ -129,28 +136,29 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
         raise BadFile(path, "is missing")
     try:
         scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers meet in a foreign file
+    except Exception as error:  # trimesh's parsers raise exceptions of many types on an invalid file
         raise BadFile(path, f"is not a readable GLB: {error}") from None
     meshes = [(*scene.graph[node],) for node in scene.graph.nodes_geometry]
     parts = [_part(scene.geometry[name], T) for T, name in meshes if hasattr(scene.geometry[name], "faces")]
     n_triangles = sum(len(part.faces) for part in parts)
     if not 0 < n_triangles <= MAX_TRIANGLES:
         raise BadFile(path, f"has {n_triangles} triangles", f"1 to {MAX_TRIANGLES} can be rendered")
-    turn = np.eye(3) if up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    corners = np.concatenate([part.vertices for part in parts]) @ turn.T
-    center = (corners.min(0) + corners.max(0)) / 2
-    radius = np.linalg.norm(corners - center, axis=1).max()
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = turn / radius, -center / radius
-    return ObjectModel(tuple(_moved(part, turn, T) for part in parts), T)
+    R_obj_file = np.eye(3) if up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    vertices = np.concatenate([part.vertices for part in parts]) @ R_obj_file.T
+    center = (vertices.min(0) + vertices.max(0)) / 2
+    radius = np.linalg.norm(vertices - center, axis=1).max()
+    T_obj_file = np.eye(4)
+    T_obj_file[:3, :3], T_obj_file[:3, 3] = R_obj_file / radius, -center / radius
+    return ObjectModel(tuple(_transformed(part, R_obj_file, T_obj_file) for part in parts), T_obj_file)
 
 
-def _moved(part: Part, R: np.ndarray, T: np.ndarray) -> Part:
-    vertices = part.vertices @ T[:3, :3].T + T[:3, 3]
-    return Part(vertices, part.normals @ R.T, part.faces, part.uv, part.albedo, part.roughness)
+def _transformed(part: Part, R_obj_file: np.ndarray, T_obj_file: np.ndarray) -> Part:
+    vertices = part.vertices @ T_obj_file[:3, :3].T + T_obj_file[:3, 3]
+    return Part(vertices, part.normals @ R_obj_file.T, part.faces, part.uv, part.albedo, part.roughness)
 
 
 def _part(mesh: Any, T: Float[np.ndarray, "4 4"]) -> Part:
+    """A mesh of trimesh with its node's transform `T` applied, in the file's coordinates."""
     vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
     normals = mesh.vertex_normals @ np.linalg.inv(T[:3, :3])
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
@@ -164,18 +172,18 @@ def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray]:
     """Base colour and roughness textures, each multiplied by its factor (glTF 2.0, section 3.9.2)."""
     material: Any = getattr(visual, "material", None)
     material = material.to_pbr() if hasattr(material, "to_pbr") else material
-    factor = np.ones(3) if getattr(material, "baseColorFactor", None) is None else _unit(material.baseColorFactor)
+    factor = np.ones(3) if getattr(material, "baseColorFactor", None) is None else _colour(material.baseColorFactor)
     albedo, roughness = np.ones((1, 1, 3)), np.ones((1, 1, 1))
     if getattr(material, "baseColorTexture", None) is not None:
         albedo = _linear(np.asarray(material.baseColorTexture.convert("RGB")) / 255.0)
     if getattr(material, "metallicRoughnessTexture", None) is not None:
         roughness = np.asarray(material.metallicRoughnessTexture.convert("RGB"))[..., 1:2] / 255.0
-    rough = getattr(material, "roughnessFactor", None)
-    return albedo * factor, roughness * (1.0 if rough is None else rough)
+    roughness_factor = getattr(material, "roughnessFactor", None)
+    return albedo * factor, roughness * (1.0 if roughness_factor is None else roughness_factor)
 
 
-def _unit(factor: Any) -> np.ndarray:
-    """trimesh keeps a colour factor as floats or as 8-bit numbers, by its mood."""
+def _colour(factor: Any) -> np.ndarray:
+    """RGB in [0, 1] of a colour factor, which trimesh stores either as floats or as 8-bit integers."""
     factor = np.asarray(factor)
     return (factor / 255.0 if factor.dtype.kind in "ui" else factor)[:3].astype(np.float64)
 
@@ -185,7 +193,7 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def write_model(source: Path, model: ObjectModel, path: Path) -> None:
-    """The GLB of `source` again, moved into the object frame (truth/mesh.glb)."""
+    """Write the GLB `source`, transformed into the object frame of `model`, to `path` (truth/mesh.glb)."""
     import trimesh
 
     scene = trimesh.load_scene(source, process=False)
@@ -198,39 +206,43 @@ def write_model(source: Path, model: ObjectModel, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Maps:
-    """What a view shows, without light. 0 where the object covers less than half a pixel."""
+    """Ground-truth maps of one view. Albedo, roughness, normal and depth are 0 where `coverage` is below 0.5."""
 
     albedo: Float[np.ndarray, "h w 3"]
+    """Linear RGB."""
     roughness: Float[np.ndarray, "h w 1"]
+    """Perceptual roughness."""
     normal: Float[np.ndarray, "h w 3"]
-    """Unit shading normals, object frame."""
+    """Unit shading normals in the object frame."""
     depth: Float[np.ndarray, "h w 1"]
     """z-depth [object radius]."""
     coverage: Float[np.ndarray, "h w"]
+    """Fraction of each pixel that the object covers."""
 
 
-def shape(model: ObjectModel, shading: Shading, roughness: float | None) -> dict[str, Any]:
-    """The model as Mitsuba objects, to be shared by scenes that differ in light.
+def mitsuba_shapes(model: ObjectModel, shading: Shading, roughness: float | None) -> dict[str, Any]:
+    """The model's parts as Mitsuba shapes by name, which scenes with different lights can share.
 
     Args:
+        model: The model.
         shading: "original": a dielectric (F0 = 0.04) with the file's base colour and roughness; "diffuse": Lambertian.
-        roughness: Replaces the file's roughness everywhere when given.
+        roughness: Constant roughness that replaces the file's; None keeps the file's.
     """
 
     def bsdf(part: Part) -> dict[str, Any]:
         if shading == "diffuse":
             return {"type": "diffuse", "reflectance": _bitmap(part.albedo)}
         rough = _bitmap(part.roughness) if roughness is None else roughness
-        # Mitsuba's "specular" 0.5 is a refractive index of 1.5, so F0 = 0.04.
+        # Mitsuba's "specular" 0.5 means a refractive index of 1.5, hence F0 = 0.04.
         return {"type": "principled", "base_color": _bitmap(part.albedo), "roughness": rough, "specular": 0.5}
 
     return {f"part_{i}": _mesh(part, bsdf(part)) for i, part in enumerate(model.parts)}
 
 
-def lit_scene(shapes: dict[str, Any], light: Environment, depth: int) -> Any:
-    """A scene under a light, to be rendered with up to `depth` path segments (2 is direct light alone)."""
+def lit_scene(shapes: dict[str, Any], light: Environment, path_depth: int) -> Any:
+    """A Mitsuba scene of shapes under an environment map, traced with up to `path_depth` segments (2: direct only)."""
     mi = mitsuba()
-    integrator = {"type": "path", "max_depth": depth, "hide_emitters": True}
+    integrator = {"type": "path", "max_depth": path_depth, "hide_emitters": True}
     emitter = {"type": "envmap", "bitmap": mi.Bitmap(_envmap(light)), "to_world": mi.ScalarTransform4f()}
     return mi.load_dict({"type": "scene", "integrator": integrator, "light": emitter, **shapes})
 
@@ -238,7 +250,11 @@ def lit_scene(shapes: dict[str, Any], light: Environment, depth: int) -> Any:
 def radiance(
     scene: Any, T_cam_obj: SE3, camera: Camera, R_env_obj: Float[Tensor, "3 3"], *, samples: int, seed: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """A photograph: linear radiance over black, and the object's coverage of each pixel."""
+    """Path trace a view of a `lit_scene`.
+
+    Returns:
+        Linear RGB radiance over black, and the fraction of each pixel that the object covers.
+    """
     mi = mitsuba()
     params = mi.traverse(scene)
     to_world = np.eye(4)
@@ -250,9 +266,10 @@ def radiance(
 
 
 def unlit_scenes(model: ObjectModel, roughness: float | None) -> tuple[Any, Any]:
-    """Two scenes for `maps`. `roughness` replaces the file's when given.
+    """The two Mitsuba scenes that `maps` renders; a `roughness` that is not None replaces the file's.
 
-    A diffuse reflectance is the one texture that Mitsuba shows unlit: the second scene carries (roughness, 1, 0) in it.
+    Mitsuba can output only one texture without lighting, the diffuse reflectance. The first scene has the albedo
+    there, the second one (roughness, 1, 0).
     """
     mi = mitsuba()
 
@@ -263,34 +280,34 @@ def unlit_scenes(model: ObjectModel, roughness: float | None) -> tuple[Any, Any]
         }
         return mi.load_dict({"type": "scene", "integrator": {"type": "aov", "aovs": aovs}, **parts})
 
-    def coded(part: Part) -> np.ndarray:
+    def packed(part: Part) -> np.ndarray:
         values = part.roughness if roughness is None else np.full((1, 1, 1), roughness)
         return np.concatenate([values, np.ones_like(values), np.zeros_like(values)], -1)
 
-    return scene("a:albedo,n:sh_normal,g:geo_normal,x:position", lambda part: part.albedo), scene("r:albedo", coded)
+    return scene("a:albedo,n:sh_normal,g:geo_normal,x:position", lambda part: part.albedo), scene("r:albedo", packed)
 
 
 def maps(unlit: tuple[Any, Any], T_cam_obj: SE3, camera: Camera, *, samples: int) -> Maps:
-    """Truth of one view of `unlit_scenes`."""
+    """Ground-truth maps of one view, rendered from the scenes of `unlit_scenes`."""
     mi = mitsuba()
     sensor = _sensor(T_cam_obj, camera)
-    first, coded = (np.array(mi.render(scene, sensor=sensor, spp=samples, seed=0)) for scene in unlit)
-    coverage = coded[..., 1]
+    first, packed = (np.array(mi.render(scene, sensor=sensor, spp=samples, seed=0)) for scene in unlit)
+    coverage = packed[..., 1]
     inside = coverage >= 0.5
-    share = np.where(inside, coverage, 1.0)[..., None]
-    x_obj = torch.from_numpy((first[..., 9:12] / share).astype(np.float64))
+    divisor = np.where(inside, coverage, 1.0)[..., None]
+    x_obj = torch.from_numpy((first[..., 9:12] / divisor).astype(np.float64))
     depth = (SE3(T_cam_obj.wxyz.double(), T_cam_obj.xyz.double()) @ x_obj)[..., 2:].numpy()
     to_camera = T_cam_obj.inverse().xyz.double().numpy() - x_obj.numpy()
-    # A shading normal belongs to the side that is seen: open meshes show their inside too.
+    # Shading normals face the camera: the inside of an open mesh can be visible.
     side = np.sign((first[..., 6:9] * to_camera).sum(-1, keepdims=True))
     normal = side * first[..., 3:6]
     normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-6)
 
-    def within(values: np.ndarray) -> np.ndarray:
+    def masked(values: np.ndarray) -> np.ndarray:
         return np.where(inside[..., None], values, 0).astype(np.float32)
 
-    albedo, roughness = first[..., :3] / share, coded[..., :1] / share
-    return Maps(within(albedo), within(roughness), within(normal), within(depth), coverage)
+    albedo, roughness = first[..., :3] / divisor, packed[..., :1] / divisor
+    return Maps(masked(albedo), masked(roughness), masked(normal), masked(depth), coverage)
 
 
 def _bitmap(pixels: np.ndarray) -> dict[str, Any]:
@@ -320,9 +337,9 @@ def _mesh(part: Part, bsdf: dict[str, Any]) -> Any:
 
 
 def _envmap(light: Environment) -> Float[np.ndarray, "rows columns 3"]:
-    """The light on Mitsuba's own grid, where -z is the left edge and row i lies at the polar angle pi i / (h - 1).
+    """The environment map on Mitsuba's grid, whose left edge is -z and whose row i has the polar angle pi i / (h - 1).
 
-    The grid is finer than the map's, so that Mitsuba's interpolation between its texels repeats ours between our own.
+    The grid is finer than the map's own, so that Mitsuba's interpolation reproduces ours between our texels.
     """
     h, w, _ = light.log_radiance.shape
     finer = max(1, 512 // h)
@@ -338,8 +355,8 @@ def _sensor(T_cam_obj: SE3, camera: Camera) -> Any:
     mi = mitsuba()
     fx, fy, cx, cy = camera.fx_fy_cx_cy.tolist()
     centered = abs(cx - camera.width / 2) + abs(cy - camera.height / 2) + abs(fx - fy) < 1e-3
-    assert centered, "captures are synthesized with a centred camera of square pixels"
-    # Mitsuba's camera looks along +z like OpenCV's, with x to the left and y up.
+    assert centered, "synthetic captures need a camera with square pixels and a centred principal point"
+    # Mitsuba's camera looks along +z like OpenCV's, but with x to the left and y up.
     T_obj_cam = T_cam_obj.inverse().matrix().double().numpy() @ np.diag([-1.0, -1.0, 1.0, 1.0])
     film = {
         "type": "hdrfilm",

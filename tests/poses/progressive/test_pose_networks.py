@@ -1,4 +1,4 @@
-"""Three sources of poses behind one function, and what their numbers mean."""
+"""Pose parametrisations: three pose sources, and the motions that their outputs stand for."""
 
 import math
 
@@ -28,42 +28,42 @@ def rates(kind: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_all_start_near_no_change_and_learn_any_pose(kind: str) -> None:
+def test_all_sources_start_near_zero_and_fit_any_target(kind: str) -> None:
     net = optim.leaves(source(kind))
     frames = [4, 0, 2]
-    assert pose_networks.raw(net, frames).shape == (3, 6)
-    # Last layers of spread 0.01 over 64 units of size < 1: below 0.1.
-    assert pose_networks.raw(net, frames).abs().max() < 0.1
+    assert pose_networks.raw_outputs(net, frames).shape == (3, 6)
+    # Last layers of standard deviation 0.01 over 64 units of size < 1: below 0.1.
+    assert pose_networks.raw_outputs(net, frames).abs().max() < 0.1
     optimizer = optim.adam(net, rates(kind))
     target = 0.3 * torch.randn(3, 6, generator=torch.Generator().manual_seed(1))
     for step in range(300):
-        optim.descend((pose_networks.raw(net, frames) - target).square().sum(), optimizer, step=step)
-    assert (pose_networks.raw(net, frames) - target).abs().max() < 0.02
+        optim.descend((pose_networks.raw_outputs(net, frames) - target).square().sum(), optimizer, step=step)
+    assert (pose_networks.raw_outputs(net, frames) - target).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("kind", ["vectors", "frame_mlps"])
-def test_frames_that_a_loss_does_not_reach_stay_where_they_are(kind: str) -> None:
-    """Also after they have gathered momentum: Adam would otherwise move them on."""
+def test_frames_without_gradient_do_not_move(kind: str) -> None:
+    """Also once they have momentum, with which Adam would otherwise move them."""
     net = optim.leaves(source(kind))
     optimizer = optim.adam(net, rates(kind))
-    optim.descend((pose_networks.raw(net, [0, 1]) - 1).square().sum(), optimizer, step=0)
-    before = pose_networks.raw(net, [0, 1, 2]).detach().clone()
-    optim.descend((pose_networks.raw(net, [1]) - 1).square().sum(), optimizer, step=1)
-    after = pose_networks.raw(net, [0, 1, 2]).detach()
+    optim.descend((pose_networks.raw_outputs(net, [0, 1]) - 1).square().sum(), optimizer, step=0)
+    before = pose_networks.raw_outputs(net, [0, 1, 2]).detach().clone()
+    optim.descend((pose_networks.raw_outputs(net, [1]) - 1).square().sum(), optimizer, step=1)
+    after = pose_networks.raw_outputs(net, [0, 1, 2]).detach()
     assert torch.equal(after[[0, 2]], before[[0, 2]])
     assert (after[1] - before[1]).abs().max() > 1e-4
 
 
-def test_codes_are_unit_vectors_of_their_own() -> None:
+def test_codes_are_unit_vectors_and_differ_between_frames() -> None:
     net = source("frame_mlps", n=40)
     assert isinstance(net, pose_networks.FrameMlps)
     assert torch.allclose(net.codes.norm(dim=-1), torch.ones(40), atol=1e-5)
     other = (net.codes[1:] @ net.codes[1:].T).fill_diagonal_(0)
-    # Frame 0 has phase 0; all others are random directions of 256 numbers: cosines of spread 1/sqrt(128), 5 sigma.
+    # Frame 0 has phase 0; others are random directions of 256 numbers, whose cosines have sigma 1/sqrt(128); 5 sigma.
     assert other.abs().max() < 5 / math.sqrt(128)
 
 
-def test_one_row_of_a_frame_mlp_is_that_mlp_written_out() -> None:
+def test_a_frame_mlp_equals_its_layers_written_out() -> None:
     net = source("frame_mlps", out=4)
     assert isinstance(net, pose_networks.FrameMlps)
     weights, x = net.values["3"], net.codes[3]
@@ -72,11 +72,11 @@ def test_one_row_of_a_frame_mlp_is_that_mlp_written_out() -> None:
     h = torch.nn.functional.gelu(first[: 64 * 256].reshape(64, 256) @ x + first[64 * 256 :])
     h = torch.nn.functional.gelu(second[: 64 * 64].reshape(64, 64) @ h + second[64 * 64 :])
     expected = last[: 4 * 64].reshape(4, 64) @ h + last[4 * 64 :]
-    assert torch.allclose(pose_networks.raw(net, [3])[0], expected, atol=1e-6)
+    assert torch.allclose(pose_networks.raw_outputs(net, [3])[0], expected, atol=1e-6)
 
 
-def test_an_orbit_keeps_where_the_object_is_seen() -> None:
-    """Without a shift the projection of the object's centre stays, the rest moves."""
+def test_an_orbit_keeps_the_projection_of_the_centre() -> None:
+    """Without a shift the projection of the object's centre is constant; a shift translates the object."""
     rng = torch.Generator().manual_seed(2)
     camera = Camera.from_fov(0.5, 100, 120)
     base = SE3(SO3.exp(torch.randn(3, generator=rng)).wxyz, torch.tensor([0.3, -0.2, 4.0]))
@@ -84,15 +84,15 @@ def test_an_orbit_keeps_where_the_object_is_seen() -> None:
     moved = pose_networks.orbit(base, raw)
     assert torch.allclose(camera.project(moved.xyz), camera.project(base.xyz).expand(20, 2), atol=1e-4)
     assert torch.allclose(moved.xyz[:, 2], 4.0 * (1 + raw[:, 3]))
-    turn = angle_between(moved.rotation, base.rotation)
-    assert torch.allclose(turn, math.pi * raw[:, :3].norm(dim=-1), atol=1e-5)
+    angle = angle_between(moved.rotation, base.rotation)
+    assert torch.allclose(angle, math.pi * raw[:, :3].norm(dim=-1), atol=1e-5)
     shifted = pose_networks.orbit(base, raw + torch.tensor([0.0, 0, 0, 0, 0.05, -0.03]))
     assert torch.allclose(shifted.xyz - moved.xyz, torch.tensor([0.05, -0.03, 0.0]).expand(20, 3), atol=1e-6)
     assert torch.equal(shifted.wxyz, moved.wxyz)
 
 
-def test_an_orbit_is_fmov_s_camera() -> None:
-    """`T_obj_cam = [Exp(pi rho) | 0] @ [R | s c]`, with matrices."""
+def test_an_orbit_equals_the_camera_motion_of_fmov() -> None:
+    """`T_obj_cam = [Exp(pi rho) | 0] @ [R | s c]`, computed with matrices."""
     rng = torch.Generator().manual_seed(3)
     base = SE3(SO3.exp(torch.randn(3, generator=rng)).wxyz, torch.tensor([0.0, 0.0, 5.0])).inverse()
     raw = pad(0.3 * torch.randn(4, generator=rng), (0, 2))
@@ -106,9 +106,9 @@ def test_an_orbit_is_fmov_s_camera() -> None:
     assert torch.allclose(T_cam_obj.inverse().matrix(), left @ scaled, atol=1e-5)
 
 
-def test_a_delta_is_bounded_and_starts_at_no_motion() -> None:
+def test_a_delta_is_bounded_and_zero_for_zero_outputs() -> None:
     assert torch.equal(pose_networks.delta(torch.zeros(6), rotation=0.3, translation=0.2).matrix(), torch.eye(4))
     huge = pose_networks.delta(torch.full((6,), 1e4), rotation=0.3, translation=0.2)
     assert huge.rotation.angle() == pytest.approx(0.3 * math.sqrt(3), rel=1e-4)
-    # A screw motion moves the origin by no more than |v|.
+    # A screw motion moves the origin by at most |v|.
     assert huge.xyz.norm() <= 0.2 * math.sqrt(3) + 1e-5

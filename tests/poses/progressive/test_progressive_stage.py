@@ -1,4 +1,4 @@
-"""The paper's route with the outcome of the other."""
+"""The progressive route of stage 1, with the assessment of the other route."""
 
 import math
 import sys
@@ -16,20 +16,20 @@ from tumble.poses.progressive import tracker, virtual_camera
 from tumble.poses.sfm import stage as sfm
 
 
-def test_true_poses_are_judged_good() -> None:
-    """In another unit and frame, but the same motion."""
+def test_true_poses_are_rated_good() -> None:
+    """The assessed trajectory may have another scale and object frame, but the motion is the same."""
     scene = tumbling(24, points=200)
     rng = torch.Generator().manual_seed(0)
     some = [scene.match(t - k, t, rng, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
     found = sfm.assess(sfm.gather(scene.capture, some, "mixed"), truth(scene))
-    assert found.quality.verdict == "good"
+    assert found.quality.rating == "good"
     assert math.degrees(found.quality.uncertainty) < 1
     between = found.trajectory.T_cam_obj.rotation.inverse() @ truth(scene).T_cam_obj.rotation
     assert angle_between(between[1:], between[:-1]).max() < 1e-3
 
 
-def test_it_finds_what_track_finds() -> None:
-    """Five frames of a painted ball: too few steps to be right, the same ones as those of the stage alone."""
+def test_the_stage_has_the_poses_of_the_tracker() -> None:
+    """On five frames of a textured sphere, with too few steps to be accurate."""
     assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
     inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
     cfg = progressive.Config(**vars(SMOKE))
@@ -43,7 +43,7 @@ def test_it_finds_what_track_finds() -> None:
     assert len(both.quality) == len(TRUTH.xyz)
 
 
-def test_the_recipe_names_the_route() -> None:
+def test_recipes_select_the_progressive_route() -> None:
     quick, paper = (recipes.progressive_poses(r).track for r in (recipes.DRAFT, recipes.PAPER))
     assert isinstance(quick, progressive.Config)
     assert paper == progressive.Config()

@@ -1,4 +1,4 @@
-"""Adjustment against derivatives by difference, and against poses and points that are known."""
+"""Bundle adjustment against finite differences, and against known poses and points."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ CAMERA = Camera(torch.tensor([240.0, 250.0, 64.0, 60.0]), 128, 128)
 
 
 def scene(groups: int, frames: int, points: int, seed: int = 0) -> BundleState:
-    """Random tumbles of random points about (0, 0, 1)."""
+    """Random rotations of random points about (0, 0, 1)."""
     rng = torch.Generator().manual_seed(seed)
     like = {"generator": rng, "dtype": torch.float64}
     steps = 0.2 * torch.randn(groups, 1, 3, **like) + 0.05 * torch.randn(groups, frames, 3, **like)
@@ -27,8 +27,8 @@ def scene(groups: int, frames: int, points: int, seed: int = 0) -> BundleState:
     return BundleState(torch.stack(R, 1), t, 0.12 * torch.randn(groups * points, 3, **like))
 
 
-def seen(truth: BundleState, noise: float = 0.0, seed: int = 5) -> Problem:
-    """Every point in every frame of its group."""
+def observed(truth: BundleState, noise: float = 0.0, seed: int = 5) -> Problem:
+    """A problem in which every frame of a group observes every point of the group."""
     g, f = truth.t.shape[:2]
     n = len(truth.X)
     group = torch.arange(n) // (n // g)
@@ -51,43 +51,44 @@ def seen(truth: BundleState, noise: float = 0.0, seed: int = 5) -> Problem:
     return replace(problem, tracks=replace(tracks, uv=uv))
 
 
-def shaken(truth: BundleState, turn: float, seed: int = 7) -> BundleState:
+def perturbed(truth: BundleState, angle: float, seed: int = 7) -> BundleState:
+    """Poses and points with random errors, of rotation with the standard deviation `angle` [radians]."""
     rng = torch.Generator().manual_seed(seed)
     like = {"generator": rng, "dtype": torch.float64}
-    R = SO3.exp(turn * torch.randn(*truth.t.shape, **like)).matrix() @ truth.R
+    R = SO3.exp(angle * torch.randn(*truth.t.shape, **like)).matrix() @ truth.R
     shift, moved = (0.02 * torch.randn(*x.shape, **like) for x in (truth.t, truth.X))
     return BundleState(R, truth.t + shift, truth.X + moved)
 
 
-def guessing(truth: BundleState, problem: Problem, factor: float) -> tuple[Problem, BundleState]:
-    """The same pixels through a camera whose focal length is the true one times a factor, and where that begins."""
+def with_wrong_focal(truth: BundleState, problem: Problem, factor: float) -> tuple[Problem, BundleState]:
+    """The same observations under an assumed focal length, the true one times a factor, and an initial state for it."""
     g = len(truth.R)
     shrink = torch.tensor([1 / factor, 1 / factor, 1.0]).double()
     start = BundleState(truth.R, shrink * truth.t, truth.X / factor, torch.zeros(g, dtype=torch.float64))
-    return replace(problem, camera=CAMERA.zoomed(factor), reach=problem.reach / factor), start
+    return replace(problem, camera=CAMERA.zoomed(factor), radius=problem.radius / factor), start
 
 
 def relative_errors(found: BundleState, truth: BundleState) -> Tensor:
-    """Angles between the found and true motions from the first frame of each group [radians]."""
+    """Angles between the estimated and true rotations from the first frame of each group [radians]."""
     a, b = (s.R @ s.R[:, :1].mT for s in (found, truth))
     return SO3.from_matrix(a @ b.mT).angle()
 
 
-def test_the_gradient_is_that_of_the_cost() -> None:
-    """By central differences, for cameras and points, with Cauchy's loss and priors in place."""
+def test_the_gradient_equals_finite_differences_of_the_cost() -> None:
+    """For cameras and points, with the Cauchy loss and priors."""
     truth = scene(2, 3, 5)
-    problem, at = seen(truth, noise=1.0), shaken(truth, 0.05)
+    problem, at = observed(truth, noise=1.0), perturbed(truth, 0.05)
     system = bundle_adjustment._linearise(problem, at, 1.5)
     h = 1e-6
 
     def cost(d_cam: Tensor, d_point: Tensor) -> Tensor:
-        return bundle_adjustment._linearise(problem, bundle_adjustment._moved(at, d_cam, d_point), 1.5).cost.sum()
+        return bundle_adjustment._linearise(problem, bundle_adjustment._apply_step(at, d_cam, d_point), 1.5).cost.sum()
 
     cameras, points = torch.zeros(6, 6).double(), torch.zeros(10, 3).double()
     for index in range(36):
         d = torch.zeros(36).double().index_fill(0, torch.tensor([index]), h).reshape(6, 6)
         slope = (cost(d, points) - cost(-d, points)) / (2 * h)
-        # The loss is half of what its gradient is written for: r^2 has the derivative 2 r.
+        # `g_cam` and `g_point` leave out the factor 2 of the derivative 2 r of r^2.
         assert float(slope) == pytest.approx(2 * float(system.g_cam.flatten()[index]), rel=1e-4, abs=1e-3)
     for index in range(30):
         d = torch.zeros(30).double().index_fill(0, torch.tensor([index]), h).reshape(10, 3)
@@ -95,12 +96,14 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         assert float(slope) == pytest.approx(2 * float(system.g_point.flatten()[index]), rel=1e-4, abs=1e-3)
 
 
-def test_the_derivatives_by_the_focal_length_are_those_of_the_cost() -> None:
-    """Two groups, each with its own: by central differences, priors in place. Of the second derivatives those by
-    cameras and points, without the loss that forgives, against differences of the gradient where residuals vanish
-    (those of points beyond any reach nearly do)."""
+def test_derivatives_by_the_focal_length_equal_finite_differences() -> None:
+    """For two groups with a focal length each, with priors.
+
+    The mixed second derivatives by cameras and points are compared with differences of the gradient, without a robust
+    loss, where residuals vanish; those of the points' prior nearly do, as its radius is huge.
+    """
     truth = scene(2, 3, 5)
-    problem, at = guessing(truth, seen(truth, noise=1.0), 1.1)
+    problem, at = with_wrong_focal(truth, observed(truth, noise=1.0), 1.1)
     h = 1e-6
 
     def at_focal(
@@ -108,14 +111,17 @@ def test_the_derivatives_by_the_focal_length_are_those_of_the_cost() -> None:
     ) -> bundle_adjustment._System:
         return bundle_adjustment._linearise(problem, replace(at, log_focal=d), scale)
 
-    system = at_focal(torch.full((2,), 0.02).double(), replace(problem, guess=-0.1))
+    system = at_focal(torch.full((2,), 0.02).double(), replace(problem, log_focal_prior=-0.1))
     for group in range(2):
         d = torch.zeros(2).double().index_fill(0, torch.tensor([group]), h)
-        a, b = (at_focal(0.02 + s * d, replace(problem, guess=-0.1)).cost.sum() for s in (1, -1))
+        a, b = (at_focal(0.02 + s * d, replace(problem, log_focal_prior=-0.1)).cost.sum() for s in (1, -1))
         assert system.border is not None
         assert float((a - b) / (2 * h)) == pytest.approx(2 * float(system.border.g[group]), rel=1e-5)
-    places = CAMERA.project(truth.t).double()
-    exact, where = replace(seen(truth), centre=places, reach=1e3), replace(truth, log_focal=torch.zeros(2).double())
+    centres = CAMERA.project(truth.t).double()
+    exact, where = (
+        replace(observed(truth), centre=centres, radius=1e3),
+        replace(truth, log_focal=torch.zeros(2).double()),
+    )
     border = at_focal(torch.zeros(2).double(), exact, where, 1e9).border
     a, b = (at_focal(torch.full((2,), s * h).double(), exact, where, 1e9) for s in (1, -1))
     assert border is not None
@@ -125,14 +131,16 @@ def test_the_derivatives_by_the_focal_length_are_those_of_the_cost() -> None:
 
 @pytest.mark.parametrize("factor", [None, 1.1])
 @pytest.mark.parametrize("short", [0, 3])
-def test_elimination_solves_the_whole_system(short: int, factor: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One group: the step equals that of the dense normal equations, whichever way points are summed, with and without
-    a focal length to find."""
-    monkeypatch.setattr(bundle_adjustment, "SHORT", short)
+def test_elimination_solves_the_dense_system(short: int, factor: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For one group, the step equals that of the dense normal equations.
+
+    Both ways to eliminate points are tested, each with a known and with an estimated focal length.
+    """
+    monkeypatch.setattr(bundle_adjustment, "SHORT_TRACK", short)
     truth = scene(1, 3, 6)
-    problem, at = seen(truth, noise=0.5), shaken(truth, 0.02)
+    problem, at = observed(truth, noise=0.5), perturbed(truth, 0.02)
     if factor is not None:
-        problem, at = guessing(at, problem, factor)
+        problem, at = with_wrong_focal(at, problem, factor)
     system = bundle_adjustment._linearise(problem, at, 2.0)
     damping = torch.tensor([0.01]).double()
     d_cam, d_point, d_focal = bundle_adjustment._solve(problem, at, system, damping, bundle_adjustment._layout(problem))
@@ -156,22 +164,25 @@ def test_elimination_solves_the_whole_system(short: int, factor: float | None, m
     torch.testing.assert_close(found, torch.linalg.solve(H, -g), rtol=1e-6, atol=1e-9)
 
 
-def test_exact_pixels_give_exact_motions() -> None:
-    """Ten degrees of error per frame vanish; what the priors pull is below a hundredth of a degree."""
+def test_exact_observations_give_exact_poses() -> None:
+    """Initial errors of ten degrees per frame vanish; the priors leave a bias below a hundredth of a degree."""
     truth = scene(3, 6, 30)
-    found, cost = bundle_adjustment.adjust(seen(truth), shaken(truth, 0.1), steps=60, scale=3.0, tolerance=0.0)
+    found, cost = bundle_adjustment.adjust(observed(truth), perturbed(truth, 0.1), steps=60, scale=3.0, tolerance=0.0)
     assert relative_errors(found, truth).max() < 2e-3
-    assert bundle_adjustment.residuals(seen(truth), found)[0].abs().max() < 0.1
-    # What is left is the priors': a few of the truth's own sigmas, NOISE^2 each.
+    assert bundle_adjustment.residuals(observed(truth), found)[0].abs().max() < 0.1
+    # The remaining cost is that of the priors at the truth, NOISE^2 per squared standard deviation.
     assert (cost < 3).all()
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
-def test_a_guessed_focal_length_is_found(factor: float) -> None:
-    """Pixels of 0.2 noise, two groups: by the inverse of the normal equations at the truth one sigma of the focal
-    length is below a hundredth, and the prior pulls by less."""
+def test_an_assumed_focal_length_is_corrected(factor: float) -> None:
+    """For two groups with 0.2 pixels of noise.
+
+    The inverse of the normal equations at the truth gives the focal length a standard deviation below a hundredth, and
+    the prior's bias is smaller.
+    """
     truth = scene(2, 12, 60)
-    problem, start = guessing(truth, seen(truth, noise=0.2), factor)
+    problem, start = with_wrong_focal(truth, observed(truth, noise=0.2), factor)
     for scale in (3.0, 1.0, 1.0):
         start, _ = bundle_adjustment.adjust(problem, start, steps=30, scale=scale, tolerance=0.0)
     assert start.log_focal is not None
@@ -180,33 +191,33 @@ def test_a_guessed_focal_length_is_found(factor: float) -> None:
 
 
 def test_a_known_focal_length_stays_as_it_is() -> None:
-    """Even a wrong one: the scene has none of its own, and the poses are those that fit it best."""
+    """Even a wrong one, although an estimated focal length would lower the cost."""
     truth = scene(1, 8, 30)
-    problem, start = guessing(truth, seen(truth), 0.8)
+    problem, start = with_wrong_focal(truth, observed(truth), 0.8)
     kept, cost = bundle_adjustment.adjust(problem, replace(start, log_focal=None), steps=30, scale=3.0)
-    found, least = bundle_adjustment.adjust(problem, start, steps=30, scale=3.0)
+    found, lower_cost = bundle_adjustment.adjust(problem, start, steps=30, scale=3.0)
     assert kept.log_focal is None
     assert found.log_focal is not None
-    assert least < cost
+    assert lower_cost < cost
 
 
-def test_outliers_are_forgiven() -> None:
+def test_outliers_have_little_influence() -> None:
     truth = scene(1, 8, 60)
-    problem = seen(truth, noise=0.2)
+    problem = observed(truth, noise=0.2)
     rng = torch.Generator().manual_seed(0)
-    astray = torch.rand(len(problem.tracks), generator=rng) < 0.15
-    uv = problem.tracks.uv + astray[:, None] * 15 * torch.randn(len(astray), 2, generator=rng, dtype=torch.float64)
+    outlier = torch.rand(len(problem.tracks), generator=rng) < 0.15
+    uv = problem.tracks.uv + outlier[:, None] * 15 * torch.randn(len(outlier), 2, generator=rng, dtype=torch.float64)
     problem = replace(problem, tracks=replace(problem.tracks, uv=uv))
-    rough, _ = bundle_adjustment.adjust(problem, shaken(truth, 0.05), steps=30, scale=3.0)
+    rough, _ = bundle_adjustment.adjust(problem, perturbed(truth, 0.05), steps=30, scale=3.0)
     found, _ = bundle_adjustment.adjust(problem, rough, steps=30, scale=0.5)
-    # 0.2 pixels over 50 good points of 30 pixels' spread: a tenth of a degree, more along the viewing rays.
+    # 0.2 pixels over 50 inliers spread over 30 pixels: a tenth of a degree, more along the viewing rays.
     assert relative_errors(found, truth).rad2deg().max() < 1.0
 
 
-def test_groups_do_not_know_of_each_other() -> None:
-    """Two groups side by side end where each ends alone."""
+def test_groups_are_independent() -> None:
+    """Two groups adjusted side by side get the same poses as each on its own."""
     truth = scene(2, 4, 12)
-    problem, start = seen(truth, noise=0.3), shaken(truth, 0.05)
+    problem, start = observed(truth, noise=0.3), perturbed(truth, 0.05)
     both, _ = bundle_adjustment.adjust(problem, start, steps=15, scale=1.0, tolerance=0.0)
     for g in range(2):
         mine = problem.group == g
@@ -219,21 +230,21 @@ def test_groups_do_not_know_of_each_other() -> None:
             problem.centre[g : g + 1],
             problem.centre_sigma[g : g + 1],
             problem.depth_sigma,
-            problem.reach,
+            problem.radius,
         )
-        one, _ = bundle_adjustment.adjust(
+        single, _ = bundle_adjustment.adjust(
             alone,
             BundleState(start.R[g : g + 1], start.t[g : g + 1], start.X[mine]),
             steps=15,
             scale=1.0,
             tolerance=0.0,
         )
-        torch.testing.assert_close(one.R[0], both.R[g], atol=1e-6, rtol=0)
+        torch.testing.assert_close(single.R[0], both.R[g], atol=1e-6, rtol=0)
 
 
-def test_points_are_where_their_rays_meet() -> None:
-    """Six views over a wide turn; the belief in the ball's front pulls by a thousandth of its radius."""
+def test_points_are_triangulated_where_their_rays_meet() -> None:
+    """For six views over a wide rotation; the prior position shifts points by a thousandth of the sphere's radius."""
     truth = scene(1, 6, 20)
-    problem = seen(truth)
+    problem = observed(truth)
     X = bundle_adjustment.triangulate(problem.tracks, truth.R[0], truth.t[0], CAMERA, torch.full((6,), 0.2).double())
     assert (X - truth.X).norm(dim=-1).median() < 0.01

@@ -1,4 +1,4 @@
-"""Outlines of a lopsided ellipsoid touch common planes when its poses are true, and only then."""
+"""Epipolar tangency of the contours of an asymmetric ellipsoid, for true and for wrong poses."""
 
 from dataclasses import replace
 
@@ -9,8 +9,8 @@ import torch
 from tests.lopsided import DISTANCE, Tumble, tumbling
 from tumble.maths.se3 import SO3
 from tumble.poses.sfm import frontier_points, relocalization
-from tumble.poses.sfm.frontier_points import Outlines
-from tumble.preprocess.segmentation import three_valued
+from tumble.poses.sfm.frontier_points import Contours
+from tumble.preprocess.segmentation import make_trimap
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 
 RADIUS = 0.9
@@ -31,40 +31,40 @@ def all_pairs(n: int) -> torch.Tensor:
 
 def gaps(scene: Tumble, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
     i, j = all_pairs(len(R)).T
-    outline = frontier_points.outlines(scene.capture)
-    found = frontier_points.touch(
-        (R[i], t[i]), (R[j], t[j]), outline[i], outline[j], scene.capture.camera, radius=RADIUS
+    contours = frontier_points.convex_contours(scene.capture)
+    tangencies = frontier_points.epipolar_tangencies(
+        (R[i], t[i]), (R[j], t[j]), contours[i], contours[j], scene.capture.camera, radius=RADIUS
     )
-    # In units of the mean distance, as `touch` is used: a gap is an angle times focal length times distance over it.
-    return found.gap[found.good].abs() / DISTANCE
+    # `epipolar_tangencies` expects lengths in units of the object's mean distance; gaps are proportional to length.
+    return tangencies.gap[tangencies.valid].abs() / DISTANCE
 
 
-def test_true_poses_leave_no_gap(scene: Tumble) -> None:
-    """Corners are pixel centres inside the outline: a fraction of a pixel is lost on each side, nearly alike."""
+def test_gaps_vanish_for_true_poses(scene: Tumble) -> None:
+    """Vertices are centres of object pixels: both contours lie a similar fraction of a pixel inside the true ones."""
     gap = gaps(scene, *poses(scene))
     assert len(gap) > 200
     assert gap.median() < 0.25
     assert gap.quantile(0.95) < 0.8
 
 
-def test_a_wrong_pose_opens_gaps(scene: Tumble) -> None:
+def test_a_wrong_rotation_increases_the_gaps(scene: Tumble) -> None:
     R, t = poses(scene)
     wrong = R.clone()
     wrong[5] = SO3.exp(torch.tensor([0.0, 0.15, 0.1], dtype=torch.float64)).matrix() @ R[5]
-    outline = frontier_points.outlines(scene.capture)
+    contours = frontier_points.convex_contours(scene.capture)
     others = torch.tensor([k for k in range(24) if k != 5])
-    judge = relocalization.Judge(
-        (R[others], t[others]), outline[torch.tensor([5])], outline[others], scene.capture.camera, RADIUS
+    constraints = relocalization.ContourConstraints(
+        (R[others], t[others]), contours[torch.tensor([5])], contours[others], scene.capture.camera, RADIUS
     )
-    both = judge.gaps(torch.stack([R[5], wrong[5]]), t[[5, 5]]).abs().nanmedian(1).values
-    assert both[1] > 3 * both[0]
+    gap_true, gap_wrong = constraints.gaps(torch.stack([R[5], wrong[5]]), t[[5, 5]]).abs().nanmedian(1).values
+    assert gap_wrong > 3 * gap_true
 
 
-def test_frontier_points_lie_on_both_outlines(scene: Tumble) -> None:
-    """And the rays of the two pixels meet, nearly, on the ellipsoid."""
+def test_frontier_points_lie_on_both_contours(scene: Tumble) -> None:
+    """Each is a track of two observations, at object pixels next to the background."""
     R, t = poses(scene)
-    outline = frontier_points.outlines(scene.capture)
-    tracks = frontier_points.frontier(R, t, scene.capture.camera, outline, radius=RADIUS, pairs=all_pairs(24))
+    contours = frontier_points.convex_contours(scene.capture)
+    tracks = frontier_points.frontier_tracks(R, t, scene.capture.camera, contours, radius=RADIUS, pairs=all_pairs(24))
     assert (torch.bincount(tracks.point) == 2).all()
     assert len(tracks) == 2 * tracks.n
     row, column = (tracks.uv.floor().long()[:, k] for k in (1, 0))
@@ -75,16 +75,16 @@ def test_frontier_points_lie_on_both_outlines(scene: Tumble) -> None:
     assert (around == BACKGROUND).any(1).all()
 
 
-def test_views_along_the_line_of_sight_say_nothing(scene: Tumble) -> None:
-    """A frame and its copy from farther away: the line through the cameras pierces the object."""
+def test_a_baseline_that_pierces_the_object_has_no_frontier_points(scene: Tumble) -> None:
+    """The same view from two distances."""
     R, t = poses(scene)
-    outline = frontier_points.outlines(scene.capture)[torch.tensor([3, 3])]
+    contours = frontier_points.convex_contours(scene.capture)[torch.tensor([3, 3])]
     far = (R[[3, 3]], torch.stack([t[3], t[3] * 1.2]))
     pairs = torch.tensor([[0, 1]])
-    assert frontier_points.frontier(*far, scene.capture.camera, outline, radius=RADIUS, pairs=pairs).n == 0
+    assert frontier_points.frontier_tracks(*far, scene.capture.camera, contours, radius=RADIUS, pairs=pairs).n == 0
 
 
-def test_outlines_that_a_hand_or_the_border_cuts_are_not_sure(scene: Tumble) -> None:
+def test_vertices_at_a_hand_or_the_image_border_are_unreliable(scene: Tumble) -> None:
     masks = scene.capture.masks[:2].clone()
     columns = torch.nonzero(masks[0])[:, 1]
     masks[0, :, int(columns.float().mean()) :] = torch.where(
@@ -93,37 +93,39 @@ def test_outlines_that_a_hand_or_the_border_cuts_are_not_sure(scene: Tumble) -> 
     masks[1] = 0
     masks[1, 40:60, 100:] = 255
     capture = Capture(scene.capture.images[:2], masks, scene.capture.camera, ("a", "b"), "camera")
-    found = frontier_points.outlines(capture)
-    assert found.sure[0].any()
-    assert not found.sure[0][found.corners[0, :, 0] > columns.float().mean() - 1].any()
-    assert not found.sure[1][found.corners[1, :, 0] > 126].any()
-    assert found.sure[1][found.corners[1, :, 0] < 101].all()
+    contours = frontier_points.convex_contours(capture)
+    assert contours.reliable[0].any()
+    assert not contours.reliable[0][contours.vertices[0, :, 0] > columns.float().mean() - 1].any()
+    assert not contours.reliable[1][contours.vertices[1, :, 0] > 126].any()
+    assert contours.reliable[1][contours.vertices[1, :, 0] < 101].all()
 
 
-def test_a_band_along_the_silhouette_hides_nothing(scene: Tumble) -> None:
-    """Masks of films have one, half inside: divided again, they are the true ones but for the sharpest corners."""
+def test_bands_along_silhouettes_are_filled(scene: Tumble) -> None:
+    """Masks of videos have bands, half of them inside the object; filled masks differ from the true ones at corners."""
     true = scene.capture.masks[:6]
-    banded = torch.stack([torch.from_numpy(three_valued(m.numpy() == OBJECT, m.numpy() < 0, 1)) for m in true])
-    assert not frontier_points.outlines(replace(scene.capture.select(list(range(6))), masks=banded)).sure.any()
-    found = frontier_points.divided(banded)
-    assert (found != UNKNOWN).all()
-    assert float((found != true).float().sum() / (true == OBJECT).sum()) < 0.002
+    banded = torch.stack([torch.from_numpy(make_trimap(m.numpy() == OBJECT, m.numpy() < 0, 1)) for m in true])
+    assert not frontier_points.convex_contours(
+        replace(scene.capture.select(list(range(6))), masks=banded)
+    ).reliable.any()
+    filled = frontier_points.fill_boundary_bands(banded)
+    assert (filled != UNKNOWN).all()
+    assert float((filled != true).float().sum() / (true == OBJECT).sum()) < 0.002
 
 
-def test_what_a_hand_hides_stays_unknown(scene: Tumble) -> None:
-    """Twelve pixels wide, from the border of the picture to the middle of the object, which ends in a band."""
+def test_pixels_occluded_by_a_hand_stay_unknown(scene: Tumble) -> None:
+    """The hand is 12 pixels wide and reaches from the image border to the middle of the object, which has a band."""
     mask = scene.capture.masks[0].numpy()
     rows, columns = (int(x.mean()) for x in np.nonzero(mask))
     hand = np.zeros(mask.shape, bool)
     hand[rows:, columns - 6 : columns + 6] = True
-    labels = three_valued((mask == OBJECT) & ~hand, hand, 1)
-    kept = frontier_points.divided(torch.from_numpy(labels)[None])[0].numpy()
-    # But for two pixels beside the band, where the three meet.
-    assert (kept[hand] == UNKNOWN).mean() > 0.97
-    assert (kept[~hand] == mask[~hand]).mean() > 0.99
+    labels = make_trimap((mask == OBJECT) & ~hand, hand, 1)
+    filled = frontier_points.fill_boundary_bands(torch.from_numpy(labels)[None])[0].numpy()
+    # Except two pixels beside the band, where object, background and hand meet.
+    assert (filled[hand] == UNKNOWN).mean() > 0.97
+    assert (filled[~hand] == mask[~hand]).mean() > 0.99
 
 
-def test_an_empty_mask_has_no_outline(scene: Tumble) -> None:
+def test_an_empty_mask_has_no_reliable_vertex(scene: Tumble) -> None:
     empty = Capture(
         scene.capture.images[:1],
         torch.zeros_like(scene.capture.masks[:1]),
@@ -131,19 +133,21 @@ def test_an_empty_mask_has_no_outline(scene: Tumble) -> None:
         ("a",),
         "camera",
     )
-    assert not frontier_points.outlines(empty).sure.any()
+    assert not frontier_points.convex_contours(empty).reliable.any()
 
 
-def test_a_frame_that_lost_its_way_is_found_again(scene: Tumble) -> None:
-    """20 degrees off, tried from its neighbour's pose. One smooth outline tells but a few degrees."""
+def test_a_wrong_pose_is_relocalized(scene: Tumble) -> None:
+    """The pose is off by 20 degrees; a single smooth contour determines the rotation to a few degrees."""
     R, t = (x.clone() for x in poses(scene))
     t = t / DISTANCE  # the unit of stage 1
-    outline = frontier_points.outlines(scene.capture)
+    contours = frontier_points.convex_contours(scene.capture)
     others = torch.tensor([k for k in range(24) if k != 10])
-    own = Outlines(outline.corners[10:11], outline.sure[10:11])
-    judge = relocalization.Judge((R[others], t[others]), own, outline[others], scene.capture.camera, RADIUS / DISTANCE)
+    own = Contours(contours.vertices[10:11], contours.reliable[10:11])
+    constraints = relocalization.ContourConstraints(
+        (R[others], t[others]), own, contours[others], scene.capture.camera, RADIUS / DISTANCE
+    )
     lost = SO3.exp(torch.tensor([0.25, -0.25, 0.0], dtype=torch.float64)).matrix() @ R[10]
-    tried = torch.cat([lost[None], relocalization.hypotheses() @ R[9]])
-    (found, _), price = relocalization.relocate(judge, tried, t[10].expand(len(tried), 3), scale=0.7)
-    assert SO3.from_matrix(found @ R[10].T).angle().rad2deg() < 5
-    assert price < relocalization.cost(judge.gaps(lost[None], t[10:11]), 0.7)[0]
+    candidates = torch.cat([lost[None], relocalization.candidate_rotations() @ R[9]])
+    (R_found, _), cost = relocalization.relocalize(constraints, candidates, t[10].expand(len(candidates), 3), scale=0.7)
+    assert SO3.from_matrix(R_found @ R[10].T).angle().rad2deg() < 5
+    assert cost < relocalization.robust_cost(constraints.gaps(lost[None], t[10:11]), 0.7)[0]

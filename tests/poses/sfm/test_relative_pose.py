@@ -1,4 +1,4 @@
-"""Two views of an ellipsoid with known rotation between them."""
+"""Relative poses of two views of an ellipsoid with a known rotation between them."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 
 
 @pytest.fixture(scope="module")
-def fits() -> tuple[relative_pose.Relative, torch.Tensor]:
+def fits() -> tuple[relative_pose.RelativePoses, torch.Tensor]:
     scene = tumbling(24)
     rng = torch.Generator().manual_seed(0)
     matches = [scene.match(t - 1, t, rng) for t in range(1, 24)]
@@ -20,8 +20,8 @@ def fits() -> tuple[relative_pose.Relative, torch.Tensor]:
     return found, R[1:] @ R[:-1].mT
 
 
-def test_the_turn_is_found_the_right_way_round(fits: tuple[relative_pose.Relative, torch.Tensor]) -> None:
-    """Two views leave the angle open (bas-relief), not the axis: a mirror image would be off by twice the angle."""
+def test_the_rotation_has_the_right_orientation(fits: tuple[relative_pose.RelativePoses, torch.Tensor]) -> None:
+    """Two views leave the angle undetermined (bas-relief), not the axis; a mirror image is off by twice the angle."""
     found, true = fits
     angle = SO3.from_matrix(true).angle()
     off = SO3.from_matrix(found.R_j_i @ true.mT).angle()
@@ -29,26 +29,26 @@ def test_the_turn_is_found_the_right_way_round(fits: tuple[relative_pose.Relativ
     assert off.rad2deg().median() < 5
 
 
-def test_outliers_do_not_count(fits: tuple[relative_pose.Relative, torch.Tensor]) -> None:
-    """Nine of ten matches are right to 0.2 pixels; a few wrong ones fall on a segment by chance."""
+def test_most_matches_are_inliers_despite_outliers(fits: tuple[relative_pose.RelativePoses, torch.Tensor]) -> None:
+    """Nine of ten matches have 0.2 pixels of noise; a few wrong ones lie on a segment by chance."""
     found, _ = fits
-    share = found.inliers / found.inliers.new_tensor([130.0])
-    assert (share > 0.5).all()
-    assert (found.cost <= found.rival_cost).all()
+    fraction = found.inliers / found.inliers.new_tensor([130.0])
+    assert (fraction > 0.5).all()
+    assert (found.cost <= found.alternative_cost).all()
 
 
-def test_a_turn_about_the_viewing_axis_is_exact() -> None:
-    """In-plane rotation is seen whatever the depths are."""
+def test_a_rotation_about_the_viewing_axis_is_exact() -> None:
+    """In-plane rotation is observable whatever the depths are."""
     scene = tumbling(2)
     uv, facing = scene.seen(0)
     centre = relative_pose.silhouettes(scene.capture).centre[0].double()
-    # Turn the pixels about the silhouette's centre, which is near the principal point: then nothing else changes.
+    # Rotate the pixels about the silhouette's centre, which is near the principal point: then nothing else changes.
     angle = torch.tensor(0.3, dtype=torch.float64)
     c, s = angle.cos(), angle.sin()
-    turn = torch.stack([torch.stack([c, -s]), torch.stack([s, c])])
+    rotation = torch.stack([torch.stack([c, -s]), torch.stack([s, c])])
     match = scene.match(0, 1, torch.Generator().manual_seed(0))
-    turned = (uv[facing] - centre) @ turn.T + centre
-    exact = type(match)(0, 1, uv[facing], turned, torch.ones(int(facing.sum())))
+    rotated = (uv[facing] - centre) @ rotation.T + centre
+    exact = type(match)(0, 1, uv[facing], rotated, torch.ones(int(facing.sum())))
     shapes = relative_pose.silhouettes(scene.capture)
     same = relative_pose.Silhouettes(*(getattr(shapes, k)[[0, 0]] for k in ("centre", "radius", "extent", "visible")))
     found = relative_pose.fit([exact], same, scene.capture.camera)
@@ -56,8 +56,8 @@ def test_a_turn_about_the_viewing_axis_is_exact() -> None:
     torch.testing.assert_close(SO3.from_matrix(found.R_j_i[0]).log(), expected, atol=0.02, rtol=0)
 
 
-def test_silhouettes_are_measured() -> None:
-    """A 20 x 10 rectangle; unknown pixels are object, for they hide it; an empty mask is said to be one."""
+def test_silhouettes_have_centre_and_radius() -> None:
+    """For a 20 x 10 rectangle whose unknown pixels count as object, and for an empty mask."""
     masks = torch.full((2, 64, 64), BACKGROUND, dtype=torch.uint8)
     masks[0, 30:40, 10:25] = OBJECT
     masks[0, 30:40, 25:30] = UNKNOWN
@@ -65,20 +65,20 @@ def test_silhouettes_are_measured() -> None:
     images = torch.zeros(2, 64, 64, 3, dtype=torch.uint8)
     shapes = relative_pose.silhouettes(Capture(images, masks, camera, ("a", "b"), "camera"))
     assert shapes.centre[0].tolist() == [20, 35]
-    assert float(shapes.radius[0]) == pytest.approx(relative_pose.ROUNDNESS * (200 / torch.pi) ** 0.5 / 100)
+    assert float(shapes.radius[0]) == pytest.approx(relative_pose.SPHERE_OVER_DISC * (200 / torch.pi) ** 0.5 / 100)
     assert shapes.visible.tolist() == [True, False]
 
 
-def test_a_silhouette_that_jumps_is_odd_and_mended() -> None:
-    """Five frames in a row grow by five percent each; one is cut in half, another moved aside."""
+def test_a_silhouette_that_jumps_is_detected_and_replaced() -> None:
+    """Frames grow by five percent each; the radius of one is reduced, and the centre of another is moved."""
     radius = 0.1 * 1.05 ** torch.arange(9, dtype=torch.float64)
     centre = torch.full((9, 2), 64.0, dtype=torch.float64)
     shapes = relative_pose.Silhouettes(centre, radius, torch.full((9,), 30.0), torch.ones(9, dtype=torch.bool))
-    assert not relative_pose.odd(shapes).any()
+    assert not relative_pose.failed_masks(shapes).any()
     radius[3] *= 0.7
     centre[6, 0] += 15
-    found = relative_pose.odd(shapes)
+    found = relative_pose.failed_masks(shapes)
     assert torch.nonzero(found)[:, 0].tolist() == [3, 6]
-    whole = relative_pose.mended(shapes, found)
-    assert float(whole.radius[3]) in (float(radius[2]), float(radius[4]))
-    assert whole.centre[6].tolist() == [64, 64]
+    repaired = relative_pose.replace_failed(shapes, found)
+    assert float(repaired.radius[3]) in (float(radius[2]), float(radius[4]))
+    assert repaired.centre[6].tolist() == [64, 64]

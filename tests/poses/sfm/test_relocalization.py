@@ -1,43 +1,43 @@
-"""Leaps in a film of known turns."""
+"""Pose jumps in a video of known rotations."""
 
 import math
 
 import torch
 
 from tumble.maths.se3 import SO3
-from tumble.poses.sfm.relocalization import unbroken
+from tumble.poses.sfm.relocalization import longest_smooth_sequence
 
 Y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
-def film(n: int = 20, step: float = math.radians(10)) -> torch.Tensor:
+def rotations_of_video(n: int = 20, step: float = math.radians(10)) -> torch.Tensor:
     return SO3.exp(torch.arange(n)[:, None] * step * Y).matrix()
 
 
-def test_a_smooth_film_is_whole() -> None:
-    assert bool(unbroken(film(), torch.ones(20) > 0).all())
+def test_a_smooth_video_is_kept_whole() -> None:
+    assert bool(longest_smooth_sequence(rotations_of_video(), torch.ones(20) > 0).all())
 
 
-def test_the_shorter_side_of_a_leap_is_given_up() -> None:
-    R = film()
+def test_the_shorter_side_of_a_pose_jump_is_excluded() -> None:
+    R = rotations_of_video()
     R[:3] = R[:3] @ SO3.exp(math.pi * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)).matrix()
-    found = unbroken(R, torch.ones(20) > 0)
-    assert torch.nonzero(~found)[:, 0].tolist() == [0, 1, 2]
+    chosen = longest_smooth_sequence(R, torch.ones(20) > 0)
+    assert torch.nonzero(~chosen)[:, 0].tolist() == [0, 1, 2]
 
 
-def test_a_single_frame_that_leaps_there_and_back() -> None:
-    """What lies on both sides of it belongs together."""
-    R = film()
+def test_a_single_frame_between_two_pose_jumps_is_excluded() -> None:
+    """The frames on both sides of it belong together."""
+    R = rotations_of_video()
     R[12] = SO3.exp(2.5 * Y).matrix() @ R[12]
-    known = torch.ones(20) > 0
-    assert torch.nonzero(unbroken(R, known))[:, 0].tolist() == [*range(12), *range(13, 20)]
+    usable = torch.ones(20) > 0
+    assert torch.nonzero(longest_smooth_sequence(R, usable))[:, 0].tolist() == [*range(12), *range(13, 20)]
 
 
-def test_frames_that_do_not_count_leave_room() -> None:
-    """After three missing frames the object has turned by 40 degrees; what stands in for them is never the answer."""
-    R = film()
+def test_rotation_may_add_up_over_unusable_frames() -> None:
+    """Over three unusable frames the object rotates by 40 degrees; the placeholder rotations are never chosen."""
+    R = rotations_of_video()
     R[5:8] = torch.eye(3, dtype=torch.float64)
-    known = torch.ones(20) > 0
-    known[5:8] = False
-    assert torch.equal(unbroken(R, known), known)
-    assert not bool(unbroken(R, torch.zeros(20) > 0).any())
+    usable = torch.ones(20) > 0
+    usable[5:8] = False
+    assert torch.equal(longest_smooth_sequence(R, usable), usable)
+    assert not bool(longest_smooth_sequence(R, torch.zeros(20) > 0).any())

@@ -1,10 +1,10 @@
-"""Chains of matches, by hand and through a known flow."""
+"""Feature tracks of matches counted by hand, and of matches of a known flow."""
 
 import pytest
 import torch
 
 from tumble.poses.sfm import tracks
-from tumble.poses.sfm.tracks import Tracks, followed, joined
+from tumble.poses.sfm.tracks import Tracks, chain_matches, concatenate
 from tumble.scene.match import Match
 
 A = torch.tensor([[1.05, 0.08], [-0.06, 0.97]], dtype=torch.float64)
@@ -17,13 +17,14 @@ def match(i: int, j: int, uv_i: list, uv_j: list, confidence: list | None = None
 
 
 def flowed(uv: torch.Tensor, steps: int) -> torch.Tensor:
+    """Positions after some steps of an affine flow."""
     for _ in range(steps):
         uv = uv @ A.T + SHIFT
     return uv
 
 
 def dense(i: int, j: int, rng: torch.Generator, n: int = 3000) -> Match:
-    """Matches of an affine flow from jittered places."""
+    """Matches of an affine flow from random positions."""
     uv = 60 * torch.rand(n, 2, generator=rng, dtype=torch.float64)
     return Match(i, j, uv, flowed(uv, j - i), torch.rand(n, generator=rng, dtype=torch.float64))
 
@@ -33,91 +34,92 @@ def spacing(n: int) -> torch.Tensor:
 
 
 def observations(tracks: Tracks, point: int) -> dict[int, list[float]]:
+    """Positions of one point, by frame."""
     mine = tracks.point == point
     return dict(zip(tracks.frame[mine].tolist(), tracks.uv[mine].tolist(), strict=True))
 
 
-def test_matches_that_meet_become_one_track() -> None:
-    tracks = followed(
+def test_matches_that_share_a_pixel_become_one_track() -> None:
+    tracks = chain_matches(
         [match(0, 1, [[5, 5], [29, 29]], [[6, 5], [20, 20]]), match(1, 2, [[6, 5]], [[7, 5]])], spacing(3)
     )
     assert tracks.n == 2
-    seen = observations(tracks, int(tracks.point[tracks.frame == 2]))
-    assert [seen[t] for t in range(3)] == [pytest.approx(uv) for uv in ([5, 5], [6, 5], [7, 5])]
+    by_frame = observations(tracks, int(tracks.point[tracks.frame == 2]))
+    assert [by_frame[t] for t in range(3)] == [pytest.approx(uv) for uv in ([5, 5], [6, 5], [7, 5])]
 
 
-def test_a_track_goes_on_between_the_matches() -> None:
-    """Dense matches that never meet: a track of five frames ends where the flow takes it."""
+def test_tracks_are_continued_between_matches() -> None:
+    """With dense matches that share no pixels, a track of five frames ends where the flow leads."""
     rng = torch.Generator().manual_seed(0)
-    tracks = followed([dense(t, t + 1, rng) for t in range(4)], spacing(5))
+    tracks = chain_matches([dense(t, t + 1, rng) for t in range(4)], spacing(5))
     first = tracks.frame == 0
-    assert int(first.sum()) > 80, "12 x 12 cells, some of which leave the matches' part of the frame"
+    assert int(first.sum()) > 80, "of 12 x 12 cells some leave the part of the frame that has matches"
     lengths, errors = [], []
     for point, uv in zip(tracks.point[first].tolist(), tracks.uv[first], strict=True):
-        seen = observations(tracks, point)
-        lengths.append(len(seen))
-        last = max(seen)
-        errors.append(float((flowed(uv, last) - torch.tensor(seen[last], dtype=torch.float64)).norm()))
+        by_frame = observations(tracks, point)
+        lengths.append(len(by_frame))
+        last = max(by_frame)
+        errors.append(float((flowed(uv, last) - torch.tensor(by_frame[last], dtype=torch.float64)).norm()))
     assert sorted(lengths)[len(lengths) // 2] == 5
-    # An affine flow is fitted by affine maps; the weight against bending costs little but at the matches' border.
+    # An affine flow is fitted by affine maps; the regularisation has little effect except at the border of the matches.
     assert sorted(errors)[len(errors) // 2] < 0.02
     assert max(errors) < 0.5
 
 
-def test_what_the_next_frame_says_goes_before_what_far_ones_say() -> None:
-    """Flow between far frames stays behind: it may sharpen a place, not move it, and not go on alone."""
+def test_the_nearest_frame_has_precedence_over_farther_ones() -> None:
+    """Flow between far frames underestimates motion: it may refine a position, not move it or continue alone."""
     near = [match(0, 1, [[5, 5], [25, 25]], [[8, 5], [28, 25]]), match(1, 2, [[8, 5]], [[11, 5]])]
-    behind = match(0, 2, [[5, 5], [25, 25]], [[9, 5], [29, 25]])
-    tracks = followed([*near, behind], spacing(3))
+    lagging = match(0, 2, [[5, 5], [25, 25]], [[9, 5], [29, 25]])
+    tracks = chain_matches([*near, lagging], spacing(3))
     assert tracks.uv[tracks.frame == 2].tolist() == [pytest.approx([11, 5])]
     agreeing = match(0, 2, [[5, 5]], [[11.4, 5]])
-    tracks = followed([*near, agreeing], spacing(3))
+    tracks = chain_matches([*near, agreeing], spacing(3))
     assert tracks.uv[tracks.frame == 2][0].tolist() == pytest.approx([11.2, 5])
 
 
-def test_a_frame_that_shows_nothing_is_bridged() -> None:
-    tracks = followed([match(0, 2, [[5, 5]], [[9, 5]]), match(2, 3, [[9, 5]], [[11, 5]])], spacing(4))
+def test_a_frame_without_matches_is_bridged() -> None:
+    tracks = chain_matches([match(0, 2, [[5, 5]], [[9, 5]]), match(2, 3, [[9, 5]], [[11, 5]])], spacing(4))
     assert tracks.n == 1
     assert tracks.frame.tolist() == [0, 2, 3]
 
 
-def test_nothing_makes_no_tracks() -> None:
-    assert followed([match(0, 1, [], [])], spacing(2)).n == 0
+def test_empty_matches_give_no_tracks() -> None:
+    assert chain_matches([match(0, 1, [], [])], spacing(2)).n == 0
 
 
-def test_of_tracks_that_meet_the_older_goes_on() -> None:
-    """Two points of frame 0 fall together in frame 1: no surface point is seen twice."""
-    tracks = followed(
+def test_of_tracks_that_meet_only_the_older_continues() -> None:
+    """Two points of frame 0 coincide in frame 1; one surface point must not have two tracks."""
+    tracks = chain_matches(
         [match(0, 1, [[5, 5], [25, 25]], [[11, 6], [11.5, 6.5]]), match(1, 2, [[11, 6]], [[13, 6]])], spacing(3)
     )
     assert len(tracks) == 3
 
 
-def test_selection_and_union_keep_points_apart() -> None:
-    tracks = followed(
+def test_select_and_concatenate_keep_points_distinct() -> None:
+    tracks = chain_matches(
         [match(0, 1, [[5, 5], [29, 29]], [[6, 5], [20, 20]]), match(1, 2, [[6, 5]], [[7, 5]])], spacing(3)
     )
     early = tracks.select(tracks.frame < 2)
     assert (early.n, len(early)) == (2, 4)
     late = tracks.select(tracks.frame > 0)
     assert (late.n, len(late)) == (1, 2), "the other point has one observation left"
-    both = joined(early, late)
+    both = concatenate(early, late)
     assert (both.n, len(both)) == (3, 6)
     assert both.point[4:].tolist() == [2, 2]
 
 
-def test_where_matches_disagree_tracks_end() -> None:
+def test_tracks_end_where_matches_disagree() -> None:
     here = [[10.0, 10.0], [10.3, 10.0], [30.0, 30.0], [30.3, 30.0]]
     there = [[12.0, 10.0], [18.0, 10.0], [32.0, 30.0], [32.3, 30.0]]
-    tracks = followed([match(0, 1, here, there)], spacing(2))
+    tracks = chain_matches([match(0, 1, here, there)], spacing(2))
     assert tracks.n == 1
     assert observations(tracks, 0)[1] == pytest.approx([32.0, 30.0], abs=0.31)
 
 
-def test_correspondences_become_points_that_two_frames_show() -> None:
+def test_correspondences_become_tracks_of_two_observations() -> None:
     uv = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    pair = tracks.of_match(Match(3, 7, uv, uv + 10, torch.ones(2)))
-    both = tracks.joined(tracks.NONE, pair, pair)
+    pair = tracks.two_frame_tracks(Match(3, 7, uv, uv + 10, torch.ones(2)))
+    both = tracks.concatenate(tracks.NO_TRACKS, pair, pair)
     assert both.n == 4
     assert both.frame.tolist() == [3, 3, 7, 7] * 2
     assert both.point.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]

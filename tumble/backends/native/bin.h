@@ -1,8 +1,9 @@
-// Which Gaussians touch which tile, nearest first: a radix sort by depth, then a counting sort by tile.
+// Lists of the Gaussians that overlap each tile, nearest first: a radix sort by depth, then a counting sort by tile.
 #pragma once
 #include "raster.h"
 
-// Drawn Gaussians by depth, ties by index, into r.ranks. Keys are the bits of a positive float, ~0 if not drawn.
+// Writes the Gaussians that are not culled to r.ranks, by depth, ties by index. Keys are the bits of a positive float,
+// or ~0 if culled.
 static void sort_by_depth(Raster& r) {
     int *from = r.ranks, *to = r.ranks_2, n = 0;
     int histogram[3][DIGIT];
@@ -26,8 +27,9 @@ static void sort_by_depth(Raster& r) {
     r.ranks_2 = to, r.ranks = from, r.n_drawn = n;
 }
 
-// Calls visit(tile) for every tile with a pixel centre inside a Gaussian's outline. Left and right ends of the part of an
-// ellipse that lies in a row of tiles are at its own extreme, or else where it crosses the row's border.
+// Calls visit(tile) for every tile with a pixel centre inside a Gaussian's footprint. The leftmost and rightmost points
+// of the part of an ellipse within a row of tiles are the extreme points of the ellipse, or else its intersections with
+// the border of the row.
 template <class F>
 INLINE void for_tiles(const Raster& r, int g, F visit) {
     const float* s = r.span + (i64)g * SPAN;
@@ -38,7 +40,7 @@ INLINE void for_tiles(const Raster& r, int g, F visit) {
     float low = fmax2(s[1] - half_y - margin, 0), high = fmin2(s[1] + half_y + margin, (float)r.height);
     int row_end = imin2(tiles_y(r), ((int)high + TILE) / TILE), across = tiles_x(r);
     for (int row = (int)low / TILE; row < row_end; row++) {
-        // Pixel centres of the row, from the outline's own centre.
+        // Pixel centres of the row, relative to the centre of the footprint.
         float top = fmax2(row * TILE + 0.5f - margin - s[1], -half_y);
         float bottom = fmin2(row * TILE + TILE - 0.5f + margin - s[1], half_y);
         if (top > bottom) continue;
@@ -47,7 +49,7 @@ INLINE void for_tiles(const Raster& r, int g, F visit) {
         float left = s[0] + slope * e_l - __builtin_sqrtf(rest * fmax2(1 - e_l * e_l * inv_y2, 0)) - margin;
         left = fmax2(left, 0.5f), right = fmin2(right, (float)r.width - 0.5f);
         if (left > right) continue;
-        // A pixel centre x + 1/2 in [left, right].
+        // Pixels whose centre x + 1/2 lies in [left, right].
         int from = (int)(left + 0.5f), to = (int)(right - 0.5f);
         if (from > to) continue;
         for (int tile = from / TILE; tile <= to / TILE && tile < across; tile++) visit(row * across + tile);
@@ -62,7 +64,7 @@ static void count_share(Raster& r, int share) {
         for_tiles(r, r.ranks[i], [&](int tile) { counts[tile]++; });
 }
 
-// Counts become places in the list; shares follow each other by depth.
+// Turns counts into positions in the list, so that the shares of a tile follow each other by depth.
 static void place(Raster& r) {
     int n_tiles = tiles_x(r) * tiles_y(r), start = 0;
     for (int tile = 0; tile < n_tiles; tile++) {

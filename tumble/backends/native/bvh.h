@@ -1,8 +1,9 @@
-// A 16-wide tree over Gaussians in the object frame, and the rays that search it.
+// A 16-wide bounding volume hierarchy of Gaussians in the object frame, and ray tracing through it.
 //
-// Gaussians are sorted by halving space; sixteen in a row are a leaf, sixteen leaves in a row a node, and so
-// on: child c of node i is node 16 i + c of the level below, so the tree holds no pointers. A node knows the boxes of its
-// sixteen children and a cone around the normals in each: a child whose every normal faces along the ray is passed by.
+// Gaussians are sorted by recursive bisection of space. Sixteen consecutive Gaussians are a leaf, sixteen consecutive
+// leaves a node, and so on: child c of node i is node 16 i + c of the level below, so that no pointers are needed.
+// A node holds the bounding boxes of its sixteen children and a cone around the normals of each; children whose normals
+// all point along the ray are skipped as back-facing.
 #pragma once
 #include "project.h"
 
@@ -57,7 +58,7 @@ static void leaf_fields(Bvh& t, float* W) {
     }
 }
 
-// Move the Gaussians that come first along an axis to order[from, middle).
+// Quickselect: moves the Gaussians with the smallest coordinates along an axis to order[from, middle).
 static void split_at(Bvh& t, int axis, int from, int middle, int to) {
     auto key = [&](int i) { return t.means[3 * (i64)t.order[i] + axis]; };
     auto swap = [&](int i, int j) {
@@ -82,8 +83,8 @@ static void split_at(Bvh& t, int axis, int from, int middle, int to) {
     }
 }
 
-// Halve again and again across the longest side, at whole leaves and powers of two of them: so any 16^k in a row from a
-// multiple of 16^k lie together.
+// Recursive bisection across the longest side at multiples of power-of-two numbers of leaves, so that 16^k consecutive
+// Gaussians from a multiple of 16^k on are close together.
 static void sort_by_halving(Bvh& t) {
     struct Range {
         int from, to;
@@ -109,7 +110,7 @@ static void sort_by_halving(Bvh& t) {
     }
 }
 
-// Child c of a node from the Gaussians [from, to) of the sorted order.
+// Computes child c of a node from the Gaussians [from, to) in sorted order.
 static void enclose(const Bvh& t, Node& node, int c, int from, int to) {
     float axis[3] = {}, worst = 1, length = 0;
     for (int a = 0; a < 3; a++) node.low[a][c] = 1e30f, node.high[a][c] = -1e30f;
@@ -127,7 +128,7 @@ static void enclose(const Bvh& t, Node& node, int c, int from, int to) {
         const float* n = t.normals + 3 * (i64)t.order[i];
         worst = fmin2(worst, n[0] * axis[0] + n[1] * axis[1] + n[2] * axis[2]);
     }
-    // Past a right angle there is always a normal that faces the ray.
+    // A cone of more than a right angle always contains a normal that faces the ray.
     node.sine[c] = worst <= 0 ? 2 : __builtin_sqrtf(fmax2(1 - worst * worst, 0)) + 1e-3f;
     if (from >= to) node.sine[c] = -2;
 }
@@ -168,7 +169,7 @@ INLINE Ray ray_at(const float* o, const float* d) {
     return r;
 }
 
-// Children of a node the ray may meet, one bit each.
+// Children of a node that the ray may hit, one bit each.
 INLINE u32 met_children(const Node& n, const Ray& r) {
     u32 met = 0;
     for (int c = 0; c < WIDE; c += LANES) {
@@ -183,7 +184,7 @@ INLINE u32 met_children(const Node& n, const Ray& r) {
     return met;
 }
 
-// Alphas of a leaf's Gaussians on the ray (0 where not met) and the distances of their peaks.
+// Alphas of the Gaussians of a leaf on the ray (0 where not hit) and distances of their peaks.
 INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, vf& alpha, vf& z) {
     vf p[3], Wd[3], Wp[3];
     for (int a = 0; a < 3; a++) p[a] = load(leaf.mean[a] + c) - r.o[a];
@@ -204,7 +205,7 @@ INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, vf&
     return on;
 }
 
-// Calls visit(alpha, z, ids, on) for every group of Gaussians the ray meets, in no order, until it returns false.
+// Calls visit(alpha, z, ids, on) for every group of Gaussians with hits, in any order, until it returns false.
 template <class F>
 INLINE void search(const Bvh& t, const Ray& ray, F visit) {
     struct Task {
@@ -254,7 +255,7 @@ struct Hits {
     float z[BUFFER + LANES], alpha[BUFFER];
     int id[BUFFER], order[BUFFER], count;
 
-    // Into `order`, nearest first: a hit's place is the number of nearer ones.
+    // Sorts into `order`, nearest first: the position of a hit is the number of nearer hits.
     METHOD void sort() {
         int sum = 0;
         store(z + count, splat(2e30f));
@@ -266,7 +267,7 @@ struct Hits {
         if (sum != count * (count - 1) / 2) sort_duplicates();
     }
 
-    // Equal distances (exact duplicates) are told apart by id.
+    // Orders hits of equal distance (exact duplicates) by id.
     __attribute__((noinline)) void sort_duplicates() {
         for (int i = 0; i < count; i++) {
             int place = 0;
@@ -275,7 +276,7 @@ struct Hits {
         }
     }
 
-    // Keep the nearer half; returns the farthest kept.
+    // Keeps the nearer half; returns the index of the farthest hit kept.
     inline int halve() {
         float z_kept[BUFFER / 2], alpha_kept[BUFFER / 2];
         int id_kept[BUFFER / 2];
@@ -288,7 +289,7 @@ struct Hits {
     }
 };
 
-// Hits behind (z, id) = after, the nearest if there is no room for all; then `all` is false.
+// Collects the hits behind (after_z, after_id). If the buffer is too small, only the nearest ones, and `all` is false.
 static void collect(const Bvh& t, const Ray& ray, float after_z, int after_id, Hits& hits, bool& all) {
     float limit_z = 1e30f;
     int limit_id = 0;
@@ -311,7 +312,7 @@ static void collect(const Bvh& t, const Ray& ray, float after_z, int after_id, H
     hits.sort();
 }
 
-// Front to back along a ray; returns the dominant Gaussian.
+// Blends the hits of a ray front to back; returns the dominant Gaussian.
 static int trace_ray(const Bvh& t, const Ray& ray, const float* radiance, float* transmittance, float* out) {
     float T = 1, best = 0, sum[3] = {}, z = -1;
     int dominant = -1, id = 0;

@@ -1,5 +1,5 @@
-// Blending front to back, a block of LANES pixels at a time, and its adjoint, which also walks front to back: with
-// s_i = dL/dw_i, what lies behind Gaussian i contributes rem = dL/dout . out - sum_{j <= i} w_j s_j.
+// Blending front to back, a block of LANES pixels at a time, and its adjoint, which also traverses front to back: with
+// s_i = dL/dw_i, the Gaussians behind Gaussian i contribute rem = dL/dout . out - sum_{j <= i} w_j s_j.
 // Formulas in raster.h. C is the number of features, rounded up to a multiple of 4.
 #pragma once
 #include "raster.h"
@@ -7,8 +7,8 @@
 struct Block {
     vf x, y;       // pixel centres
     vi inside;     // lanes within the image
-    bool whole;    // all lanes are
-    bool corner;   // the first of its tile
+    bool whole;    // all lanes are within the image
+    bool corner;   // first block of its tile
     int tile;
     i64 pixel[LANES];
 };
@@ -24,8 +24,8 @@ INLINE Block block_at(const Raster& r, int x0, int y0) {
     return b;
 }
 
-// Channels `first` .. of an image with `stride` of them, at a block's pixels. What is read beyond the last channel is the
-// next pixel's, or zero at the end of the image. Zero where there is no image.
+// Reads LANES channels from `first` on of an image with `stride` channels, at the pixels of a block. Channels beyond
+// the last one are those of the next pixel, or zero at the end of the image. All are zero if the image is null.
 INLINE void read_channels(const Raster& r, const float* image, const Block& b, int stride, int first, vf* x) {
     i64 end = (i64)r.height * r.width * stride;
     for (int l = 0; l < LANES; l++) {
@@ -53,7 +53,7 @@ INLINE vf read_one(const float* image, const Block& b) {
     return load(x);
 }
 
-// Channels of a block's pixels as one row a pixel, padded with zeros; x[C].
+// Transposes C channels x of a block to one row per pixel, padded with zeros.
 template <int C, int N>
 INLINE void lay_out(const vf* x, float (*rows)[N]) {
     for (int first = 0; first < N; first += LANES) {
@@ -64,11 +64,11 @@ INLINE void lay_out(const vf* x, float (*rows)[N]) {
     }
 }
 
-// Numbers in whole vectors.
+// N rounded up to whole vectors.
 template <int N>
 constexpr int PADDED = (N + LANES - 1) / LANES * LANES;
 
-// The first `count` of C channels to an image of as many.
+// Writes the first `count` of C channels to an image with `count` channels.
 template <int C>
 INLINE void write_channels(float* image, const Block& b, int count, const vf* x) {
     float rows[LANES][PADDED<C>];
@@ -87,13 +87,13 @@ INLINE void write_one(float* image, const Block& b, vf value) {
         if (inside >> l & 1) image[b.pixel[l]] = x[l];
 }
 
-// A Gaussian at a block's pixels, up to its alpha.
+// The response of a Gaussian at the pixels of a block, up to its alpha.
 struct Peak {
     vf dx, dy, K, l, q, r, G, raw, alpha;
     vi on;
 };
 
-// False if no pixel of `alive` is reached.
+// Computes the response at the pixels of the mask `alive`; false if the Gaussian contributes to none of them.
 INLINE bool peak_at(const float* f, const Block& b, vi alive, float alpha_min, float alpha_max, Peak& p) {
     p.dx = b.x - f[CX], p.dy = b.y - f[CY];
     vf beta = f[BX] * p.dx + f[BY] * p.dy;
@@ -112,7 +112,7 @@ INLINE bool peak_at(const float* f, const Block& b, vi alive, float alpha_min, f
 INLINE vf lift(const float* f, const Peak& p) { return -(p.l * (p.l - 1.0f) + f[KAPPA] * p.K) * p.r; }
 
 struct Corners {
-    vf u, v, free_u, free_v;   // clamped coordinates; the same before the clamp
+    vf u, v, free_u, free_v;   // clamped and unclamped coordinates
 };
 INLINE Corners corners_at(const float* f, const Peak& p, vf zeta, vf zeta_1) {
     Corners c;
@@ -122,7 +122,7 @@ INLINE Corners corners_at(const float* f, const Peak& p, vf zeta, vf zeta_1) {
     return c;
 }
 
-// Sums of w over a block's pixels wait here until there are enough for one transposed reduction.
+// Buffer of blending weights w of a block, until there are enough for one transposed reduction over its pixels.
 struct Weights {
     vf w[LANES];
     int g[LANES];
@@ -141,7 +141,7 @@ struct Weights {
     }
 };
 
-// Features wait for a few Gaussians, so that their sums stay in registers while those are added.
+// Buffer of a few Gaussians whose features are added together, so that the sums stay in registers.
 template <int C>
 struct Features {
     enum { WAITING = 8 };
@@ -212,12 +212,12 @@ static void composite_block(const Raster& r, const Block& b, const int* list, in
     if (C) write_channels<C + !C>(r.features, b, r.c, features.sum);
 }
 
-// dL/d(sums) at a block's pixels.
+// Gradients dL/d(sums) at the pixels of a block.
 template <int C>
 struct Seeds {
     vf red, green, blue, nx, ny, nz, alpha, z, zz, rem;
     vf features[C + 1];
-    // The channels again, one row a pixel: rgb and normal; features.
+    // The same channels with one row per pixel: rgb and normal; features.
     float fixed_rows[LANES][PADDED<6>], feature_rows[LANES][PADDED<C + !C>];
 };
 
@@ -263,7 +263,7 @@ INLINE void add_channels(float* to, const vf* w, const float (*rows)[N]) {
     }
 }
 
-// A Gaussian's share of its corners' gradients.
+// Adds the gradients of the corners of a Gaussian.
 template <int C>
 INLINE void add_corners(float* out, vf w, const Corners& c, const Seeds<C>& s) {
     vf wu = w * c.u, w1 = w - wu, w11 = wu * c.v, w01 = w1 * c.v;
@@ -291,7 +291,7 @@ static void adjoint_block(const Raster& r, const Block& b, const int* list, int 
         if (C) {
             Corners c = corners_at(f, p, zeta, zeta_1);
             const float* f4 = f + RECORD;
-            // Two chains of sums for each, or the processor waits.
+            // Two chains of sums each, because the latency of one chain would stall the processor.
             vf f0 = {}, f1 = {}, f2 = {}, f3 = {}, h0 = {}, h1 = {}, h2 = {}, h3 = {};
 #pragma GCC unroll 8
             for (int ch = 0; ch < C; ch += 2, f4 += 8) {
@@ -328,7 +328,7 @@ static void adjoint_block(const Raster& r, const Block& b, const int* list, int 
     }
 }
 
-// The same for the corners alone, where nobody asks for the geometry's gradient: its weights are given.
+// The adjoint for the features at the corners only, if no gradient of the geometry is needed.
 template <int C>
 static void corner_adjoint_block(const Raster& r, const Block& b, const int* list, int count, float* parts) {
     Seeds<C> s;
@@ -346,7 +346,7 @@ static void corner_adjoint_block(const Raster& r, const Block& b, const int* lis
     }
 }
 
-// Tiles are dealt out in turn, since the object fills the middle of the picture.
+// Calls visit for all blocks of a share. Tiles are assigned round-robin because the object is in the image centre.
 template <class F>
 INLINE void for_blocks(const Raster& r, int share, F visit) {
     int across = tiles_x(r), n_tiles = across * tiles_y(r);
@@ -362,7 +362,7 @@ INLINE void for_blocks(const Raster& r, int share, F visit) {
     }
 }
 
-// Ask for what the adjoint of a tile will read; its pixels lie far apart in memory.
+// Prefetches what the adjoint of a tile will read, because the rows of a tile lie far apart in memory.
 INLINE void prefetch_tile(const Raster& r, int tile) {
     const float* images[] = {r.rgb, r.v_rgb, r.normal, r.v_normal, r.features, r.v_features, r.alpha, r.v_alpha};
     const int strides[] = {3, 3, 3, 3, r.c, r.c, 1, 1};

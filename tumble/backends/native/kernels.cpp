@@ -1,4 +1,4 @@
-// The plain C ABI of the CPU backend. One translation unit, no C or C++ library.
+// The plain C ABI of the CPU backend, one translation unit that needs no C or C++ library.
 #include "bin.h"
 #include "bvh.h"
 #include "composite.h"
@@ -10,13 +10,13 @@
 
 API int lanes() { return LANES; }
 
-// For the caller to compare with its own.
+// Sizes of the structures, which the caller compares with its own.
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
-// Project, sort and count: how many pairs of a Gaussian and a tile there will be.
+// Projects, sorts and counts; returns the number of pairs of a Gaussian and a tile, the required length of `list`.
 API int raster_prepare(Raster* r) {
     parallel(r->threads, [=](int share) { project_share(*r, share); });
     sort_by_depth(*r);
@@ -34,7 +34,7 @@ static void adjoint(Raster* r) {
     parallel(r->threads, [=](int share) { adjoint_share<C>(*r, share); });
 }
 
-// The list has room for the pairs now.
+// Must be called after raster_prepare, with `list` allocated.
 API void raster_forward(Raster* r) {
     parallel(r->threads, [=](int share) { list_share(*r, share); });
     switch ((r->c + 3) / 4) {

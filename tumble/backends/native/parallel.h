@@ -1,13 +1,13 @@
-// Threads that wait between phases. Share i of n of a phase is the same work whoever runs it, so results repeat bit for
-// bit for a fixed number of shares.
+// A pool of threads that run the shares of a *phase*. Share i of n is the same work on any thread, so that results are
+// bit-for-bit reproducible for a fixed number of shares.
 //
-// A pool of our own, not OpenMP: some compilers lack that, and its threads spin while they wait, which on a busy machine
-// takes the very core that the others wait for. These spin for microseconds, then sleep.
+// OpenMP is not used because some compilers lack it, and because its idle threads spin, which blocks cores of a busy
+// machine. Threads of this pool spin for microseconds, then sleep.
 #pragma once
 #include "simd.h"
 
 #if defined(__unix__) || defined(__APPLE__)
-// A just-in-time compiler links no library: there these are pointers, and whoever loads the kernels sets them.
+// With a just-in-time compiler no library is linked; these are pointers then, which the loader of the kernels sets.
 #if defined(JUST_IN_TIME)
 #define FROM_SYSTEM(name, ...) static int (*name)(__VA_ARGS__);
 #else
@@ -25,10 +25,10 @@ FROM_SYSTEM(getpid)
 enum { MAX_WORKERS = 255, SPINS = 2000 };
 
 struct Pool {
-    // Larger than any system's mutex or condition.
+    // Larger than the mutexes and condition variables of all systems.
     alignas(64) char mutex[256], wake[256], done[256];
     int n_workers, pid, busy;
-    int generation, left;   // of the phase at hand: its number, and the workers still on it
+    int generation, left;   // number of the current phase, and of workers that have not finished it
     void (*phase)(void*, int);
     void* context;
     int shares;
@@ -67,7 +67,7 @@ static void* work(void* argument) {
     return nullptr;
 }
 
-// As many workers as asked for, or as the system gives. A child of fork() has none of its parent's.
+// Starts workers up to the wanted number, or as many as the system allows. After fork() a child has to start its own.
 static void hire(int wanted) {
     if (pool.pid != getpid()) {
         pthread_mutex_init(pool.mutex, nullptr);
@@ -98,7 +98,7 @@ static void run_phase(int shares, void (*phase)(void*, int), void* context) {
     pthread_mutex_unlock(pool.mutex);
 }
 
-// Calls phase(share) for every share. Without a free pool (one share, or another thread at it) one after the other.
+// Calls phase(share) for every share, sequentially if there is one share or another thread is using the pool.
 template <class F>
 INLINE void parallel(int shares, F phase) {
     auto call = [](void* f, int share) { (*(F*)f)(share); };

@@ -1,4 +1,4 @@
-// Projection of Gaussians to the screen, sixteen at a time, and its adjoint. Formulas in raster.h.
+// Projection of Gaussians to the screen, LANES at a time, and its adjoint. Formulas in raster.h.
 #pragma once
 #include "raster.h"
 
@@ -21,7 +21,7 @@ INLINE V2 operator*(V2 a, vf s) { return {a.x * s, a.y * s}; }
 INLINE vf dot(V2 a, V2 b) { return a.x * b.x + a.y * b.y; }
 INLINE vf cross(V2 a, V2 b) { return a.x * b.y - a.y * b.x; }
 
-// Row-major 3x3, either of vectors or (splatted) of the camera.
+// Row-major 3x3 matrices, one per lane.
 struct M3 {
     vf m[9];
     METHOD vf operator()(int i, int j) const { return m[3 * i + j]; }
@@ -36,7 +36,7 @@ INLINE V3 mul_T(const M3& A, V3 b) {
 }
 INLINE V3 row(const M3& A, int i) { return {A(i, 0), A(i, 1), A(i, 2)}; }
 
-// Field j of Gaussians first .. first + count of an [n stride] array; lanes beyond repeat the last one.
+// Field j of the Gaussians [first, first + count) of an [n stride] array; further lanes repeat the last Gaussian.
 INLINE vf gather(const float* p, int stride, int j, int first, int count) {
     float x[LANES];
     for (int i = 0; i < LANES; i++) x[i] = p[(i64)(first + imin2(i, count - 1)) * stride + j];
@@ -84,7 +84,7 @@ INLINE void rotation_adjoint(const vf* q, const M3& g, vf* v) {
            4.0f * z * (g(0, 0) + g(1, 1));
 }
 
-// Real spherical harmonics in the signs of 3D Gaussian splatting, and the gradient of sum_i v_i Y_i in (x, y, z).
+// Real spherical harmonics with the signs of 3D Gaussian splatting, and the gradient of sum_i v_i Y_i in (x, y, z).
 INLINE void harmonics(int k, V3 d, vf* Y) {
     vf x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
     Y[0] = splat(0.28209479177f);
@@ -123,13 +123,13 @@ INLINE V3 harmonics_adjoint(int k, V3 d, const vf* v) {
                       o * (xx - yy)};
 }
 
-// Everything between the inputs and the record, kept for the adjoint.
+// Intermediate values of the projection, which the adjoint needs again.
 struct Projected {
     vf q[4], q_scale;        // unit quaternion, 1 / length of the given one
     M3 R_obj_local, M;       // M: local to camera
     V3 mu, mu_cam, p, s, inv_s;   // mu_cam = R mu, p = mu_cam + t
-    // Whitened centre and pixel steps: their first two parts, and the third as n = normal.p, e = step / centre and
-    // tau = (s_3 / n)^2, so that the thickness comes in through tau alone and nothing cancels when it is small.
+    // Whitened centre P and pixel steps E: the first two components. The third is represented by n = normal.p,
+    // e = step / centre and tau = (s_3 / n)^2, so that the thickness enters through tau alone, without cancellation.
     V2 P, E1, E2;
     vf n, e1, e2, tau;
     // F = E - e P, g = P x E, w = P.E, h = 1 / (1 + tau P.P), S = F.F + tau g g.
@@ -182,7 +182,7 @@ INLINE Projected project(const Raster& r, const Camera& cam, int first, int coun
     return o;
 }
 
-// Which lanes are drawn, and the outline of each on screen: the ellipse inside which alpha can reach alpha_min.
+// Which lanes are not culled, and the footprint of each: the ellipse on screen inside which alpha can reach alpha_min.
 INLINE vi outline(const Raster& r, const Camera& cam, const Projected& o, vf cut, vf* span) {
     V3 X = row(o.M, 0) * o.s, Y = row(o.M, 1) * o.s, Z = row(o.M, 2) * o.s, p = o.p;
     vf zz = dot(Z, Z), xz = dot(X, Z), yz = dot(Y, Z), D = p.z * p.z - cut * zz, inv_D = 1.0f / D;
@@ -198,7 +198,7 @@ INLINE vi outline(const Raster& r, const Camera& cam, const Projected& o, vf cut
     vi drawn = (p.z > r.near) & (p.z > r.near_sigmas * vsqrt(zz)) & (o.opacity >= r.alpha_min) &
                (dot(p, n) <= r.facing * vsqrt(dot(p, p)));
     vf half_x = vsqrt(vmax(span[2], vf{})) + 0.05f, half_y = vsqrt(vmax(span[4], vf{})) + 0.05f;
-    // Whole pixels, so that what misses every pixel centre of the image is not drawn either.
+    // Footprints that contain no pixel centre of the image are culled as well.
     return drawn & (span[0] + half_x > 0.5f) & (span[0] - half_x < (float)r.width - 0.5f) &
            (span[1] + half_y > 0.5f) & (span[1] - half_y < (float)r.height - 0.5f);
 }
@@ -244,8 +244,8 @@ static void project_share(Raster& r, int share) {
     }
 }
 
-// Gradients of a record's fields, lane-wise, to those of the inputs. The camera's gather in `camera`:
-// R (9), t (3), focal lengths and principal point (4).
+// Gradients of the inputs from those of a record's fields, per lane. The gradient of the camera is accumulated in
+// `camera`: R (9), t (3), focal lengths and principal point (4).
 INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected& o, const vf* g, V3 v_rgb,
                             V3 v_normal, vi drawn, int first, int count, vf* camera) {
     vf z = o.p.z, iz = o.inv_z, uv = splat(1.0f / (2.0f * r.corner)), zh = z * o.h, zzh = z * zh;
@@ -326,7 +326,7 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     scatter(r.v_opacity, 1, 0, first, count, keep(drawn, g[G_OPACITY]));
 }
 
-// Add up what the shares found, and take it to the inputs.
+// Sums the gradients of all shares and propagates them to the inputs.
 static void project_adjoint_share(Raster& r, int share) {
     Camera cam = camera_of(r);
     vf camera[CAMERA] = {};

@@ -1,6 +1,6 @@
-// Lambert + GGX of a point under directions shared by all points, LANES directions at a time, and its adjoint. The
-// formulas are in `Backend.shade`; f below is the specular part. Directions and radiance come as three rows of numbers
-// each, padded with zeros to whole vectors; a padding direction is below every horizon.
+// Shading (Lambert + GGX) under light directions shared by all points, LANES directions at a time, and its adjoint.
+// The formulas are in `Backend.shade`; f below is the specular part. Directions and radiance are three rows of numbers
+// each, padded with zeros to whole vectors; padding directions have n.w = 0 and therefore do not count.
 #pragma once
 #include "parallel.h"
 #include "simd.h"
@@ -13,17 +13,17 @@ struct Shade {
     int blocker_point_stride, blocker_direction_stride;
     float f0, roughness_min;
     float* out;
-    // Gradients: in, per share, out.
+    // Gradients: of results, per share, of inputs.
     const float* v_out;
     float *radiance_parts, *blocker_parts;
     float *v_normal, *v_albedo, *v_roughness, *v_view, *v_radiance, *v_blocker_radiance;
 };
 
-// One point, lane-independent.
+// Quantities of a point that do not depend on the direction.
 struct Point {
     float n[3], v[3], C[3], n_v, r, a, aa, g_v, slope_v, scale;   // C = n x v, slope_v = dg_v / dn_v
 };
-// Smith's g(x) = (x + root) / 2 with root = sqrt(aa + (1 - aa) x^2).
+// The root in Smith's g(x) = (x + root) / 2.
 INLINE vf smith_root(vf x, float aa) { return vsqrt(aa + (1 - aa) * x * x); }
 INLINE Point point_at(const Shade& s, i64 p) {
     Point o;
@@ -39,7 +39,7 @@ INLINE Point point_at(const Shade& s, i64 p) {
     return o;
 }
 
-// One point under a vector of directions.
+// The specular lobe of a point in LANES directions.
 struct Lobe {
     vf w[3], n_w, HH, C[3], n_H, t_num, vh, F, slope_F, root_w, g_w, rest, f;   // f = F rest
     vi exists;
@@ -60,7 +60,7 @@ INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
     o.root_w = smith_root(facing, p.aa), o.g_w = 0.5f * (facing + o.root_w);
     o.vh = 0.5f * vsqrt(o.HH);
     vf m = 1.0f - o.vh, mm = m * m;
-    // brdf.fresnel, and its slope in m.
+    // tumble.rendering.brdf.fresnel and its derivative in m.
     o.F = s.f0 * (1 + 24 * m * mm * (0.9878f + m * (-3.8886f + m * (9.1922f + m * (-9.6217f + m * 4.3303f)))));
     o.slope_F = s.f0 * 24 * mm * (2.9634f + m * (-15.5544f + m * (45.961f + m * (-57.7302f + m * 30.3121f))));
     vf x = o.HH / o.t_num;
@@ -68,7 +68,7 @@ INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
     o.f = o.F * o.rest;
 }
 
-// What arrives along a vector of directions, given which are in sight and lit at all.
+// Radiance arriving from LANES directions, given which are visible (`seen`) and above the horizon (`lit`).
 INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
     float lanes[3][LANES];
     u32 blocked = lit & ~seen;
@@ -85,7 +85,7 @@ INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
     for (int ch = 0; ch < 3; ch++) L[ch] = load(lanes[ch]);
 }
 
-// Visibility bits of the directions j ..; a vector never straddles two words.
+// Visibility bits of LANES directions from j on; they never straddle two words.
 INLINE u32 seen_at(const Shade& s, i64 p, int j) {
     return (u32)s.visibility[p * s.words + j / 32] >> j % 32 & ((1ull << LANES) - 1);
 }
@@ -109,7 +109,7 @@ static void shade_share(const Shade& s, int share) {
     }
 }
 
-// Sums over directions that make a point's gradient.
+// Gradients of a point summed over directions.
 struct PointSums {
     vf n[3], v[3], albedo[3], g_v, n_v, aa, a;
 };

@@ -1,7 +1,7 @@
-// Vectors of the machine's own width, in GCC/Clang vector extensions alone: no header is included, so that any of
-// the two compilers will do, also one without a C library. Wider vectors than the machine's are lowered badly.
+// SIMD vectors of the machine's width through the vector extensions of GCC and Clang. No header is included, so that a
+// compiler without a C library suffices. Vectors wider than the machine's would be compiled to slow code.
 //
-// A mask is an integer vector of 0 and -1. Never compile with -ffast-math: it folds `exp`'s rounding trick away.
+// A mask is an integer vector of 0 and -1. Never compile with -ffast-math, which removes the rounding trick of `vexp`.
 #pragma once
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
@@ -56,7 +56,7 @@ INLINE vf vsqrt(vf x) {
     return y;
 }
 
-// One bit per lane.
+// A mask as an integer with one bit per lane.
 INLINE u32 bits(vi m) {
 #if LANES == 16 && !defined(__clang__)
     typedef int v16si __attribute__((vector_size(64)));
@@ -147,7 +147,7 @@ INLINE vf fold1(vf a, vf b) { return SHUFFLE(a, b, 0, 5, 2, 7) + SHUFFLE(a, b, 1
 INLINE vf fold2(vf a, vf b) { return SHUFFLE(a, b, 0, 1, 6, 7) + SHUFFLE(a, b, 2, 3, 4, 5); }
 #endif
 
-// Lane i of x[j] becomes lane j of x[i]: zipping the halves together rotates the bits of an element's place by one.
+// Lane i of x[j] becomes lane j of x[i]: interleaving both halves rotates the bits of the index of an element by one.
 INLINE void transpose(vf* x) {
 #pragma GCC unroll 4
     for (int bit = 1; bit < LANES; bit *= 2) {
@@ -160,7 +160,7 @@ INLINE void transpose(vf* x) {
     }
 }
 
-// Lane i of the result is the sum of the lanes of x[i]: a transposed reduction, three operations a sum.
+// Lane i of the result is the sum of the lanes of x[i]: a transposed reduction with three operations per sum.
 INLINE vf sums_of(const vf* x) {
     vf a[LANES / 2];
     for (int i = 0; i < LANES / 2; i++) a[i] = fold1(x[2 * i], x[2 * i + 1]);
@@ -181,5 +181,5 @@ INLINE float sum_of(vf x) {
 }
 
 INLINE void clear(void* p, i64 bytes) {
-    if (bytes) __builtin_memset(p, 0, bytes);   // no bytes may mean no pointer
+    if (bytes) __builtin_memset(p, 0, bytes);   // p may be null if bytes is 0
 }

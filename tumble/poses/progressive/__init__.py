@@ -1,4 +1,7 @@
-"""The paper's stage 1 (section 4.1): a virtual camera, a neural signed distance field, and a frame at a time."""
+"""The paper's stage 1 (section 4.1): frame-by-frame tracking with a virtual camera and a neural signed distance field.
+
+An alternative to `poses.sfm`, which the default recipe uses; `recipes.progressive_poses` selects this one.
+"""
 
 from tumble.poses.progressive import stage
 from tumble.poses.progressive.sdf_field import Sizes

@@ -1,7 +1,7 @@
-"""NeuS under moving poses: what rays of several frames see of one shape, and how far that is from the photographs.
+"""NeuS volume rendering of one shape under several poses, and the losses of stage 1.
 
-A *glimpse* is some pixels of one frame with the pose that its object has there. Terms are those of NeuS (Wang et al.
-2021) for rays of an object with a mask, and FMOV's flow term between two frames (section 4.1 of the paper).
+The losses are those of NeuS (Wang et al. 2021) for rays of an object with a mask, and FMOV's flow loss between two
+frames (section 4.1 of the paper).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,38 +18,41 @@ from tumble.poses.progressive.ray_sampling import Pixels
 from tumble.poses.progressive.sdf_field import Fields
 from tumble.scene import Camera
 
-LEAST = 1e-3
-"""Opacities are kept this far from 0 and 1 in the mask term (NeuS)."""
-SEEN = 0.05
-"""Opacity under which a ray says nothing about where it met the object."""
+OPACITY_MARGIN = 1e-3
+"""Smallest distance of opacities from 0 and 1 in the mask loss (NeuS)."""
+MIN_HIT_OPACITY = 0.05
+"""Opacity of a ray below which its intersection with the object is undefined."""
 
 SdfFunction = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
-"""Points [n 3] to signed distance [n], its gradient [n 3] and features [n f]."""
+"""Function of points [n 3] that returns signed distance [n], its gradient [n 3] and features [n f]."""
 ColourFunction = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""Points, ray directions, gradients [n 3] and features [n f] to colours [n 3]."""
+"""Function of points, ray directions, gradients [n 3] and features [n f] that returns colours [n 3]."""
 
 
 @dataclass(frozen=True)
 class Sections:
-    """Pieces that rays are cut into."""
+    """Sections along rays, each of which contributes one sample."""
 
     middles: Float[Tensor, "r k"]
-    """Distance of their centres from the origin of the ray."""
+    """Distances of the sections' centres from the origin of the ray."""
     lengths: Float[Tensor, "r k"]
+    """Lengths of the sections."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What rays saw."""
+    """Rendered rays: `r` rays with `k` sections each."""
 
     rgb: Float[Tensor, "r 3"]
+    """Colour over black, sRGB."""
     opacity: Float[Tensor, " r"]
+    """Sum of the weights."""
     weights: Float[Tensor, "r k"]
-    """Share of each section in the colour."""
+    """Weight of each section in the colour."""
     points: Float[Tensor, "r k 3"]
-    """Centres of the sections."""
+    """Centres of the sections, object frame."""
     gradients: Float[Tensor, "r k 3"]
-    """Of the signed distance."""
+    """Gradient of the signed distance at the centres."""
 
 
 @torch.no_grad()
@@ -61,22 +64,25 @@ def sections(
     bound: float,
     jitter: Float[Tensor, " r"] | None = None,
 ) -> Sections:
-    """The chord of each ray through the ball of radius `bound`, in `n` equal pieces.
+    """Sections of equal length along the chord of each ray in a sphere.
 
-    NeuS marches one radius before and behind the point closest to the centre, and may put matter outside the ball;
-    chords are shorter, and a ray that misses the ball gets sections of length 0, which see nothing.
+    NeuS samples one radius before and behind the point closest to the centre, and so also outside the sphere. Chords
+    are shorter; a ray that misses the sphere gets sections of length 0, whose opacity is 0.
 
     Args:
-        directions: Of unit length.
-        jitter: Moves all sections of a ray by that share of their length, in [-0.5, 0.5].
+        origins: Origins of the rays.
+        directions: Directions of the rays, unit length.
+        n: Number of sections per ray.
+        bound: Radius of the sphere.
+        jitter: Shift of all sections of a ray, as a fraction of their length, in [-0.5, 0.5].
     """
     closest = -(origins * directions).sum(-1)
     squared = bound**2 - (origins + closest[:, None] * directions).square().sum(-1)
     half = squared.clamp_min(0).sqrt()
     step = 2 * half / n
     ticks = torch.arange(n, dtype=origins.dtype, device=origins.device) + 0.5
-    places = ticks if jitter is None else ticks + jitter[:, None]
-    middles = (closest - half)[:, None] + places * step[:, None]
+    positions = ticks if jitter is None else ticks + jitter[:, None]
+    middles = (closest - half)[:, None] + positions * step[:, None]
     return Sections(middles, step[:, None].expand_as(middles))
 
 
@@ -86,23 +92,24 @@ def opacities(
     lengths: Float[Tensor, "r k"],
     sharpness: Float[Tensor, ""],
 ) -> Float[Tensor, "r k"]:
-    """How much each section hides of what is behind it: `(F(s0) - F(s1)) / F(s0)`, F logistic (NeuS eq. 13).
+    """Opacity of each section: `(F(s0) - F(s1)) / F(s0)` with the logistic function F (NeuS eq. 13).
 
     Args:
         sdf: Signed distance at the sections' centres.
-        slope: Its derivative along the ray. Rising distance (leaving the object) hides nothing.
-        sharpness: [1 / object radius]
+        slope: Derivative of the distance along the ray; where it is positive, the opacity is 0.
+        lengths: Lengths of the sections.
+        sharpness: Sharpness of the logistic function [1 / object radius].
     """
     half = 0.5 * slope.clamp_max(0) * lengths
     before, after = torch.sigmoid((sdf - half) * sharpness), torch.sigmoid((sdf + half) * sharpness)
-    # 1e-5 as in NeuS: deep inside both are 0; but a section of no length must hide nothing.
+    # 1e-5 as in NeuS, because deep inside both are 0; not in the numerator, so that a section of length 0 gives 0.
     return ((before - after) / (before + 1e-5)).clamp(0, 1)
 
 
 def composite(alpha: Float[Tensor, "r k"]) -> Float[Tensor, "r k"]:
-    """Weights `alpha_k * product of (1 - alpha_j) over j < k`."""
-    free = torch.cumprod(1 - alpha + 1e-7, dim=1)
-    return alpha * torch.cat([torch.ones_like(free[:, :1]), free[:, :-1]], 1)
+    """Compositing weights: `alpha_k` times the product of `1 - alpha_j` over j < k."""
+    transmittance = torch.cumprod(1 - alpha + 1e-7, dim=1)
+    return alpha * torch.cat([torch.ones_like(transmittance[:, :1]), transmittance[:, :-1]], 1)
 
 
 def render(
@@ -111,16 +118,16 @@ def render(
     sharpness: Float[Tensor, ""],
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
-    along: Sections,
+    intervals: Sections,
 ) -> Rendered:
-    """Colours and opacities of rays over black; differentiable in both functions, origins and directions."""
-    r, k = along.middles.shape
-    points = origins[:, None] + along.middles[..., None] * directions[:, None]
+    """Volume rendering of rays over black; differentiable in both functions, origins and directions."""
+    r, k = intervals.middles.shape
+    points = origins[:, None] + intervals.middles[..., None] * directions[:, None]
     flat = points.reshape(-1, 3)
     views = directions[:, None].expand(r, k, 3).reshape(-1, 3)
     distance, gradient, features = sdf(flat)
     slope = (gradient * views).sum(-1)
-    weights = composite(opacities(distance.reshape(r, k), slope.reshape(r, k), along.lengths, sharpness))
+    weights = composite(opacities(distance.reshape(r, k), slope.reshape(r, k), intervals.lengths, sharpness))
     rgb = (weights[..., None] * colour(flat, views, gradient, features).reshape(r, k, 3)).sum(1)
     return Rendered(rgb, weights.sum(1), weights, points, gradient.reshape(r, k, 3))
 
@@ -129,78 +136,88 @@ def render(
 
 
 @dataclass(frozen=True)
-class Glimpse:
-    """Pixels of one frame and a pose."""
+class RayBatch:
+    """Rays of one frame and the pose of the object in it."""
 
     pixels: Pixels
+    """Rays and their targets."""
     T_aim_obj: SE3
-    """Detached where these pixels must not move the pose."""
+    """Object to virtual camera; detached where the rays must not change the pose."""
 
 
-def look(
-    net: Fields, glimpses: Sequence[Glimpse], n_sections: int, *, bound: float, rng: torch.Generator | None
+def render_batches(
+    fields: Fields, batches: Sequence[RayBatch], n_sections: int, *, bound: float, rng: torch.Generator | None
 ) -> Rendered:
-    """What the rays of all glimpses see, one after the other; all in the object frame.
+    """Volume rendering of the rays of all batches, concatenated, in the object frame.
 
     Args:
-        n_sections: Per ray.
-        bound: Radius of the ball in which the object is [object radius].
-        rng: Shifts the sections of every ray by a random part of their length; None leaves them in place.
+        fields: Networks of the object.
+        batches: Rays and poses of several frames.
+        n_sections: Sections per ray.
+        bound: Radius of the sphere that contains the object [object radius].
+        rng: Random number generator for a shift of the sections of every ray; None for no shift.
     """
-    T_obj_aim = [glimpse.T_aim_obj.inverse() for glimpse in glimpses]
-    pairs = list(zip(T_obj_aim, glimpses, strict=True))
-    directions = torch.cat([T.rotation @ g.pixels.directions for T, g in pairs])
-    origins = torch.cat([T.xyz.expand(len(g.pixels), 3) for T, g in pairs])
+    T_obj_aim = [batch.T_aim_obj.inverse() for batch in batches]
+    pairs = list(zip(T_obj_aim, batches, strict=True))
+    directions = torch.cat([T.rotation @ batch.pixels.directions for T, batch in pairs])
+    origins = torch.cat([T.xyz.expand(len(batch.pixels), 3) for T, batch in pairs])
     jitter = None if rng is None else torch.rand(len(origins), generator=rng).to(origins) - 0.5
-    along: Sections = sections(origins, directions, n_sections, bound=bound, jitter=jitter)
+    intervals: Sections = sections(origins, directions, n_sections, bound=bound, jitter=jitter)
     return render(
-        lambda x: sdf_field.surface(net.sdf, x),
-        lambda x, view, gradient, features: sdf_field.colour(net.colour, x, view, gradient, features),
-        net.sharpness,
+        lambda x: sdf_field.distance_and_gradient(fields.sdf, x),
+        lambda x, view, gradient, features: sdf_field.colour(fields.colour, x, view, gradient, features),
+        fields.sharpness,
         origins,
         directions,
-        along,
+        intervals,
     )
 
 
-def colour_error(seen: Rendered, pixels: Pixels) -> Float[Tensor, ""]:
-    """Absolute difference, summed over channels, meaned over the object (NeuS)."""
-    error = (seen.rgb - pixels.rgb).abs().sum(-1)
+def colour_loss(rendered: Rendered, pixels: Pixels) -> Float[Tensor, ""]:
+    """Absolute colour difference, summed over channels and averaged over object pixels (NeuS)."""
+    error = (rendered.rgb - pixels.rgb).abs().sum(-1)
     return (error * pixels.mask).sum() / (pixels.mask.sum() + 1e-5)
 
 
-def mask_error(seen: Rendered, pixels: Pixels) -> Float[Tensor, ""]:
-    """Mean binary cross entropy between opacity and mask (NeuS); 0 without rays, as where a mask is all unknown."""
-    total = binary_cross_entropy(seen.opacity.clamp(LEAST, 1 - LEAST), pixels.mask, reduction="sum")
+def mask_loss(rendered: Rendered, pixels: Pixels) -> Float[Tensor, ""]:
+    """Mean binary cross entropy between opacity and mask (NeuS); 0 without rays, as where all pixels are unknown."""
+    total = binary_cross_entropy(
+        rendered.opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN), pixels.mask, reduction="sum"
+    )
     return total / max(1, len(pixels))
 
 
-def eikonal(seen: Rendered) -> Float[Tensor, ""]:
-    """A distance changes by 1 per unit of length: mean of `(|gradient| - 1)^2`; 0 without rays."""
-    return (seen.gradients.norm(dim=-1) - 1).square().sum() / max(1, seen.weights.numel())
+def eikonal_loss(rendered: Rendered) -> Float[Tensor, ""]:
+    """Eikonal loss of the signed distance, the mean of `(|gradient| - 1)^2`; 0 without rays."""
+    return (rendered.gradients.norm(dim=-1) - 1).square().sum() / max(1, rendered.weights.numel())
 
 
-def transfer(
-    seen: Rendered, rays: slice, T_aim_obj: SE3, camera: Camera, uv: Float[Tensor, "m 2"]
+def transfer_residuals(
+    rendered: Rendered, rays: slice, T_aim_obj: SE3, camera: Camera, uv: Float[Tensor, "m 2"]
 ) -> tuple[Float[Tensor, "m 2"], Float[Tensor, " m"]]:
-    """Where another frame should see what some rays met, less where its matches are; and how surely the rays met it.
+    """Reprojection errors of correspondences through the rendered shape, and weights that exclude rays without a hit.
 
-    FMOV sums projections with weights that do not sum to one, so that a ray that misses pulls the picture to the
-    origin, and weights to zero; here the weights' mean point is projected.
+    The points where rays of one frame meet the shape are projected into another frame and compared with the matched
+    positions there. FMOV sums projections with weights that do not sum to one, which biases them towards the origin and
+    the weights towards zero; here the weighted mean point is projected.
 
     Args:
-        rays: Of `seen`; ends of the correspondences in the one frame.
-        T_aim_obj: Of the other frame.
-        camera: The virtual one.
-        uv: Ends of the correspondences in the other virtual frame [pixels].
+        rendered: Rendered rays.
+        rays: Range of the rays through the correspondences of the first frame.
+        T_aim_obj: Pose in the second frame.
+        camera: Virtual camera.
+        uv: Positions of the correspondences in the second virtual frame [pixels].
+
+    Returns:
+        Projected minus matched positions [pixels], and weights 0 or 1.
     """
-    weights = seen.weights[rays]
+    weights = rendered.weights[rays]
     total = weights.sum(-1)
-    met = (weights[..., None] * seen.points[rays]).sum(1) / (total[:, None] + 1e-4)
-    return camera.project(T_aim_obj @ met) - uv, (total.detach() > SEEN).to(total)
+    hit = (weights[..., None] * rendered.points[rays]).sum(1) / (total[:, None] + 1e-4)
+    return camera.project(T_aim_obj @ hit) - uv, (total.detach() > MIN_HIT_OPACITY).to(total)
 
 
-def robust(residual: Float[Tensor, "m 2"], weight: Float[Tensor, " m"], *, threshold: float) -> Float[Tensor, ""]:
-    """Weighted mean of Huber's function of both components, in its slope-1 form: `|r|` far out, as FMOV's term."""
+def huber_loss(residual: Float[Tensor, "m 2"], weight: Float[Tensor, " m"], *, threshold: float) -> Float[Tensor, ""]:
+    """Weighted mean of the Huber loss of both components, scaled to slope 1: `|r|` for large residuals, as in FMOV."""
     loss = smooth_l1_loss(residual, torch.zeros_like(residual), reduction="none", beta=threshold).mean(-1)
     return (loss * weight).sum() / (weight.sum() + 1e-5)

@@ -1,8 +1,8 @@
-"""What poses come from: networks, or plain numbers, behind one function of the frames' numbers.
+"""Pose parametrisations: per-frame vectors or networks, and the motions that their outputs stand for.
 
-A *pose source* is a tree of weights with `raw(source, frames) -> [f k]`. What the numbers mean is a second choice:
-`orbit` turns the object about its centre, scales its distance and shifts it across (stage 1), `delta` is a small
-bounded motion in the camera frame (stages 2 and 3, `delta(raw, ...) @ base`). All start (nearly) at "no change".
+A *pose source* is a tree of weights from which `raw_outputs(source, frames)` computes `k` numbers per frame, about zero
+at the start. Two functions convert these to motions: `orbit` rotates the object about its centre, scales its distance
+and shifts it across the view (stage 1); `delta` is a small bounded motion in the camera frame.
 """
 
 import math
@@ -16,111 +16,128 @@ from torch.nn.functional import gelu, pad
 
 from tumble.maths import SE3, SO3
 
-CODE_SPREAD = 10.0
-"""Standard deviation of the frequencies of a frame's code (FMOV): neighbours in time have unrelated codes."""
-HEAD_SPREAD = 0.01
-"""Standard deviation of the last layer's weights at the start (FMOV)."""
+CODE_STD = 10.0
+"""Standard deviation of the frequencies in the frames' codes (FMOV); neighbouring frames get unrelated codes."""
+HEAD_STD = 0.01
+"""Standard deviation of the initial weights of the last layer (FMOV)."""
 
 
 @dataclass(frozen=True)
 class Vectors:
-    """Plain numbers per frame: the fastest to train, and no frame disturbs another."""
+    """Independent numbers per frame, which converge fastest."""
 
     values: dict[str, Tensor]
-    """`[k]` by frame: a leaf each, so that an optimizer leaves frames alone that a loss does not reach."""
+    """Tensors `[k]` by frame, one leaf each, so that an optimizer does not move frames without a gradient."""
 
 
 @dataclass(frozen=True)
 class FrameMlps:
-    """One small network per frame, fed with a fixed random code of the frame (section 4.1; FMOV)."""
+    """One small network per frame over a fixed random code of the frame (section 4.1; FMOV)."""
 
     codes: Float[Tensor, "t c"]
-    """Not trained."""
+    """Codes of the frames, not trained."""
     values: dict[str, Tensor]
     """All weights of a frame's network in one vector, by frame."""
     width: int
+    """Units of the hidden layers."""
     out: int
+    """Number of outputs."""
 
 
 @dataclass(frozen=True)
 class GlobalMlp:
-    """One network for all frames, fed with a learned embedding of each (section 4.2)."""
+    """The paper's network over learned embeddings of the frames (section 4.2); not used by the default recipe."""
 
     embeddings: Float[Tensor, "t e"]
+    """Embeddings of the frames, trained."""
     layers: dict[str, Tensor]
-    """Weights of one network, under one name."""
+    """All weights of the network in one vector, under the name "mlp"."""
     width: int
+    """Units of the hidden layers."""
     out: int
+    """Number of outputs."""
 
 
 PoseSource = Vectors | FrameMlps | GlobalMlp
 
 
 def vectors(n_frames: int, out: int) -> Vectors:
-    """No change in any frame."""
+    """Zeros in every frame."""
     return Vectors({str(i): torch.zeros(out) for i in range(n_frames)})
 
 
 def frame_mlps(n_frames: int, out: int, rng: torch.Generator, *, width: int = 64, code: int = 256) -> FrameMlps:
-    """Networks of two hidden layers over codes `[sin(2 pi i b), cos(2 pi i b)]`; sizes of FMOV.
+    """Per-frame networks with two hidden layers over codes `[sin(2 pi i b), cos(2 pi i b)]`, sizes as in FMOV.
 
-    FMOV draws the frequencies `b` once per network from NumPy's global generator; here from the given one.
+    The frequencies `b` are drawn once per network, as in FMOV, but from the given generator.
     """
-    b = CODE_SPREAD * torch.randn(n_frames, code // 2, generator=rng)
+    b = CODE_STD * torch.randn(n_frames, code // 2, generator=rng)
     phase = 2 * math.pi * torch.arange(n_frames)[:, None] * b
     codes = torch.cat([phase.sin(), phase.cos()], -1) / math.sqrt(code // 2)
-    return FrameMlps(codes, {str(i): _mlp(code, width, out, rng) for i in range(n_frames)}, width, out)
+    return FrameMlps(codes, {str(i): _initial_weights(code, width, out, rng) for i in range(n_frames)}, width, out)
 
 
 def global_mlp(n_frames: int, out: int, rng: torch.Generator, *, width: int = 64, embedding: int = 32) -> GlobalMlp:
-    """Sizes are not stated in the paper."""
-    embeddings = HEAD_SPREAD * torch.randn(n_frames, embedding, generator=rng)
-    return GlobalMlp(embeddings, {"mlp": _mlp(embedding, width, out, rng)}, width, out)
+    """The paper's global pose network with per-frame embeddings (section 4.2); not used by the default recipe.
+
+    A pose source for refining poses in stage 2, together with `delta`. The paper does not state its sizes.
+    """
+    embeddings = HEAD_STD * torch.randn(n_frames, embedding, generator=rng)
+    return GlobalMlp(embeddings, {"mlp": _initial_weights(embedding, width, out, rng)}, width, out)
 
 
-def raw(source: PoseSource, frames: Sequence[int]) -> Float[Tensor, "f k"]:
-    """What a source says of some frames, about 0 at the start."""
+def raw_outputs(source: PoseSource, frames: Sequence[int]) -> Float[Tensor, "f k"]:
+    """Outputs of a pose source for some frames, about 0 at the start."""
     if isinstance(source, Vectors):
         return torch.stack([source.values[str(i)] for i in frames])
     if isinstance(source, FrameMlps):
         weights = torch.stack([source.values[str(i)] for i in frames])
-        return _through(weights, source.codes[list(frames)], source.width, source.out)
+        return _apply_mlps(weights, source.codes[list(frames)], source.width, source.out)
     inputs = source.embeddings[list(frames)]
     weights = source.layers["mlp"].expand(len(inputs), -1)
-    return _through(weights, inputs, source.width, source.out)
+    return _apply_mlps(weights, inputs, source.width, source.out)
 
 
 def orbit(base: SE3, raw: Float[Tensor, "*b 6"]) -> SE3:
-    """Turn the object about its own centre by `pi raw[:3]` (object axes), scale its distance by `1 + raw[3]`, and shift
-    it across the view by `raw[4:]` [object radius].
+    """Pose after a rotation about the object's centre, a scaling of its distance, and a shift across the view.
 
-    The first four are FMOV's. Its camera orbits, `[Exp | 0] @ [R | s c]` for camera to object; this is the same motion
-    seen from the camera: without a shift, the direction in which the object's centre is seen stays.
+    The first four parameters are FMOV's, which orbits the camera around the object: `[Exp | 0] @ [R | s c]` for camera
+    to object. Without a shift, the projection of the object's centre does not change.
+
+    Args:
+        base: `T_cam_obj` before the motion.
+        raw: `-pi raw[:3]` is the rotation vector in object axes [radians], `1 + raw[3]` the factor on the distance, and
+            `raw[4:]` the shift [object radius].
     """
-    turned = base.rotation @ SO3.exp(-math.pi * raw[..., :3])
-    return SE3.from_rotation(turned, base.xyz * (1 + raw[..., 3:4]) + pad(raw[..., 4:], (0, 1)))
+    rotated = base.rotation @ SO3.exp(-math.pi * raw[..., :3])
+    return SE3.from_rotation(rotated, base.xyz * (1 + raw[..., 3:4]) + pad(raw[..., 4:], (0, 1)))
 
 
 def delta(raw: Float[Tensor, "*b 6"], *, rotation: float, translation: float) -> SE3:
-    """A motion in the camera frame of at most `rotation` [radians] and `translation` [object radius] per axis.
+    """The paper's deviation from an initial pose, as a bounded motion (section 4.2); not used by the default recipe.
 
-    `delta(raw, ...) @ base` is a refined pose. With the bounds as scale, 0.01 moves by a hundredth of them.
+    For refining poses in stages 2 and 3: `delta(raw, ...) @ base` is the refined pose.
+
+    Args:
+        raw: Translation and rotation vector before the limits are applied; 0 is no motion, 0.01 a hundredth of them.
+        rotation: Limit of the rotation about each axis of the camera frame [radians].
+        translation: Limit of the translation along each axis of the camera frame [object radius].
     """
     v, omega = raw.tanh().split(3, -1)
     return SE3.exp(torch.cat([translation * v, rotation * omega], -1))
 
 
-def _mlp(n_in: int, width: int, out: int, rng: torch.Generator) -> Float[Tensor, " w"]:
-    """Weights of two hidden layers as one vector; torch's own start for these, nearly 0 for the last layer."""
+def _initial_weights(n_in: int, width: int, out: int, rng: torch.Generator) -> Float[Tensor, " w"]:
+    """Initial weights of a network in one vector: PyTorch's defaults for the hidden layers, about 0 for the last."""
     parts = []
     for rows, columns in ((width, n_in), (width, width)):
-        reach = 1 / math.sqrt(columns)
-        parts += [reach * (2 * torch.rand(rows * columns + rows, generator=rng) - 1)]
-    return torch.cat([*parts, HEAD_SPREAD * torch.randn(out * width, generator=rng), torch.zeros(out)])
+        limit = 1 / math.sqrt(columns)
+        parts += [limit * (2 * torch.rand(rows * columns + rows, generator=rng) - 1)]
+    return torch.cat([*parts, HEAD_STD * torch.randn(out * width, generator=rng), torch.zeros(out)])
 
 
-def _through(weights: Float[Tensor, "f w"], x: Float[Tensor, "f i"], width: int, out: int) -> Float[Tensor, "f o"]:
-    """One network per row."""
+def _apply_mlps(weights: Float[Tensor, "f w"], x: Float[Tensor, "f i"], width: int, out: int) -> Float[Tensor, "f o"]:
+    """Outputs of one network per row, each for its own input."""
     h, start = x, 0
     for layer, rows in enumerate((width, width, out)):
         columns = h.shape[-1]

@@ -1,6 +1,7 @@
-"""Pixels of one frame as rays of its virtual camera, with the colours that the photograph has there.
+"""Sampling of pixels of a frame as rays of the virtual camera, with the colours of the input image.
 
-The photograph itself is never resampled: turning the camera about its centre turns rays (`virtual_camera`).
+The input image is not resampled: the virtual camera is the true one rotated about its centre, so only rays are rotated
+(`virtual_camera`).
 """
 
 from dataclasses import dataclass
@@ -17,26 +18,26 @@ from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture
 
 @dataclass(frozen=True)
 class Pixels:
-    """Rays and what they should see."""
+    """Rays of one frame, with their target colours and masks."""
 
     directions: Float[Tensor, "r 3"]
-    """Aim frame, unit length."""
+    """Directions in the aim frame, unit length."""
     rgb: Float[Tensor, "r 3"]
-    """sRGB in [0, 1]."""
+    """Target colour, sRGB in [0, 1]."""
     mask: Float[Tensor, " r"]
-    """Share of the object."""
+    """Target opacity: fraction of the averaged pixels that are object."""
 
     def __len__(self) -> int:
         return len(self.mask)
 
     def __add__(self, other: "Pixels") -> "Pixels":
-        """Both, one after the other."""
+        """Concatenation of the rays."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in ("directions", "rgb", "mask"))
         return Pixels(*(torch.cat(pair) for pair in pairs))
 
 
-def around(capture: Capture, frame: int, margin: float) -> Box:
-    """The window of a frame's silhouette and `margin` more [picture widths]; the whole frame when it shows nothing."""
+def silhouette_box(capture: Capture, frame: int, margin: float) -> Box:
+    """Bounding box of a frame's silhouette, enlarged by `margin` [image widths]; the whole frame without silhouette."""
     mask = capture.masks[frame] != BACKGROUND
     if not bool(mask.any()):
         return 0, 0, mask.shape[0], mask.shape[1]
@@ -44,10 +45,16 @@ def around(capture: Capture, frame: int, margin: float) -> Box:
 
 
 def draw(capture: Capture, aim: Aim, frame: int, n: int, *, box: Box, block: int, rng: torch.Generator) -> Pixels:
-    """Up to `n` pixels at random places of a window; those with an unknown part are left out.
+    """Random pixels within a box; fewer than `n` where some are unknown, as these are left out.
 
     Args:
-        block: Side of the square of pixels that is averaged into one; its ray goes through the middle.
+        capture: Frames and masks.
+        aim: Virtual camera.
+        frame: Index of the frame.
+        n: Number of pixels drawn.
+        box: Top, left, height and width of the box [pixels].
+        block: Side of the square of pixels averaged into one sample, whose ray passes through the square's centre.
+        rng: Random number generator.
     """
     top, left, height, width = box
     block = min(block, height, width)
@@ -56,10 +63,10 @@ def draw(capture: Capture, aim: Aim, frame: int, n: int, *, box: Box, block: int
     return _averaged(capture, aim, frame, corner.to(capture.masks.device), block)
 
 
-def at(capture: Capture, aim: Aim, frame: int, uv: Float[Tensor, "m 2"]) -> Pixels:
-    """Rays through given positions [pixels, centres at +0.5], with the colours of the pixels there.
+def at_positions(capture: Capture, aim: Aim, frame: int, uv: Float[Tensor, "m 2"]) -> Pixels:
+    """Rays through given positions of a frame [pixels, centres at +0.5], with the colours of the pixels there.
 
-    They count as object whatever the mask says: correspondences lie on it.
+    Their mask is 1, because correspondences lie on the object.
     """
     limit = torch.tensor([capture.camera.width - 1, capture.camera.height - 1]).to(uv)
     column, row = torch.minimum(uv.floor().clamp_min(0), limit).long().unbind(-1)
@@ -68,6 +75,7 @@ def at(capture: Capture, aim: Aim, frame: int, uv: Float[Tensor, "m 2"]) -> Pixe
 
 
 def _averaged(capture: Capture, aim: Aim, frame: int, corner: Int64[Tensor, "n 2"], block: int) -> Pixels:
+    """Squares of pixels by their top left corners (row, column), averaged; those with unknown pixels are left out."""
     like = capture.camera.fx_fy_cx_cy
     within = torch.arange(block, device=corner.device)
     row, column = corner[:, :1, None] + within[:, None], corner[:, 1:, None] + within
@@ -79,5 +87,6 @@ def _averaged(capture: Capture, aim: Aim, frame: int, corner: Int64[Tensor, "n 2
 
 
 def _directions(capture: Capture, aim: Aim, frame: int, uv: Tensor) -> Float[Tensor, "m 3"]:
+    """Unit directions in the aim frame through positions of a frame [pixels]."""
     x_cam = capture.camera.unproject(uv, torch.ones_like(uv[:, 0]))
     return normalize(aim.R_cam_aim[frame].inverse() @ x_cam, dim=-1)

@@ -1,9 +1,9 @@
-"""Small networks that hold one object: signed distance, colour, and how sharp the surface is (section 4.1, NeuS).
+"""Neural fields of one object: signed distance function (SDF), colour and sharpness (section 4.1; NeuS).
 
-Networks are trees of weights and functions of them; an optimizer sees leaves with names. Every linear layer `l` is
-weight-normalised: `direction_l [out in]` gives each row its direction, `length_l [out]` its length, `bias_l [out]`.
-Points are in the object frame [object radius]; the distance is negative inside. The gradient of the distance is
-written out, backwards through the layers, so that terms on it (eikonal, shading) need one ordinary backward pass.
+Networks are trees of named weights and functions of them. Every linear layer `l` is weight-normalised: `direction_l
+[out in]` gives the direction of each row, `length_l [out]` its length, and `bias_l [out]` its bias. Points are in the
+object frame [object radius]; the distance is negative inside. The gradient of the distance is computed analytically,
+backwards through the layers, so that losses on it (eikonal, colour) need only one ordinary backward pass.
 """
 
 import math
@@ -15,29 +15,31 @@ from torch import Tensor
 from torch.nn.functional import normalize, relu, softplus
 
 BETA = 100.0
-"""Sharpness of softplus, nearly a ReLU with a second derivative (NeuS)."""
+"""Sharpness of softplus, which is then nearly a ReLU but twice differentiable (NeuS)."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Of the two networks; values of NeuS, which the paper's section 4.1 takes over."""
+    """Sizes of the two networks; the defaults are those of NeuS, which the paper adopts (section 4.1)."""
 
     width: int = 256
+    """Units of the hidden layers of the distance network."""
     depth: int = 8
-    """Hidden layers of the distance network."""
+    """Number of hidden layers of the distance network."""
     skip: int = 4
-    """Layer that sees the encoded point once more; 0 for none."""
+    """Index of the layer that also takes the encoded point (skip connection); 0 for none."""
     features: int = 256
-    """What the distance network tells the colour network, besides the normal."""
+    """Number of features that the colour network takes from the distance network."""
     octaves: int = 6
-    """Of the encoding of points."""
+    """Octaves of the positional encoding of points."""
     colour_width: int = 256
+    """Units of the hidden layers of the colour network."""
     colour_depth: int = 4
-    """Hidden layers of the colour network."""
+    """Number of hidden layers of the colour network."""
     colour_octaves: int = 4
-    """Of the encoding of view directions."""
+    """Octaves of the positional encoding of view directions."""
     radius: float = 0.5
-    """Of the sphere that the distance network starts as [object radius]."""
+    """Radius of the initial sphere [object radius]."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Layers:
     """Weight-normalised linear layers, by name."""
 
     weights: dict[str, Tensor]
+    """Directions, lengths and biases, see the module."""
 
     def __len__(self) -> int:
         return len(self.weights) // 3
@@ -60,8 +63,11 @@ class Sdf:
     """Weights of the distance network."""
 
     layers: Layers
+    """Linear layers."""
     octaves: int
+    """Octaves of the positional encoding of points."""
     skip: int
+    """Index of the layer that also takes the encoded point; 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -69,53 +75,56 @@ class Colour:
     """Weights of the colour network."""
 
     layers: Layers
+    """Linear layers."""
     octaves: int
+    """Octaves of the positional encoding of view directions."""
 
 
 @dataclass(frozen=True)
 class Fields:
-    """All that NeuS knows of an object."""
+    """Distance network, colour network and sharpness of one object."""
 
     sdf: Sdf
+    """Distance network."""
     colour: Colour
+    """Colour network."""
     log_sharpness: Float[Tensor, ""]
-    """A tenth of the logarithm of the sharpness: Adam's steps are then those of the other weights (NeuS)."""
+    """A tenth of the logarithm of the sharpness, so that Adam's steps are of the size of other weights' (NeuS)."""
 
     @property
     def sharpness(self) -> Float[Tensor, ""]:
-        """Of the logistic curve that turns distance into opacity [1 / object radius]."""
+        """Sharpness of the logistic function that converts distance to opacity [1 / object radius]."""
         return (10 * self.log_sharpness).clamp(-13.8, 13.8).exp()
 
 
-def sphere(sizes: Sizes, rng: torch.Generator) -> Fields:
-    """Networks that start as a grey sphere: `sdf ~ |x| - radius`.
+def sphere_initialised(sizes: Sizes, rng: torch.Generator) -> Fields:
+    """Initial networks, whose shape is a sphere: `sdf ~ |x| - radius`.
 
-    Random weights that come to it in the mean (geometric initialization, Atzmon and Lipman 2020), as in NeuS. That
-    mean is off by a tenth at width 256 and by a quarter at 64; here the last row is then moved, as little as it takes,
-    to where it fits the sphere.
+    Geometric initialisation as in NeuS (Atzmon and Lipman 2020) gives a sphere only on average over random weights. The
+    row of the last layer that outputs the distance is therefore corrected by ridge regression to fit the sphere.
     """
     skip = sizes.skip if 0 < sizes.skip < sizes.depth else 0
-    layers = _layers(_geometric(sizes, skip, rng))
+    layers = _layers(_geometric_init(sizes, skip, rng))
     sdf = Sdf(layers, sizes.octaves, skip)
     x = normalize(torch.randn(2048, 3, generator=rng), dim=-1) * 1.2 * torch.rand(2048, 1, generator=rng)
-    h = _hidden(sdf, x).double()
-    wanted = x.norm(dim=-1).double() - sizes.radius - _forward(sdf, x)[0][:, 0].double()
+    h = _last_hidden(sdf, x).double()
+    correction = x.norm(dim=-1).double() - sizes.radius - _forward(sdf, x)[0][:, 0].double()
     ridge = 1e-3 * len(x) * h.square().mean() * torch.eye(h.shape[1], dtype=h.dtype)
-    row = layers.linear(sizes.depth)[0][0] + torch.linalg.solve(h.T @ h + ridge, h.T @ wanted).float()
+    row = layers.linear(sizes.depth)[0][0] + torch.linalg.solve(h.T @ h + ridge, h.T @ correction).float()
     layers.weights[f"direction{sizes.depth}"][0] = row
     layers.weights[f"length{sizes.depth}"][0] = row.norm()
     colour, n_in = [], 6 + 3 + 6 * sizes.colour_octaves + sizes.features
     for layer in range(sizes.colour_depth + 1):
         n_out = 3 if layer == sizes.colour_depth else sizes.colour_width
-        reach = 1 / math.sqrt(n_in)
-        matrix, bias = (reach * (2 * torch.rand(*s, generator=rng) - 1) for s in ((n_out, n_in), (n_out,)))
+        limit = 1 / math.sqrt(n_in)
+        matrix, bias = (limit * (2 * torch.rand(*s, generator=rng) - 1) for s in ((n_out, n_in), (n_out,)))
         colour.append((matrix, bias))
         n_in = n_out
     return Fields(sdf, Colour(_layers(colour), sizes.colour_octaves), torch.tensor(0.3))
 
 
-def _geometric(sizes: Sizes, skip: int, rng: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-    """Matrices and biases of the distance network: each layer keeps lengths, the last one averages them."""
+def _geometric_init(sizes: Sizes, skip: int, rng: torch.Generator) -> list[tuple[Tensor, Tensor]]:
+    """Geometric initialisation of the distance network: matrices and biases of all layers."""
     encoded = 3 + 6 * sizes.octaves
     pairs: list[tuple[Tensor, Tensor]] = []
     n_in = encoded
@@ -133,6 +142,7 @@ def _geometric(sizes: Sizes, skip: int, rng: torch.Generator) -> list[tuple[Tens
 
 
 def _layers(pairs: list[tuple[Tensor, Tensor]]) -> Layers:
+    """Weight-normalised layers from matrices and biases."""
     weights: dict[str, Tensor] = {}
     for i, (matrix, bias) in enumerate(pairs):
         weights |= {f"direction{i}": matrix, f"length{i}": matrix.norm(dim=-1), f"bias{i}": bias}
@@ -140,14 +150,14 @@ def _layers(pairs: list[tuple[Tensor, Tensor]]) -> Layers:
 
 
 def distance(net: Sdf, x: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Signed distance alone, for marching along rays and for meshes."""
+    """Signed distance without its gradient, for the extraction of surfaces."""
     return _forward(net, x)[0][:, 0]
 
 
-def surface(
+def distance_and_gradient(
     net: Sdf, x: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n f"]]:
-    """Signed distance, its gradient, and the features that the colour network reads; all differentiable."""
+    """Signed distance, its gradient, and the features for the colour network; all differentiable."""
     out, slopes, matrices = _forward(net, x)
     encoded = 3 + 6 * net.octaves
     gradient = matrices[-1][0].expand(len(x), -1)
@@ -158,7 +168,7 @@ def surface(
             direct = gradient[:, -encoded:]
             gradient = gradient[:, :-encoded]
         gradient = (gradient * slopes[layer]) @ matrices[layer]
-    return out[:, 0], _through_encoding(gradient + direct, x, net.octaves), out[:, 1:]
+    return out[:, 0], _encoding_backward(gradient + direct, x, net.octaves), out[:, 1:]
 
 
 def colour(
@@ -168,7 +178,7 @@ def colour(
     normal: Float[Tensor, "n 3"],
     features: Float[Tensor, "n f"],
 ) -> Float[Tensor, "n 3"]:
-    """Colour in [0, 1] that the object shows at points `x` to rays of direction `view`."""
+    """Colour, sRGB in [0, 1], at points `x` for rays of direction `view`; `normal` is the distance's gradient."""
     h = torch.cat([x, encode(view, net.octaves), normal, features], -1)
     last = len(net.layers) - 1
     for layer in range(last):
@@ -179,18 +189,19 @@ def colour(
 
 
 def encode(x: Float[Tensor, "n 3"], octaves: int) -> Float[Tensor, "n e"]:
-    """The point itself, then its sines, then its cosines, of frequencies 1, 2, 4, ..."""
+    """Positional encoding: the point, then the sines, then the cosines of its multiples by 1, 2, 4, ..."""
     angles = _angles(x, octaves)
     return torch.cat([x, angles.sin(), angles.cos()], -1)
 
 
 def _angles(x: Tensor, octaves: int) -> Tensor:
+    """Multiples of the coordinates by 1, 2, 4, ... [radians]."""
     frequencies = 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)
     return (x[:, None] * frequencies[:, None]).flatten(1)
 
 
-def _through_encoding(v_encoded: Tensor, x: Tensor, octaves: int) -> Float[Tensor, "n 3"]:
-    """The gradient for `x` from that for `encode(x)`."""
+def _encoding_backward(v_encoded: Tensor, x: Tensor, octaves: int) -> Float[Tensor, "n 3"]:
+    """Gradient with respect to `x` from that with respect to `encode(x)`."""
     if octaves == 0:
         return v_encoded
     n = 3 * octaves
@@ -200,13 +211,13 @@ def _through_encoding(v_encoded: Tensor, x: Tensor, octaves: int) -> Float[Tenso
     return v_encoded[:, :3] + (waves.reshape(-1, octaves, 3) * frequencies[:, None]).sum(1)
 
 
-def _hidden(net: Sdf, x: Tensor) -> Tensor:
-    """What the last layer of the distance network reads."""
+def _last_hidden(net: Sdf, x: Tensor) -> Tensor:
+    """Output of the distance network's last hidden layer."""
     return _forward(net, x, last=False)[0]
 
 
 def _forward(net: Sdf, x: Tensor, *, last: bool = True) -> tuple[Tensor, list[Tensor], list[Tensor]]:
-    """Output of the (last) layer, the slopes of all softplus, and all matrices."""
+    """Output of the last layer, or of the last hidden one; derivatives of all activations; matrices of all layers."""
     encoded = encode(x, net.octaves)
     h, slopes, matrices = encoded, [], []
     for layer in range(len(net.layers) - 1):

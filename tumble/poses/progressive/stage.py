@@ -1,7 +1,7 @@
-"""Stage 1 by the paper's progressive route: a neural shape that grows while the object is followed frame by frame.
+"""Stage 1 by the paper's progressive route (section 4.1): tracking frame by frame against a shape learned meanwhile.
 
-The tracker finds poses in the virtual camera; they are lifted to the true camera in closed form. How far they can be
-trusted is assessed by whatever judges the other route, which is handed in.
+The tracker estimates poses in the frame of the virtual camera, which are converted to the true camera in closed form.
+Their quality is computed by a function that the caller passes in, so that both routes of stage 1 are assessed alike.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,31 +15,37 @@ from tumble.poses.result import PoseResult
 from tumble.scene import Capture, Match, Trajectory
 
 VERSION = 4
-AIM = 128
-"""Size of the virtual frames [pixels]."""
+VIRTUAL_SIZE = 128
+"""Height and width of the virtual frames [pixels]."""
 
 
 @dataclass(frozen=True)
 class Config(tracker.Config):
-    """Settings of the tracker: the route has no others."""
+    """Settings of the progressive route, which are those of the tracker."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """A capture without poses, as `gather` makes it."""
+    """Inputs of the progressive route; `gather` creates them."""
 
     track: tracker.Inputs
+    """Inputs of the tracker."""
     assess: Callable[[Trajectory], PoseResult]
-    """Adds points, quality and lost frames to poses in the camera frame."""
+    """Computes points, quality and lost frames from poses in the camera frame."""
 
 
 def gather(capture: Capture, matches: Sequence[Match], assess: Callable[[Trajectory], PoseResult]) -> Inputs:
-    """Aim the virtual camera at the silhouettes.
+    """Inputs of the route, with the virtual camera aimed at the silhouettes.
+
+    Args:
+        capture: Frames and masks, without poses.
+        matches: Correspondences between the frames.
+        assess: See `Inputs`.
 
     Raises:
         ValueError: No frame shows the object.
     """
-    aim = virtual_camera.aim_at(capture.masks, capture.camera, size=AIM)
+    aim = virtual_camera.aim_at(capture.masks, capture.camera, size=VIRTUAL_SIZE)
     return Inputs(tracker.Inputs(capture, tuple(matches), aim), assess)
 
 
@@ -56,6 +62,6 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, torch.Tensor | 
 
 
 def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
-    """Poses in the true camera, assessed."""
-    found = tracker.finish(cfg, inputs.track, state)
-    return inputs.assess(virtual_camera.lift(found.aim, found.T_aim_obj, inputs.track.capture.light))
+    """Poses in the true camera, with their quality."""
+    result = tracker.finish(cfg, inputs.track, state)
+    return inputs.assess(virtual_camera.lift(result.aim, result.T_aim_obj, inputs.track.capture.light))

@@ -1,13 +1,13 @@
-"""The adjustment of surface points and poses to what the frames show (bundle adjustment).
+"""Bundle adjustment: poses and surface points that minimise the reprojection errors of feature tracks.
 
-Levenberg-Marquardt with Cauchy's loss; points are eliminated first (Schur complement). Cameras come in *groups* of
-equal size that share no point: many short windows are adjusted side by side as easily as one whole capture, each with
-its own damping.
+Levenberg-Marquardt with the Cauchy loss; points are eliminated by the Schur complement. Cameras are arranged in
+*groups* of equal size that share no points, so that many short windows of a video are adjusted side by side in the same
+way as one whole capture, each group with its own damping.
 
-Two priors hold what pixels say little about: the object's origin stays near the middle of its silhouette, and at about
-the same distance. Where the focal length is a guess, one factor on it per group is found as well; the guess is a third
-prior. Everything is float64. Unit of length: the origin's mean distance from the camera, until the gauge is fixed at
-the end of the stage.
+Two priors constrain what reprojection errors constrain weakly: the object's origin projects near the centre of its
+silhouette, and its distance stays about constant. Where the focal length is only assumed, a factor on it per group is
+estimated as well, with a third prior on that factor. All computations are in float64. The unit of length is the
+origin's mean distance from the camera; the final scale is set at the end of the stage.
 """
 
 import math
@@ -24,125 +24,141 @@ from tumble.poses.sfm.tracks import Tracks
 from tumble.scene import Camera
 
 NOISE = 0.3
-"""Of a good match: what a prior's one sigma weighs against residuals [pixels]."""
-NEAREST = 0.05
-"""Least depth of a point: what comes closer is on its way behind the camera."""
-SHALLOW = 0.15
-"""Half length of the shortest chord through the ball about the object [its radius]."""
-FRONT = 0.6
-"""How far towards the camera a visible point is first believed to be [half chord]."""
-TRUST_FRONT = 0.003
-"""Weight of that belief against the rays of all frames that show the point."""
-GUESS = math.log(1.25)
-"""One sigma of the logarithm of a guessed focal length: phones film at equivalents of 24 to 35 mm."""
-GUESS_NOISE = 0.02
-"""What that sigma weighs against the residuals of all observations, whose errors are not independent [pixels]: where
-they say nothing (a bare ball) little moves, elsewhere a guess 25 % off pulls by one percent."""
-SHORT = 3
-"""Observations of a point up to which pairs of them are summed one by one."""
+"""Standard deviation of an inlier match, which weighs priors against reprojection errors [pixels]."""
+MIN_DEPTH = 0.05
+"""Lower limit of a point's depth in projections, which keeps points in front of the camera [unit of length]."""
+MIN_HALF_CHORD = 0.15
+"""Lower limit of half the chord of a ray in the bounding sphere [radius of the sphere]."""
+FRONT_POSITION = 0.6
+"""Prior position of a visible point on its ray, from the middle of the chord towards the camera [half chord]."""
+FRONT_WEIGHT = 0.003
+"""Weight of the prior position in triangulation, relative to a ray's weight of 1."""
+FOCAL_SIGMA = math.log(1.25)
+"""Standard deviation of the logarithm of an assumed focal length; phones record at equivalents of 24 to 35 mm."""
+FOCAL_NOISE = 0.02
+"""Noise that weighs the focal length's prior against the reprojection errors of all observations [pixels].
+
+Small, because the errors of observations are not independent: the focal length then hardly changes where observations
+do not constrain it, and the prior hardly biases it elsewhere."""
+SHORT_TRACK = 3
+"""Number of observations up to which a point is eliminated by a sum over their pairs; above, by a matrix product."""
 
 
 @dataclass(frozen=True)
 class BundleState:
-    """Poses and points that are adjusted; `g` groups of `f` cameras."""
+    """Optimised variables: poses of `g` groups of `f` cameras, `n` points, and focal lengths."""
 
     R: Float[Tensor, "g f 3 3"]
-    """`R_cam_obj`"""
+    """`R_cam_obj`: object to camera."""
     t: Float[Tensor, "g f 3"]
-    """The object's origin, camera frame."""
+    """Position of the object's origin, camera frame."""
     X: Float[Tensor, "n 3"]
-    """Points, object frame of their group."""
+    """Positions of the points, object frame of their group."""
     log_focal: Float[Tensor, " g"] | None = None
-    """Logarithm of the focal length over the camera's; None: the camera's is known."""
+    """Logarithm of the focal length over that of `Problem.camera`; None if the latter is known."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is seen, and what is believed before; `o` observations of `n` points by `g` groups of `f` cameras."""
+    """Measurements and priors: `o` observations of `n` points by `g` groups of `f` cameras."""
 
     camera: Camera
+    """Camera of all frames."""
     tracks: Tracks
-    """With frames counted over all groups: `group * f + frame`."""
+    """Observations, with frames numbered over all groups: `group * f + frame`."""
     group: Int64[Tensor, " n"]
-    """Of every point."""
+    """Group of every point."""
     weight: Float[Tensor, " o"]
-    """Of every observation."""
+    """Weight of every observation."""
     centre: Float[Tensor, "g f 2"]
-    """Where the object's origin should be seen [pixels]."""
+    """Prior position of the projected origin of the object [pixels]."""
     centre_sigma: Float[Tensor, "g f"]
-    """[pixels]"""
+    """Standard deviation of that position [pixels]."""
     depth_sigma: float
-    """Of the logarithm of the origin's distance about 0."""
-    reach: float
-    """Radius about the origin in which points are expected."""
-    guess: float = 0.0
-    """Logarithm of the guessed focal length over the camera's; counts where the scene has one of its own."""
+    """Standard deviation of the logarithm of the origin's depth, whose mean is 0."""
+    radius: float
+    """Standard deviation of the points' coordinates in the prior that keeps them near the origin [unit of length]."""
+    log_focal_prior: float = 0.0
+    """Mean of the prior on `BundleState.log_focal`, without effect where that is None."""
 
 
 def residuals(problem: Problem, scene: BundleState) -> tuple[Float[Tensor, "o 2"], Float[Tensor, "o 3"]]:
-    """Projected minus seen positions [pixels], and the points in the camera frames."""
+    """Reprojection errors, projected minus observed [pixels], and the points in their camera frames."""
     R, t = scene.R.flatten(0, 1)[problem.tracks.frame], scene.t.flatten(0, 1)[problem.tracks.frame]
     x = torch.einsum("oij,oj->oi", R, scene.X[problem.tracks.point]) + t
     focal, principal = _focals(problem, scene)[problem.tracks.frame], problem.camera.fx_fy_cx_cy.double()[2:]
-    z = x[:, 2:].clamp_min(NEAREST)
+    z = x[:, 2:].clamp_min(MIN_DEPTH)
     return x[:, :2] / z * focal + principal - problem.tracks.uv, x
 
 
 def _focals(problem: Problem, scene: BundleState) -> Float[Tensor, "c 2"]:
-    """Focal lengths of all cameras [pixels]."""
+    """Focal lengths fx, fy of all cameras [pixels]."""
     g, f = scene.t.shape[:2]
     focal = problem.camera.fx_fy_cx_cy.double()[:2].expand(g * f, 2)
     return focal if scene.log_focal is None else focal * scene.log_focal.exp().repeat_interleave(f)[:, None]
 
 
 @dataclass(frozen=True)
-class _Border:
-    """What the logarithm of the focal length adds to the normal equations: one row and column per group."""
+class _FocalBorder:
+    """Row and column of the logarithm of the focal length in the normal equations of each group."""
 
     H: Float[Tensor, " g"]
+    """Diagonal entry."""
     g: Float[Tensor, " g"]
+    """Gradient."""
     cam: Float[Tensor, "c 6"]
+    """Entries coupled with the poses."""
     point: Float[Tensor, "n 3"]
+    """Entries coupled with the points."""
 
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations before elimination, and the costs."""
+    """Costs of the groups, and normal equations before elimination, for `c` cameras of all groups."""
 
     cost: Float[Tensor, " g"]
+    """Robust loss and priors [pixels^2]."""
     U: Float[Tensor, "c 6 6"]
+    """Blocks of the poses."""
     V: Float[Tensor, "n 3 3"]
+    """Blocks of the points."""
     W: Float[Tensor, "o 6 3"]
+    """Blocks of pose and point of each observation."""
     g_cam: Float[Tensor, "c 6"]
+    """Gradient by the poses."""
     g_point: Float[Tensor, "n 3"]
-    border: _Border | None
+    """Gradient by the points."""
+    border: _FocalBorder | None
+    """Terms of the focal lengths; None where they are known."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Who shares points with whom: what elimination couples."""
+    """Observations that the elimination of points couples: pairs for short tracks, a matrix column for long ones."""
 
     a: Int64[Tensor, " l"]
-    """Ordered pairs of observations of one point, for points with few."""
+    """First observation of every ordered pair of observations of one point, for points with short tracks."""
     b: Int64[Tensor, " l"]
+    """Second observation of every pair."""
     long: Int64[Tensor, " m"]
     """Observations of all other points."""
     column: Int64[Tensor, " n"]
-    """Number of those points within their group."""
+    """Index of each of these other points within its group."""
     columns: int
-    """Most of a group."""
+    """Largest number of such points in a group."""
 
 
 def adjust(
     problem: Problem, scene: BundleState, *, steps: int, scale: float, tolerance: float = 1e-4
 ) -> tuple[BundleState, Float[Tensor, " g"]]:
-    """Adjust poses and points of every group; also its final robust cost [pixels^2].
+    """Adjusted poses and points of every group, and its final cost [pixels^2].
 
     Args:
-        scene: The start.
+        problem: Measurements and priors.
+        scene: Initial poses, points and focal lengths.
         steps: Largest number of iterations.
-        scale: Residual at which Cauchy's loss starts to forgive [pixels].
-        tolerance: A group is done when an iteration lowers its cost by less than this share.
+        scale: Scale of the Cauchy loss: the residual from which an observation is down-weighted [pixels].
+        tolerance: A group has converged when an iteration lowers its cost by less than this fraction.
     """
     layout = _layout(problem)
 
@@ -151,18 +167,19 @@ def adjust(
         return Linearised(system.cost, system)
 
     def moved(scene: BundleState, system: _System, damping: Tensor) -> BundleState:
-        return _moved(scene, *_solve(problem, scene, system, damping, layout))
+        return _apply_step(scene, *_solve(problem, scene, system, damping, layout))
 
-    choose = partial(_choose, problem)
-    damping = Damping(least=1e-10, most=1e8)
+    choose = partial(_select_better, problem)
+    damping = Damping(minimum=1e-10, maximum=1e8)
     scene, last = minimise(scene, linearised, moved, choose, steps=steps, damping=damping, tolerance=tolerance)
     return scene, last.cost
 
 
 def _layout(problem: Problem) -> _Layout:
+    """Couplings between observations, the same in all iterations."""
     point = problem.tracks.point
     count = torch.bincount(point, minlength=len(problem.group))
-    short, many = count[point] <= SHORT, count > SHORT
+    short, many = count[point] <= SHORT_TRACK, count > SHORT_TRACK
     order = torch.nonzero(short)[:, 0][torch.argsort(point[short], stable=True)]
     size = count[point[order]]
     begin = torch.nonzero(torch.cat([size.new_ones(1), point[order].diff()]))[:, 0] if len(order) else size
@@ -182,10 +199,10 @@ def _layout(problem: Problem) -> _Layout:
 def _jacobians(
     problem: Problem, scene: BundleState, x: Float[Tensor, "o 3"]
 ) -> tuple[Float[Tensor, "o 2 6"], Float[Tensor, "o 2 3"]]:
-    """Derivatives of the projections by poses (turn, shift) and by points."""
+    """Derivatives of the projections by poses (rotation vector from the left, translation) and by points."""
     focal = _focals(problem, scene)[problem.tracks.frame]
     R = scene.R.flatten(0, 1)[problem.tracks.frame]
-    z = x[:, 2].clamp_min(NEAREST)
+    z = x[:, 2].clamp_min(MIN_DEPTH)
     zero = torch.zeros_like(z)
     J_x = torch.stack(
         [
@@ -195,11 +212,12 @@ def _jacobians(
         -2,
     )
     arm = x - scene.t.flatten(0, 1)[problem.tracks.frame]
-    J_turn = torch.linalg.cross(arm[:, None].expand_as(J_x), J_x)
-    return torch.cat([J_turn, J_x], -1), J_x @ R
+    J_rotation = torch.linalg.cross(arm[:, None].expand_as(J_x), J_x)
+    return torch.cat([J_rotation, J_x], -1), J_x @ R
 
 
 def _linearise(problem: Problem, scene: BundleState, scale: float) -> _System:
+    """Costs and normal equations at the current poses and points."""
     g, f = scene.t.shape[:2]
     residual, x = residuals(problem, scene)
     squared = residual.square().sum(-1) / scale**2
@@ -218,71 +236,72 @@ def _linearise(problem: Problem, scene: BundleState, scale: float) -> _System:
     loss = problem.weight * scale**2 * torch.log1p(squared)
     cost = torch.zeros(g, dtype=torch.float64).index_add_(0, problem.group[problem.tracks.point], loss)
     cost = cost + _camera_priors(problem, scene, U, g_cam)
-    # A point that few pixels hold stays within the object.
-    hold = _hold(problem, scene)
-    V = V + hold[..., None] * torch.eye(3, dtype=torch.float64)
-    g_point = g_point + hold * scene.X
-    cost = cost.index_add(0, problem.group, hold[:, 0] * scene.X.square().sum(-1))
+    # A prior keeps weakly constrained points within the object.
+    prior = _point_prior_weight(problem, scene)
+    V = V + prior[..., None] * torch.eye(3, dtype=torch.float64)
+    g_point = g_point + prior * scene.X
+    cost = cost.index_add(0, problem.group, prior[:, 0] * scene.X.square().sum(-1))
     known = scene.log_focal is None
-    price, border = (0, None) if known else _border(problem, scene, x, residual, wJ_cam, wJ_point, w)
-    return _System(cost + price, U, V, wJ_cam.mT @ J_point, g_cam, g_point, border)
+    penalty, border = (0, None) if known else _focal_border(problem, scene, x, residual, wJ_cam, wJ_point, w)
+    return _System(cost + penalty, U, V, wJ_cam.mT @ J_point, g_cam, g_point, border)
 
 
-def _hold(problem: Problem, scene: BundleState) -> Float[Tensor, "#n 1"]:
-    """Weight of the points' distance from the origin: through a longer lens the object is as much smaller."""
-    hold = torch.full((1, 1), (NOISE / problem.reach) ** 2, dtype=torch.float64)
-    return hold if scene.log_focal is None else hold * (2 * scene.log_focal).exp()[problem.group, None]
+def _point_prior_weight(problem: Problem, scene: BundleState) -> Float[Tensor, "#n 1"]:
+    """Weight of the prior on the points' distance from the origin; a longer focal length implies a smaller object."""
+    weight = torch.full((1, 1), (NOISE / problem.radius) ** 2, dtype=torch.float64)
+    return weight if scene.log_focal is None else weight * (2 * scene.log_focal).exp()[problem.group, None]
 
 
-def _border(
+def _focal_border(
     problem: Problem, scene: BundleState, x: Tensor, residual: Tensor, wJ_cam: Tensor, wJ_point: Tensor, w: Tensor
-) -> tuple[Float[Tensor, " g"], _Border]:
-    """The cost of leaving the guessed focal length, and all derivatives by its logarithm."""
-    assert scene.log_focal is not None, "a focal length to find"
+) -> tuple[Float[Tensor, " g"], _FocalBorder]:
+    """Cost of the focal length's prior, and all derivatives by the logarithm of the focal length."""
+    assert scene.log_focal is not None, "the focal length is estimated"
     g, f = scene.t.shape[:2]
     track, focal = problem.tracks, _focals(problem, scene)
     group = problem.group[track.point]
-    J = x[:, :2] / x[:, 2:].clamp_min(NEAREST) * focal[track.frame]
+    J = x[:, :2] / x[:, 2:].clamp_min(MIN_DEPTH) * focal[track.frame]
     cam = torch.zeros(g * f, 6, dtype=torch.float64).index_add_(0, track.frame, (wJ_cam * J[..., None]).sum(1))
-    held = _hold(problem, scene) * scene.X
-    point = held.index_add(0, track.point, (wJ_point * J[..., None]).sum(1))
-    none, off = torch.zeros(g, dtype=torch.float64), scene.log_focal - problem.guess
-    pull = (GUESS_NOISE / GUESS) ** 2 * none.index_add(0, group, problem.weight)
-    shrinks = none.index_add(0, problem.group, (held * scene.X).sum(-1))
-    H = (pull + shrinks).index_add(0, group, w * J.square().sum(-1))
-    gradient = (pull * off + shrinks).index_add(0, group, w * (J * residual).sum(-1))
-    rows, r, J = _origin(problem, scene)
+    prior = _point_prior_weight(problem, scene) * scene.X
+    point = prior.index_add(0, track.point, (wJ_point * J[..., None]).sum(1))
+    zero, offset = torch.zeros(g, dtype=torch.float64), scene.log_focal - problem.log_focal_prior
+    weight = (FOCAL_NOISE / FOCAL_SIGMA) ** 2 * zero.index_add(0, group, problem.weight)
+    shrinkage = zero.index_add(0, problem.group, (prior * scene.X).sum(-1))
+    H = (weight + shrinkage).index_add(0, group, w * J.square().sum(-1))
+    gradient = (weight * offset + shrinkage).index_add(0, group, w * (J * residual).sum(-1))
+    rows, r, J = _origin_prior(problem, scene)
     cam[:, 3:] += torch.einsum("cki,ck->ci", rows[:, :2], J)
     H, gradient = H + J.square().reshape(g, -1).sum(1), gradient + (J * r[:, :2]).reshape(g, -1).sum(1)
-    return pull * off.square(), _Border(H, gradient, cam, point)
+    return weight * offset.square(), _FocalBorder(H, gradient, cam, point)
 
 
 def _camera_priors(problem: Problem, scene: BundleState, U: Tensor, g_cam: Tensor) -> Float[Tensor, " g"]:
-    """Add the priors of the origin's place to the normal equations in place; their cost."""
-    rows, r, _ = _origin(problem, scene)
+    """Cost of the priors on the origin's position, which are added to the normal equations in place."""
+    rows, r, _ = _origin_prior(problem, scene)
     U[:, 3:, 3:] += rows.mT @ rows
     g_cam[:, 3:] += torch.einsum("cki,ck->ci", rows, r)
     return r.square().sum(-1).reshape(scene.t.shape[:2]).sum(1)
 
 
-def _origin(problem: Problem, scene: BundleState) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the origin's place: derivatives of the residuals by it, residuals, derivatives by the logarithmic focal."""
+def _origin_prior(problem: Problem, scene: BundleState) -> tuple[Tensor, Tensor, Tensor]:
+    """Priors on the origin's position: derivatives by it, residuals, derivatives by the logarithmic focal length."""
     focal, principal = _focals(problem, scene), problem.camera.fx_fy_cx_cy.double()[2:]
     t = scene.t.flatten(0, 1)
-    z = t[:, 2:].clamp_min(NEAREST)
-    off = (t[:, :2] / z * focal + principal - problem.centre.flatten(0, 1)) / problem.centre_sigma.flatten()[:, None]
-    far = z.log() / problem.depth_sigma
+    z = t[:, 2:].clamp_min(MIN_DEPTH)
+    offset = (t[:, :2] / z * focal + principal - problem.centre.flatten(0, 1)) / problem.centre_sigma.flatten()[:, None]
+    log_depth = z.log() / problem.depth_sigma
     rows = torch.zeros(len(t), 3, 3, dtype=torch.float64)
     scaled = focal / z / problem.centre_sigma.flatten()[:, None]
     rows[:, 0, 0], rows[:, 1, 1] = scaled[:, 0], scaled[:, 1]
     rows[:, :2, 2] = -scaled * t[:, :2] / z
     rows[:, 2, 2] = 1 / (z[:, 0] * problem.depth_sigma)
-    return NOISE * rows, NOISE * torch.cat([off, far], -1), NOISE * scaled * t[:, :2]
+    return NOISE * rows, NOISE * torch.cat([offset, log_depth], -1), NOISE * scaled * t[:, :2]
 
 
 def _solve(
     problem: Problem, scene: BundleState, system: _System, damping: Float[Tensor, " g"], layout: _Layout
 ) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "n 3"], Float[Tensor, " g"] | None]:
+    """Damped steps of poses, points and, where they are estimated, logarithms of the focal lengths."""
     g, f = scene.t.shape[:2]
     lam_cam, lam_point = damping.repeat_interleave(f)[:, None], damping[problem.group][:, None]
     U, V = (
@@ -297,7 +316,7 @@ def _solve(
     S = S.reshape(g, f, f, 6, 6)
     S.diagonal(dim1=1, dim2=2).add_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
     S = S.permute(0, 1, 3, 2, 4).reshape(g, 6 * f, 6 * f)
-    # One product of matrices instead of a sum over pairs: there are as many as a track's length squared.
+    # One matrix product instead of a sum over pairs, whose number is the square of a track's length.
     half = torch.zeros(g * f, layout.columns, 6, 3, dtype=torch.float64)
     point = problem.tracks.point[layout.long]
     half[frame[layout.long], layout.column[point]] = system.W[layout.long] @ torch.linalg.cholesky(V_inv)[point]
@@ -312,27 +331,28 @@ def _solve(
         side = border.cam.index_add(0, frame, -(Y @ border.point[problem.tracks.point][..., None])[..., 0])
         slope = torch.linalg.solve(S, side.reshape(g, 6 * f, 1)).reshape(g * f, 6)
 
-        def among(cameras: Tensor, points: Tensor) -> Float[Tensor, " g"]:
+        def total(cameras: Tensor, points: Tensor) -> Float[Tensor, " g"]:
             return cameras.reshape(g, -1).sum(1).index_add(0, problem.group, points.sum(-1))
 
-        H = (1 + damping) * border.H - among(side * slope, border.point * V_point)
-        d_focal = (-border.g - among(side * d_cam, -V_point * g_point)) / H
+        H = (1 + damping) * border.H - total(side * slope, border.point * V_point)
+        d_focal = (-border.g - total(side * d_cam, -V_point * g_point)) / H
         d_cam = d_cam - d_focal.repeat_interleave(f)[:, None] * slope
         g_point = g_point + d_focal[problem.group][:, None] * border.point
     back = g_point.index_add(0, problem.tracks.point, (system.W.mT @ d_cam[problem.tracks.frame][..., None])[..., 0])
     return d_cam, -(V_inv @ back[..., None])[..., 0], d_focal
 
 
-def _moved(scene: BundleState, d_cam: Tensor, d_point: Tensor, d_focal: Tensor | None = None) -> BundleState:
+def _apply_step(scene: BundleState, d_cam: Tensor, d_point: Tensor, d_focal: Tensor | None = None) -> BundleState:
+    """The variables after a step, which is clamped; rotations are applied from the left."""
     g, f = scene.t.shape[:2]
-    turn = SO3.exp(d_cam[:, :3].clamp(-0.5, 0.5)).matrix().reshape(g, f, 3, 3)
+    rotation = SO3.exp(d_cam[:, :3].clamp(-0.5, 0.5)).matrix().reshape(g, f, 3, 3)
     shift = d_cam[:, 3:].clamp(-0.2, 0.2).reshape(g, f, 3)
     log_focal = None if d_focal is None or scene.log_focal is None else scene.log_focal + d_focal.clamp(-0.1, 0.1)
-    return BundleState(turn @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2), log_focal)
+    return BundleState(rotation @ scene.R, scene.t + shift, scene.X + d_point.clamp(-0.2, 0.2), log_focal)
 
 
-def _choose(problem: Problem, better: Tensor, new: Any, old: Any) -> Any:
-    """Per group, the new where it is better: of scenes, and of systems."""
+def _select_better(problem: Problem, better: Tensor, new: Any, old: Any) -> Any:
+    """Per group, the new value where it is better, else the old one; of variables and of systems."""
     if bool(better.all()):
         return new
     point = better[problem.group]
@@ -349,10 +369,12 @@ def _choose(problem: Problem, better: Tensor, new: Any, old: Any) -> Any:
 
 
 def information(problem: Problem, scene: BundleState, precision: Float[Tensor, "o 2 2"]) -> Float[Tensor, "c 6 6"]:
-    """Of every pose (turn, shift) with the points held and without priors.
+    """Information matrix of every pose (rotation, translation), with points fixed and without priors.
 
     Args:
-        precision: Of every observation [1/pixel^2].
+        problem: Observations; its weights and priors are not used.
+        scene: Poses and points.
+        precision: Inverse covariance of every observation [1/pixel^2].
     """
     _, x = residuals(problem, scene)
     J, _ = _jacobians(problem, scene, x)
@@ -370,30 +392,30 @@ def triangulate(
     camera: Camera,
     radius: Float[Tensor, " c"],
 ) -> Float[Tensor, "n 3"]:
-    """Points closest to all their rays, drawn slightly towards where the front of a ball would be.
+    """Points closest to all their rays, with a weak prior on the front of the object's bounding sphere.
 
     Args:
-        tracks: With frames in [0, c).
-        R: `R_cam_obj`
-        t: The object's origin, camera frame.
-        camera: Of all frames.
-        radius: Of the ball about the object, over its distance.
+        tracks: Observations, with frames in [0, c).
+        R: `R_cam_obj` of every frame.
+        t: Position of the object's origin in every frame, camera frame.
+        camera: Camera of all frames.
+        radius: Radius of the bounding sphere over its distance, per frame.
     """
     focal, principal = camera.fx_fy_cx_cy.double().split(2)
     xy = (tracks.uv - principal) / focal
     ray = torch.nn.functional.normalize(torch.cat([xy, torch.ones_like(xy[:, :1])], -1), dim=-1)
     R, t = R[tracks.frame], t[tracks.frame]
     middle = (ray * t).sum(-1)
-    reach = radius[tracks.frame] * t.norm(dim=-1)
-    half2 = reach.square() - t.square().sum(-1) + middle.square()
-    half = torch.maximum(half2, (SHALLOW * reach).square()).sqrt()
-    front = torch.einsum("oji,oj->oi", R, ray * (middle - FRONT * half)[:, None] - t)
+    sphere = radius[tracks.frame] * t.norm(dim=-1)
+    half2 = sphere.square() - t.square().sum(-1) + middle.square()
+    half = torch.maximum(half2, (MIN_HALF_CHORD * sphere).square()).sqrt()
+    front = torch.einsum("oji,oj->oi", R, ray * (middle - FRONT_POSITION * half)[:, None] - t)
     direction = torch.einsum("oji,oj->oi", R, ray)
     eye = torch.eye(3, dtype=torch.float64)
     across = eye - direction[:, :, None] * direction[:, None]
     centre = -torch.einsum("oji,oj->oi", R, t)
     A = torch.zeros(tracks.n, 3, 3, dtype=torch.float64)
-    A.index_add_(0, tracks.point, across + TRUST_FRONT * eye)
+    A.index_add_(0, tracks.point, across + FRONT_WEIGHT * eye)
     b = torch.zeros(tracks.n, 3, dtype=torch.float64)
-    b.index_add_(0, tracks.point, (across @ centre[..., None])[..., 0] + TRUST_FRONT * front)
+    b.index_add_(0, tracks.point, (across @ centre[..., None])[..., 0] + FRONT_WEIGHT * front)
     return torch.linalg.solve(A, b)

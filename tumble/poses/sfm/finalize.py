@@ -1,7 +1,7 @@
-"""What stage 1 hands on: poses in the object's own unit and frame, its points, and how far to trust them.
+"""Last step of stage 1: lost frames, the object's frame and unit, surface points and the quality of the poses.
 
-The gauge: the ball about the object's frontier points, which lie on its convex hull, is the unit ball. The object frame
-is turned as the camera saw it in the first frame.
+The similarity frame of the result: the smallest sphere around the frontier points, which lie on the object's convex
+hull, becomes the unit sphere, and the object axes are the camera axes of the first frame.
 """
 
 from collections.abc import Sequence
@@ -11,134 +11,148 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_ball
-from tumble.poses.result import UNSEEN, Observability, PoseQuality, PoseResult
+from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
+from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult
 from tumble.poses.sfm import bundle_adjustment, relocalization, symmetry, texture_information
-from tumble.poses.sfm.frontier_points import Outlines, touch
-from tumble.poses.sfm.relocalization import Judge
-from tumble.poses.sfm.symmetry import Mirrors
+from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
+from tumble.poses.sfm.relocalization import ContourConstraints
+from tumble.poses.sfm.symmetry import MirrorSymmetry
 from tumble.poses.sfm.tracks import Tracks
 from tumble.scene import BACKGROUND, UNKNOWN, Capture, Trajectory, visual_hull
 
-AGREES = 1.5
-"""Distance between a match and its point up to which the match is an inlier [pixels]."""
-LOST = 8.0
-"""Gap over the capture's median from which the outline contradicts the pose."""
-LEAST_GAP = 0.15
-"""Median gap that is always forgiven [pixels]."""
-STRANGE = 0.1
-"""Overlap under the median from which a frame's silhouette contradicts the hull."""
-FEW, CONTRARY = 8, 6.0
-"""Inliers under which matches do not hold a frame against its outline, and median distance between its matches and
-their points from which they speak against it [pixels]."""
-WIDE = 0.5
-"""Least angle between the rays that make a frontier point [radians]."""
-STRAY = 1.1
-"""Distance from the centre, over that which one point in twenty exceeds, from which a point is a wrong one: frontier
-points gather at the object's ends."""
-BARE = 0.03
-"""Share of observations with texture that no edge explains under which a body of revolution has no texture: bare cans
-and balls up to 1.4 %, without grain and with it, and 2.7 % with a film's masks; a soup can 21 %, and 7 % under grain of
-25 code values."""
-BALL_STEPS = 299
-"""Of the search for the smallest ball."""
-JUDGED, JUDGES = 24, 16
-"""Frames that are asked what their outline would say of a turn, and frames they are compared with."""
-CELLS = 48
-"""Of the hull's grid, per side, and of the grid of rays that look at it."""
+INLIER_THRESHOLD = 1.5
+"""Reprojection error below which an observation is an inlier [pixels]."""
+MAX_GAP_RATIO = 8.0
+"""Tangency gap above which a frame's contour contradicts its pose [median gap of the capture]."""
+MIN_MEDIAN_GAP = 0.15
+"""Lower limit of the capture's median gap where thresholds are multiples of it [pixels]."""
+MAX_OVERLAP_DEFICIT = 0.1
+"""Difference to the median overlap above which a frame's silhouette contradicts the visual hull (IoU)."""
+MIN_INLIERS = 8
+"""Number of inliers below which a frame is lost if its contour or its observations contradict its pose."""
+MAX_RESIDUAL = 6.0
+"""Median reprojection error above which a frame's observations contradict its pose [pixels]."""
+MIN_TRIANGULATION_ANGLE = 0.5
+"""Minimum angle between two optical axes, and between one and the reverse of the other, for their frontier points to
+be triangulated [radians]."""
+OUTLIER_DISTANCE = 1.1
+"""Distance from the centre above which a point is an outlier [95th percentile of all distances]. Little more than 1,
+because frontier points are dense at the object's extremities."""
+MIN_TEXTURED_FRACTION = 0.03
+"""Fraction of observations with texture in both image directions, not only across an edge, below which a body of
+revolution counts as untextured."""
+SPHERE_STEPS = 299
+"""Iterations of the search for the smallest enclosing sphere."""
+ASSESSED_FRAMES = 24
+"""Number of frames, up to a factor of 2, for which the information of the contour about the pose is evaluated."""
+REFERENCE_FRAMES = 16
+"""Number of frames, up to a factor of 2, with whose contours each of these frames is compared."""
+HULL_RESOLUTION = 48
+"""Cells per side of the visual hull's grid; also rays per side of the image in which its silhouette is compared."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Poses in stage 1's own unit, the object's mean distance."""
+    """Estimated poses in the unit of stage 1, the mean distance between camera and object."""
 
     R: Float[Tensor, "t 3 3"]
+    """`R_cam_obj`"""
     t: Float[Tensor, "t 3"]
+    """Object origin, camera frame [mean distance]."""
     radius: float
-    """Of the object, roughly."""
-    drift: Float[Tensor, " t"]
-    """Angle between what tracks and what outlines would have preferred [radians]."""
+    """Approximate radius of the object [mean distance]."""
+    rotation_disagreement: Float[Tensor, " t"]
+    """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]."""
 
 
-def finished(capture: Capture, tracks: Tracks, outline: Outlines, solution: Solution) -> PoseResult:
-    """Judge every frame, fix the gauge, and collect the points that deserve it."""
+def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: Solution) -> PoseResult:
+    """Result of stage 1 for estimated poses: lost frames, poses in the object's frame and unit, points and quality."""
     R, t, camera = solution.R, solution.t, capture.camera
-    reach = torch.full((len(R),), solution.radius, dtype=torch.float64)
-    X = bundle_adjustment.triangulate(tracks, R, t, camera, reach)
+    radius = torch.full((len(R),), solution.radius, dtype=torch.float64)
+    X = bundle_adjustment.triangulate(tracks, R, t, camera, radius)
     scene = bundle_adjustment.BundleState(R[None], t[None], X)
     group, weight = torch.zeros(tracks.n, dtype=torch.long), torch.ones(len(tracks), dtype=torch.float64)
-    place = torch.ones(1, len(R), 2, dtype=torch.float64)
-    problem = bundle_adjustment.Problem(camera, tracks, group, weight, place, place[..., 0], depth_sigma=1.0, reach=1.0)
+    # Residuals do not depend on the priors, whose values are placeholders here.
+    ones = torch.ones(1, len(R), 2, dtype=torch.float64)
+    problem = bundle_adjustment.Problem(camera, tracks, group, weight, ones, ones[..., 0], depth_sigma=1.0, radius=1.0)
     residual = bundle_adjustment.residuals(problem, scene)[0].norm(dim=-1)
-    gap, rim = _frontier(capture, outline, solution)
-    median, inliers = _per_frame(residual, tracks.frame, len(R))
-    worst = LOST * gap[~gap.isnan()].median().clamp_min(LEAST_GAP) if bool((~gap.isnan()).any()) else torch.inf
+    gap, frontier_points = _frontier_points(capture, contours, solution)
+    median, inliers = _residuals_per_frame(residual, tracks.frame, len(R))
+    known = ~gap.isnan()
+    max_gap = MAX_GAP_RATIO * gap[known].median().clamp_min(MIN_MEDIAN_GAP) if bool(known.any()) else torch.inf
     visible = (capture.masks != BACKGROUND).flatten(1).any(1)
-    failed = ~outline.sure.any(1)
-    lost = ~visible | failed | (((gap > worst) | gap.isnan() | (median > CONTRARY)) & (inliers < FEW))
-    lost = ~relocalization.unbroken(R, ~lost)
-    sure = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < AGREES).float()) >= 3
-    centre, scale = _ball(torch.cat([rim, X[sure]]) if len(rim) < 50 else rim)
+    no_contour = ~contours.reliable.any(1)
+    contradicted = (gap > max_gap) | gap.isnan() | (median > MAX_RESIDUAL)
+    lost = ~visible | no_contour | (contradicted & (inliers < MIN_INLIERS))
+    lost = ~relocalization.longest_smooth_sequence(R, ~lost)
+    reliable = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < INLIER_THRESHOLD).float()) >= 3
+    few = len(frontier_points) < 50
+    centre, scale = _bounding_sphere(torch.cat([frontier_points, X[reliable]]) if few else frontier_points)
     R_first = R[0]
     origin = t + R @ centre
     T = SE3.from_rotation(SO3.from_matrix(R @ R_first.mT), origin / scale)
-    lost, overlap = _contradicting(capture, Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light), lost)
-    T = _bridged(T, lost)
+    lost, overlap = _reject_by_overlap(capture, Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light), lost)
+    T = _interpolate_lost(T, lost)
     trajectory = Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light)
-    points = ((X[sure] - centre) / scale) @ R_first.mT
-    colours = _colours(capture, tracks, residual, sure)
-    observability = _observability(capture, outline, solution, problem, scene, residual < AGREES)
-    drift, turn = solution.drift.float(), angle_between(T.rotation[:, None], T.rotation).max().float()
-    quality = PoseQuality(median.float(), inliers.float(), gap.float(), overlap, drift, lost, turn, observability)
+    points = ((X[reliable] - centre) / scale) @ R_first.mT
+    colours = _point_colours(capture, tracks, residual, reliable)
+    observability = _observability(capture, contours, solution, problem, scene, residual < INLIER_THRESHOLD)
+    disagreement = solution.rotation_disagreement.float()
+    rotation_range = angle_between(T.rotation[:, None], T.rotation).max().float()
+    quality = PoseQuality(
+        median.float(), inliers.float(), gap.float(), overlap, disagreement, lost, rotation_range, observability
+    )
     return PoseResult(trajectory, points.float(), colours, quality, camera)
 
 
-def _frontier(
-    capture: Capture, outline: Outlines, solution: Solution
+def _frontier_points(
+    capture: Capture, contours: Contours, solution: Solution
 ) -> tuple[Float[Tensor, " t"], Float[Tensor, "n 3"]]:
-    """Median gap of every frame with all others [pixels], and the frontier points of small gaps."""
+    """Median tangency gap of every frame with all others [pixels], and the frontier points with small gaps."""
     n = len(solution.R)
     i, j = torch.triu_indices(n, n, 1)
     pose_i, pose_j = ((solution.R[k], solution.t[k]) for k in (i, j))
-    found = touch(pose_i, pose_j, outline[i], outline[j], capture.camera, radius=solution.radius)
+    found = epipolar_tangencies(pose_i, pose_j, contours[i], contours[j], capture.camera, radius=solution.radius)
     table = torch.full((n, n, 2), torch.nan, dtype=torch.float64)
-    table[i, j] = table[j, i] = torch.where(found.good, found.gap.abs(), torch.nan)
+    table[i, j] = table[j, i] = torch.where(found.valid, found.gap.abs(), torch.nan)
     gap = table.flatten(1).nanmedian(1).values
-    # Rays that meet at a small angle do not say where.
-    turn = (solution.R[i, 2] * solution.R[j, 2]).sum(-1).clamp(-1, 1).arccos()
-    wide = (turn > WIDE) & (turn < torch.pi - WIDE)
-    close = found.good & wide[:, None] & (found.gap.abs() < 2 * gap[~gap.isnan()].median().clamp_min(LEAST_GAP))
-    frames = torch.stack([i, j], 1)[:, None].expand(-1, 2, -1)[close]
-    uv = torch.stack([outline.corners[i[:, None], found.corner_i], outline.corners[j[:, None], found.corner_j]], 2)[
-        close
-    ]
+    # The depth of a point is uncertain where its rays are nearly parallel.
+    angle = (solution.R[i, 2] * solution.R[j, 2]).sum(-1).clamp(-1, 1).arccos()
+    wide = (angle > MIN_TRIANGULATION_ANGLE) & (angle < torch.pi - MIN_TRIANGULATION_ANGLE)
+    max_gap = 2 * gap[~gap.isnan()].median().clamp_min(MIN_MEDIAN_GAP)
+    chosen = found.valid & wide[:, None] & (found.gap.abs() < max_gap)
+    frames = torch.stack([i, j], 1)[:, None].expand(-1, 2, -1)[chosen]
+    uv_i, uv_j = contours.vertices[i[:, None], found.vertex_i], contours.vertices[j[:, None], found.vertex_j]
+    uv = torch.stack([uv_i, uv_j], 2)[chosen]
     point = torch.arange(len(frames)).repeat_interleave(2)
     tracks = Tracks(frames.reshape(-1), point, uv.reshape(-1, 2))
-    reach = torch.full((n,), solution.radius, dtype=torch.float64)
-    return gap, bundle_adjustment.triangulate(tracks, solution.R, solution.t, capture.camera, reach)
+    radius = torch.full((n,), solution.radius, dtype=torch.float64)
+    return gap, bundle_adjustment.triangulate(tracks, solution.R, solution.t, capture.camera, radius)
 
 
-def _per_frame(residual: Float[Tensor, " o"], frame: Tensor, n: int) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
+def _residuals_per_frame(
+    residual: Float[Tensor, " o"], frame: Tensor, n: int
+) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
     """Median residual and number of inliers of every frame."""
     groups = [residual[frame == k] for k in range(n)]
     median = torch.stack([g.median() if len(g) else g.new_tensor(torch.nan) for g in groups])
-    return median, torch.stack([(g < AGREES).sum() for g in groups]).double()
+    return median, torch.stack([(g < INLIER_THRESHOLD).sum() for g in groups]).double()
 
 
-def _ball(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Centre and radius of the smallest ball about all points but strays."""
+def _bounding_sphere(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+    """Centre and radius of the smallest sphere around all points but outliers."""
     if len(points) < 4:
         return torch.zeros(3, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
     centre = points.median(0).values
     for _ in range(2):
         distance = (points - centre).norm(dim=-1)
-        points = points[distance <= STRAY * distance.quantile(0.95)]
-        centre = smallest_ball(lambda x, points=points: points - x, centre, steps=BALL_STEPS)
+        points = points[distance <= OUTLIER_DISTANCE * distance.quantile(0.95)]
+        centre = smallest_enclosing_sphere(lambda x, points=points: points - x, centre, steps=SPHERE_STEPS)
     return centre, (points - centre).norm(dim=-1).max()
 
 
-def _bridged(T: SE3, lost: Bool[Tensor, " t"]) -> SE3:
-    """Poses of lost frames by interpolation between the closest that are not, or by the closest at the ends."""
+def _interpolate_lost(T: SE3, lost: Bool[Tensor, " t"]) -> SE3:
+    """Poses with those of lost frames interpolated between the closest other frames, or copied at either end."""
     kept = torch.nonzero(~lost)[:, 0].tolist()
     if not kept:
         return T
@@ -148,68 +162,72 @@ def _bridged(T: SE3, lost: Bool[Tensor, " t"]) -> SE3:
             max((i for i in kept if i < k), default=kept[0]),
             min((i for i in kept if i > k), default=kept[-1]),
         )
-        share = (k - before) / (after - before) if before < k < after else 0.0
-        guess = interpolate(T[before], T[after], share)
-        wxyz[k], xyz[k] = guess.wxyz, guess.xyz
+        fraction = (k - before) / (after - before) if before < k < after else 0.0
+        pose = interpolate(T[before], T[after], fraction)
+        wxyz[k], xyz[k] = pose.wxyz, pose.xyz
     return SE3(wxyz, xyz)
 
 
-def _colours(
-    capture: Capture, tracks: Tracks, residual: Float[Tensor, " o"], sure: Bool[Tensor, " n"]
+def _point_colours(
+    capture: Capture, tracks: Tracks, residual: Float[Tensor, " o"], reliable: Bool[Tensor, " n"]
 ) -> Float[Tensor, "m 3"]:
-    """Of the points that are sure, the median over observations that agree."""
+    """Linear RGB of the reliable points: the median over their inlier observations."""
     column, row = tracks.uv.floor().long().T
     size = capture.camera
-    seen = capture.images[tracks.frame, row.clamp(0, size.height - 1), column.clamp(0, size.width - 1)]
-    colour = linear_from_srgb(seen.float() / 255)
+    code = capture.images[tracks.frame, row.clamp(0, size.height - 1), column.clamp(0, size.width - 1)]
+    colour = linear_from_srgb(code.float() / 255)
     order = torch.argsort(tracks.point, stable=True)
-    good = order[(residual < AGREES)[order] & sure[tracks.point[order]]]
-    parts = colour[good].split(torch.bincount(tracks.point[good], minlength=tracks.n)[sure].tolist())
+    chosen = order[(residual < INLIER_THRESHOLD)[order] & reliable[tracks.point[order]]]
+    parts = colour[chosen].split(torch.bincount(tracks.point[chosen], minlength=tracks.n)[reliable].tolist())
     return torch.stack([part.median(0).values for part in parts]) if parts else colour[:0]
 
 
-def _contradicting(
+def _reject_by_overlap(
     capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"]
 ) -> tuple[Bool[Tensor, " t"], Float[Tensor, " t"]]:
-    """Lost frames, with those whose silhouette the hull of the others does not know; also the overlaps.
+    """Lost frames, extended by those whose silhouette contradicts the visual hull of the others; also all overlaps.
 
-    Frames that went astray together carve the hull of all: what they leave of it is looked at again without them.
+    Several wrong frames distort the visual hull of all, which is therefore carved again without the rejected frames.
     """
     for _ in range(3):
-        overlap = _overlap(capture, trajectory, lost)
+        overlap = _hull_overlap(capture, trajectory, lost)
         if bool(lost.all()):
             break
-        strange = overlap < overlap[~lost].median() - STRANGE
-        if not bool((strange & ~lost).any()):
+        contradicted = overlap < overlap[~lost].median() - MAX_OVERLAP_DEFICIT
+        if not bool((contradicted & ~lost).any()):
             break
-        lost = lost | strange
+        lost = lost | contradicted
     return lost, overlap
 
 
-def _overlap(capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"]) -> Float[Tensor, " t"]:
-    """Intersection over union of silhouettes and the hull that those of frames not lost carve."""
+def _hull_overlap(capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"]) -> Float[Tensor, " t"]:
+    """Intersection over union of all silhouettes with that of the visual hull of the frames that are not lost."""
     kept = torch.nonzero(~lost)[:, 0]
     if not len(kept):
         return torch.zeros(len(capture))
-    inside = visual_hull.carve(_part(capture, kept.tolist()), trajectory.select(kept), resolution=CELLS)
-    camera = capture.camera.resized(CELLS, CELLS)
-    direction = camera.unproject(camera.pixel_centers(), torch.ones(CELLS, CELLS)).reshape(-1, 1, 3)
-    rows = ((torch.arange(CELLS) + 0.5) * capture.camera.height / CELLS).long()
-    columns = ((torch.arange(CELLS) + 0.5) * capture.camera.width / CELLS).long()
-    scores = []
+    inside = visual_hull.carve(
+        _select_frames(capture, kept.tolist()), trajectory.select(kept), resolution=HULL_RESOLUTION
+    )
+    camera = capture.camera.resized(HULL_RESOLUTION, HULL_RESOLUTION)
+    depth_one = torch.ones(HULL_RESOLUTION, HULL_RESOLUTION)
+    direction = camera.unproject(camera.pixel_centers(), depth_one).reshape(-1, 1, 3)
+    ticks = torch.arange(HULL_RESOLUTION) + 0.5
+    rows = (ticks * capture.camera.height / HULL_RESOLUTION).long()
+    columns = (ticks * capture.camera.width / HULL_RESOLUTION).long()
+    overlaps = []
     for frame in range(len(trajectory)):
         T_cam_obj = trajectory.T_cam_obj[frame]
-        depth = T_cam_obj.xyz[2] + torch.linspace(-1.1, 1.1, 2 * CELLS)[:, None]
+        depth = T_cam_obj.xyz[2] + torch.linspace(-1.1, 1.1, 2 * HULL_RESOLUTION)[:, None]
         x_obj = T_cam_obj.inverse() @ (direction * depth)
-        at = x_obj.flip(-1)[None, None]  # grid_sample wants the last axis of the grid first
-        through = torch.nn.functional.grid_sample(inside[None, None], at, align_corners=False)[0, 0, 0].amax(-1) > 0.5
+        grid = x_obj.flip(-1)[None, None]  # grid_sample expects the last axis of the volume first
+        hit = torch.nn.functional.grid_sample(inside[None, None], grid, align_corners=False)[0, 0, 0].amax(-1) > 0.5
         mask = capture.masks[frame][rows][:, columns].flatten()
         counted, silhouette = mask != UNKNOWN, mask != BACKGROUND
-        scores.append(iou(through, silhouette, counted))
-    return torch.stack(scores)
+        overlaps.append(iou(hit, silhouette, counted))
+    return torch.stack(overlaps)
 
 
-def _part(capture: Capture, frames: Sequence[int]) -> Capture:
+def _select_frames(capture: Capture, frames: Sequence[int]) -> Capture:
     """Some frames of a capture, without poses."""
     index = torch.as_tensor(frames)
     names = tuple(capture.names[k] for k in frames)
@@ -218,49 +236,56 @@ def _part(capture: Capture, frames: Sequence[int]) -> Capture:
 
 def _observability(
     capture: Capture,
-    outline: Outlines,
+    contours: Contours,
     solution: Solution,
     problem: bundle_adjustment.Problem,
     scene: bundle_adjustment.BundleState,
-    agrees: Tensor,
+    inlier: Tensor,
 ) -> Observability:
-    """Uncertainty of a single frame's rotation by texture and outlines, points held, translation free: typical over
-    frames that texture shows anything of, and others."""
+    """Standard deviations of a frame's rotation, from the Fisher information of texture and contours.
+
+    The points are held fixed, the translation is eliminated, and the information is averaged over frames, normalised by
+    its trace. An untextured body of revolution is recognised by the mirror symmetry of its silhouettes instead.
+    """
     R, t, camera, n = solution.R, solution.t, capture.camera, len(solution.R)
-    textured = texture_information.information(capture, problem.tracks) * agrees[:, None, None]
-    # A place is never known better than to the noise of a good match.
+    texture = texture_information.information(capture, problem.tracks) * inlier[:, None, None]
+    # The noise of a good match limits how precisely a position is known.
     precision = torch.linalg.inv(
-        torch.linalg.inv(textured + 1e-9 * torch.eye(2, dtype=torch.float64))
+        torch.linalg.inv(texture + 1e-9 * torch.eye(2, dtype=torch.float64))
         + bundle_adjustment.NOISE**2 * torch.eye(2, dtype=torch.float64)
     )
     information = bundle_adjustment.information(problem, scene, precision)
-    frames = torch.arange(0, n, max(1, n // JUDGED))
+    frames = torch.arange(0, n, max(1, n // ASSESSED_FRAMES))
     for k in frames.tolist():
-        others = torch.tensor([i for i in range(0, n, max(1, n // JUDGES)) if i != k])
-        own, theirs = outline[torch.tensor([k])], outline[others]
-        judge = Judge((R[others], t[others]), own, theirs, camera, solution.radius)
-        information[k] += relocalization.information(judge, R[k], t[k])
+        others = torch.tensor([i for i in range(0, n, max(1, n // REFERENCE_FRAMES)) if i != k])
+        contour, other_contours = contours[torch.tensor([k])], contours[others]
+        constraints = ContourConstraints((R[others], t[others]), contour, other_contours, camera, solution.radius)
+        information[k] += relocalization.information(constraints, R[k], t[k])
     information = information[frames]
     H = information[:, :3, :3] - information[:, :3, 3:] @ torch.linalg.solve(
         information[:, 3:, 3:] + 1e-9 * torch.eye(3, dtype=torch.float64), information[:, 3:, :3]
     )
-    R_first_cam = R[0] @ R[frames].mT  # from each camera to the object frame of the outcome
+    R_first_cam = R[0] @ R[frames].mT  # from each camera to the object frame of the result
     H = R_first_cam @ H @ R_first_cam.mT
-    total = H.diagonal(dim1=1, dim2=2).sum(-1)
-    typical = total.median() * (H / total.clamp_min(1e-9)[:, None, None]).mean(0)
-    strength, axes = torch.linalg.eigh(typical)
-    seen = Observability(axes[:, 0].float(), strength.clamp_min(1 / torch.pi**2).rsqrt().float())
-    lesser, greater = torch.linalg.eigvalsh(textured).T
-    # Rounding leaves a little across an edge.
-    bare = bool((lesser > 1e-6 * greater).double().mean() < BARE)
-    return _symmetric(seen, symmetry.mirrors(capture.masks)) if bare else seen
+    trace = H.diagonal(dim1=1, dim2=2).sum(-1)
+    typical = trace.median() * (H / trace.clamp_min(1e-9)[:, None, None]).mean(0)
+    eigenvalues, axes = torch.linalg.eigh(typical)
+    estimate = Observability(axes[:, 0].float(), eigenvalues.clamp_min(1 / torch.pi**2).rsqrt().float())
+    smaller, larger = torch.linalg.eigvalsh(texture).T
+    # Rounding leaves a small eigenvalue along an edge.
+    untextured = bool((smaller > 1e-6 * larger).double().mean() < MIN_TEXTURED_FRACTION)
+    return _observability_from_symmetry(estimate, symmetry.mirror_symmetry(capture.masks)) if untextured else estimate
 
 
-def _symmetric(seen: Observability, mirrors: Mirrors) -> Observability:
-    """What is seen of a bare object, whatever the poses that were found for it say."""
-    if not mirrors.revolves:
-        return seen
-    if mirrors.ball:
-        return replace(seen, sigma=torch.full_like(seen.sigma, torch.pi))
-    axis = torch.nn.functional.pad(mirrors.axis, (0, 1), value=torch.nan)
-    return Observability(axis, torch.cat([seen.sigma.new_full((1,), torch.pi), seen.sigma[1:].clamp_max(UNSEEN)]))
+def _observability_from_symmetry(estimate: Observability, mirror_symmetry: MirrorSymmetry) -> Observability:
+    """Observability of an untextured object: no rotation about an axis of revolution, none at all of a sphere.
+
+    The estimate, which depends on the estimated poses, is kept where the object is not a body of revolution.
+    """
+    if not mirror_symmetry.is_revolution:
+        return estimate
+    if mirror_symmetry.is_sphere:
+        return replace(estimate, sigma=torch.full_like(estimate.sigma, torch.pi))
+    axis = torch.nn.functional.pad(mirror_symmetry.axis, (0, 1), value=torch.nan)
+    across = estimate.sigma[1:].clamp_max(UNOBSERVABLE_SIGMA)
+    return Observability(axis, torch.cat([estimate.sigma.new_full((1,), torch.pi), across]))

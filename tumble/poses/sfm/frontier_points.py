@@ -1,12 +1,12 @@
-"""What silhouettes say about poses: points where two of them touch one epipolar plane (frontier points).
+"""Frontier points: surface points where a plane through two camera centres is tangent to the object.
 
-A plane through two cameras that just touches the object touches it in one point, which both silhouettes show on their
-outlines (Cipolla and Giblin 2000, chapter 4). Every pair of frames has two such planes, so all pairs of frames bind
-each other, textured or not, near in time or not, and unlike matches they know nothing of shading or highlights. Between
-frames of 128 pixels with true poses the outlines' planes agree to a tenth of a pixel.
+Both silhouettes show such a point on their contours, where the epipolar plane is tangent to them (Cipolla and Giblin
+2000, chapter 4). Any two frames whose baseline misses the object have two such planes, one on each side of it. This
+constrains their relative pose without texture and however far apart in time they are, and unlike matches it does not
+depend on shading or highlights.
 
-For poses that are believed the touching pixels are found here and handed on as matches. When the poses move they slide
-along the outlines, to first order along the epipolar lines, which costs nothing.
+The tangent vertices are found for given poses and then treated as matches. As the poses change, the true tangent points
+slide along the contours, to first order along the epipolar lines, so that matches kept fixed add no first-order error.
 """
 
 from dataclasses import dataclass
@@ -20,141 +20,155 @@ from torch import Tensor
 from tumble.poses.sfm.tracks import Tracks
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
 
-CORNERS = 48
-"""Of the polygon around each silhouette."""
-CLEAR = 1.3
-"""Least distance of the line through two cameras from the object's centre, over the object's radius: closer lines may
-pierce it, and then no plane through them touches."""
-LEAST_TURN = 0.15
-"""Angle between two viewing directions from which their outlines say something [radians]."""
-BORDER = 2
-"""Pixels along the border of the picture and around unknown pixels where an outline may be cut off."""
-BAND = 3
-"""Widest band of unknown pixels along a silhouette that tells where it runs [pixels]; a hand is wider."""
+VERTICES = 48
+"""Number of vertices of each contour polygon."""
+MIN_BASELINE_DISTANCE = 1.3
+"""Minimum distance of the baseline from the object's centre [object radius].
+
+A closer baseline may pierce the object, which then has no tangent epipolar plane.
+"""
+MIN_VIEW_ANGLE = 0.15
+"""Minimum angle between the optical axes of two frames [radians]; closer views hardly constrain each other."""
+MARGIN = 2
+"""Distance to the image border or to an unknown pixel within which a contour may be truncated [pixels]."""
+MAX_BAND = 3
+"""Maximum width of a band of unknown pixels that follows a silhouette [pixels]; an occluding hand is wider."""
 
 
 @dataclass(frozen=True)
-class Outlines:
-    """Convex polygons around silhouettes."""
+class Contours:
+    """Convex hulls of the silhouettes of `c` frames, as polygons of `v` vertices."""
 
-    corners: Float[Tensor, "c v 2"]
-    """[pixels]"""
-    sure: Bool[Tensor, "c v"]
-    """Whether the object truly ends there."""
+    vertices: Float[Tensor, "c v 2"]
+    """Positions in the image [pixels]."""
+    reliable: Bool[Tensor, "c v"]
+    """Whether the object ends at the vertex, rather than being occluded or cut off by the image border."""
 
-    def __getitem__(self, frames: Tensor) -> "Outlines":
-        """Those of some frames."""
-        return Outlines(self.corners[frames], self.sure[frames])
+    def __getitem__(self, frames: Tensor) -> "Contours":
+        """The contours of some frames."""
+        return Contours(self.vertices[frames], self.reliable[frames])
 
 
 @dataclass(frozen=True)
-class Touch:
-    """Where `p` pairs of outlines touch common planes, above and below."""
+class EpipolarTangencies:
+    """Tangent epipolar planes of `p` pairs of frames, one on each side of the object."""
 
-    corner_i: Int64[Tensor, "p 2"]
-    corner_j: Int64[Tensor, "p 2"]
+    vertex_i: Int64[Tensor, "p 2"]
+    """Index of the tangent vertex in the first frame's contour."""
+    vertex_j: Int64[Tensor, "p 2"]
+    """Index of the tangent vertex in the second frame's contour."""
     gap: Float[Tensor, "p 2"]
-    """Distance between the two planes that each outline alone would touch [pixels]."""
-    good: Bool[Tensor, "p 2"]
-    """Whether poses and outlines allow to say so."""
+    """Signed distance at the object between the planes tangent to either contour, 0 for true poses [pixels]."""
+    valid: Bool[Tensor, "p 2"]
+    """Whether the two views are suitable and both tangent vertices are reliable."""
 
 
-def divided(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]:
-    """Masks whose narrow bands of unknown pixels between object and background are given to the nearer of the two.
+def fill_boundary_bands(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]:
+    """Masks whose narrow bands of unknown pixels between object and background are assigned to the nearer of the two.
 
-    Masks of films have such a band all along the silhouette, which runs in its middle: no loss should count those
-    pixels, yet they hide nothing.
+    The masks of a video have such a band along the whole silhouette, whose contour runs in the middle of the band.
+    Losses ignore these pixels, but they do not occlude the object.
     """
-    cut = []
+    filled = []
     for mask in masks.numpy():
-        to_object, to_background = (
+        object_distance, background_distance = (
             cv2.distanceTransform((mask != value).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
             for value in (OBJECT, BACKGROUND)
         )
         # Across a band of n pixels the two distances add up to n + 1.
-        band = (mask == UNKNOWN) & (to_object + to_background < BAND + 1.5)
-        nearer = np.where(to_object <= to_background, np.uint8(OBJECT), np.uint8(BACKGROUND))
-        cut.append(torch.from_numpy(np.where(band, nearer, mask)))
-    return torch.stack(cut)
+        band = (mask == UNKNOWN) & (object_distance + background_distance < MAX_BAND + 1.5)
+        nearer = np.where(object_distance <= background_distance, np.uint8(OBJECT), np.uint8(BACKGROUND))
+        filled.append(torch.from_numpy(np.where(band, nearer, mask)))
+    return torch.stack(filled)
 
 
-def outlines(capture: Capture) -> Outlines:
-    """The polygons of all frames; without sure corners where there is no object."""
+def convex_contours(capture: Capture) -> Contours:
+    """Contours of all frames; no vertex is reliable in a frame without the object."""
     height, width = capture.camera.height, capture.camera.width
-    corners, sure = [], []
+    vertices, reliable = [], []
     for mask in capture.masks.numpy():
         pixels = np.argwhere(mask == OBJECT)[:, [1, 0]].astype(np.int32)
         if len(pixels) < 3:
-            corners.append(torch.zeros(CORNERS, 2))
-            sure.append(torch.zeros(CORNERS, dtype=torch.bool))
+            vertices.append(torch.zeros(VERTICES, 2))
+            reliable.append(torch.zeros(VERTICES, dtype=torch.bool))
             continue
         hull: np.ndarray = np.asarray(cv2.convexHull(np.ascontiguousarray(pixels)))[:, 0]
-        hull = hull[np.linspace(0, len(hull) - 1, CORNERS).round().astype(int)]
-        kernel = np.ones((2 * BORDER + 1,) * 2, np.uint8)
-        wide: np.ndarray = np.asarray(cv2.dilate((mask == UNKNOWN).astype(np.uint8), kernel))
-        hidden = wide[hull[:, 1], hull[:, 0]] > 0
-        cut = ((hull < BORDER) | (hull >= np.array([width, height]) - BORDER)).any(1)
-        corners.append(torch.from_numpy(hull + 0.5).float())
-        sure.append(torch.from_numpy(~hidden & ~cut))
-    return Outlines(torch.stack(corners).double(), torch.stack(sure))
+        hull = hull[np.linspace(0, len(hull) - 1, VERTICES).round().astype(int)]
+        kernel = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
+        unknown: np.ndarray = np.asarray(cv2.dilate((mask == UNKNOWN).astype(np.uint8), kernel))
+        occluded = unknown[hull[:, 1], hull[:, 0]] > 0
+        cut_off = ((hull < MARGIN) | (hull >= np.array([width, height]) - MARGIN)).any(1)
+        vertices.append(torch.from_numpy(hull + 0.5).float())
+        reliable.append(torch.from_numpy(~occluded & ~cut_off))
+    return Contours(torch.stack(vertices).double(), torch.stack(reliable))
 
 
-def touch(
+def epipolar_tangencies(
     pose_i: tuple[Float[Tensor, "p 3 3"], Float[Tensor, "p 3"]],
     pose_j: tuple[Float[Tensor, "p 3 3"], Float[Tensor, "p 3"]],
-    outlines_i: Outlines,
-    outlines_j: Outlines,
+    contours_i: Contours,
+    contours_j: Contours,
     camera: Camera,
     *,
     radius: float,
-) -> Touch:
-    """The touching corners of pairs of frames.
+) -> EpipolarTangencies:
+    """Tangent epipolar planes of pairs of frames, and the contour vertices where they are tangent.
 
     Args:
-        pose_i: `R_cam_obj` and the object's origin in the camera frame, of the one frame of each pair.
-        pose_j: Of the other.
-        outlines_i: One per pair.
-        outlines_j: Likewise.
-        camera: Of all frames.
-        radius: Of the object, in the poses' unit.
+        pose_i: `R_cam_obj` and the object's origin in the camera frame [object's mean distance], for the first frame
+            of each pair.
+        pose_j: The same for the second frame of each pair.
+        contours_i: Contour of the first frame of each pair.
+        contours_j: Contour of the second frame of each pair.
+        camera: Camera of all frames.
+        radius: Object radius [object's mean distance].
     """
     centre_i, centre_j = (-torch.einsum("pji,pj->pi", R, t) for R, t in (pose_i, pose_j))
-    base = torch.nn.functional.normalize(centre_j - centre_i, dim=-1)
-    away = centre_i - (centre_i * base).sum(-1, keepdim=True) * base
-    distance = away.norm(dim=-1)
-    turn = (pose_i[0][:, 2] * pose_j[0][:, 2]).sum(-1).clamp(-1, 1).arccos()
-    good = (distance > CLEAR * radius) & (turn > LEAST_TURN)
-    away = away / distance.clamp_min(1e-9)[:, None]
-    frame = torch.stack([torch.linalg.cross(base, away), -away], -1)
+    baseline = torch.nn.functional.normalize(centre_j - centre_i, dim=-1)
+    offset = centre_i - (centre_i * baseline).sum(-1, keepdim=True) * baseline
+    distance = offset.norm(dim=-1)
+    view_angle = (pose_i[0][:, 2] * pose_j[0][:, 2]).sum(-1).clamp(-1, 1).arccos()
+    valid = (distance > MIN_BASELINE_DISTANCE * radius) & (view_angle > MIN_VIEW_ANGLE)
+    offset = offset / distance.clamp_min(1e-9)[:, None]
+    plane_axes = torch.stack([torch.linalg.cross(baseline, offset), -offset], -1)
     focal, principal = camera.fx_fy_cx_cy.double().split(2)
     angles = []
-    for (R, _), outline in ((pose_i, outlines_i), (pose_j, outlines_j)):
-        xy = (outline.corners - principal) / focal
-        # Angle of the plane through the base line and each ray, 0 towards the object's centre.
-        axes = R @ frame
+    for (R, _), contours in ((pose_i, contours_i), (pose_j, contours_j)):
+        xy = (contours.vertices - principal) / focal
+        # Angle of the epipolar plane of each vertex about the baseline; 0 is the plane through the object's centre.
+        axes = R @ plane_axes
         x = xy @ axes[:, :2] + axes[:, 2:]
         angles.append(torch.atan2(x[..., 0], x[..., 1]))
-    picks = [torch.stack([angle.argmax(1), angle.argmin(1)], 1) for angle in angles]
-    sure = outlines_i.sure.gather(1, picks[0]) & outlines_j.sure.gather(1, picks[1])
-    ends = [angle.gather(1, pick) for angle, pick in zip(angles, picks, strict=True)]
-    gap = (ends[0] - ends[1]) * (distance * focal.prod().sqrt())[:, None]
-    return Touch(picks[0], picks[1], gap, good[:, None] & sure)
+    extremes = [torch.stack([angle.argmax(1), angle.argmin(1)], 1) for angle in angles]
+    reliable = contours_i.reliable.gather(1, extremes[0]) & contours_j.reliable.gather(1, extremes[1])
+    extreme_angles = [angle.gather(1, extreme) for angle, extreme in zip(angles, extremes, strict=True)]
+    gap = (extreme_angles[0] - extreme_angles[1]) * (distance * focal.prod().sqrt())[:, None]
+    return EpipolarTangencies(extremes[0], extremes[1], gap, valid[:, None] & reliable)
 
 
-def frontier(
+def frontier_tracks(
     R: Float[Tensor, "c 3 3"],
     t: Float[Tensor, "c 3"],
     camera: Camera,
-    outline: Outlines,
+    contours: Contours,
     *,
     radius: float,
     pairs: Int64[Tensor, "p 2"],
 ) -> Tracks:
-    """The touching pixels of pairs of cameras as tracks of two observations each; `frame` counts the cameras."""
+    """Frontier points of pairs of frames, as tracks of two observations each.
+
+    Args:
+        R: `R_cam_obj` of all frames.
+        t: The object's origin in the camera frame [object's mean distance].
+        camera: Camera of all frames.
+        contours: Contours of all frames.
+        radius: Object radius [object's mean distance].
+        pairs: Indices into the frames; `Tracks.frame` has the same indices.
+    """
     i, j = pairs.T
-    found = touch((R[i], t[i]), (R[j], t[j]), outline[i], outline[j], camera, radius=radius)
-    frames = pairs[:, None].expand(-1, 2, -1)[found.good]
-    uv_i, uv_j = outline.corners[i[:, None], found.corner_i], outline.corners[j[:, None], found.corner_j]
-    places = torch.stack([uv_i, uv_j], 2)[found.good]
+    tangencies = epipolar_tangencies((R[i], t[i]), (R[j], t[j]), contours[i], contours[j], camera, radius=radius)
+    frames = pairs[:, None].expand(-1, 2, -1)[tangencies.valid]
+    uv_i, uv_j = contours.vertices[i[:, None], tangencies.vertex_i], contours.vertices[j[:, None], tangencies.vertex_j]
+    uv = torch.stack([uv_i, uv_j], 2)[tangencies.valid]
     point = torch.arange(len(frames)).repeat_interleave(2)
-    return Tracks(frames.reshape(-1), point, places.reshape(-1, 2))
+    return Tracks(frames.reshape(-1), point, uv.reshape(-1, 2))

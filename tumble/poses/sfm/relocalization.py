@@ -1,10 +1,12 @@
-"""A second look at single frames whose outline contradicts the others': many rotations are tried, the best is kept.
+"""Relocalization: a search over candidate rotations for frames whose contour contradicts those of other frames.
 
-The judge is the frontier (see `frontier`): outlines of all frames together leave a frame little freedom, whatever its
-texture. What is tried are the poses of the neighbours in time, turned about many axes.
+A pose is rated by its epipolar tangency gaps (see `frontier_points`). The contours of all other frames together leave
+a frame little freedom, whatever its texture. The candidates are the poses of the neighbouring frames, rotated about
+many axes, and the best of them are refined by Levenberg-Marquardt.
 
-Outlines do not tell a bottle's bottom from itself half a turn later. A film does: between two frames an object turns
-by degrees. Where poses *leap*, one side of the leap is wrong, however well it fits.
+Contours alone cannot exclude all wrong poses: a bottle seen from below has nearly the same contour after half a
+revolution. In a video, however, an object rotates by only a few degrees between frames. Where consecutive poses differ
+by much more (a pose jump), those on one side are wrong, however small their gaps.
 """
 
 from dataclasses import dataclass
@@ -14,142 +16,175 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, rowwise
-from tumble.poses.sfm.frontier_points import Outlines, touch
+from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
+from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
 from tumble.scene import Camera
 
-TURNS = (-0.35, -0.17, 0.17, 0.35)
-"""Angles tried about each of 13 axes [radians]."""
-KEPT = 6
-"""Hypotheses that are refined."""
-FEW = 10
-"""Planes below which a pose cannot be assessed."""
-HOLD = 10.0
-"""Weight of the origin's place against one pixel: it moves by a tenth of its distance at most."""
-STEP = 1e-4
-"""Of the difference quotients."""
-LEAP, PACE = 0.7, 0.2
-"""Turn from one frame to the next that no matcher survives, and what it may be in the long run [radians]."""
-RAGGED = 0.5
-"""Noise of a gap where one outline is compared with many: its own errors are the same in all [pixels]."""
-TURN, SHIFT = 0.15, 0.02
-"""Likewise, where outlines are asked what they know of a pose [radians, distance of the object]."""
+CANDIDATE_ANGLES = (-0.35, -0.17, 0.17, 0.35)
+"""Angles of the candidate rotations about each of 13 axes [radians]."""
+MAX_REFINED = 6
+"""Number of candidates that are refined, besides the current pose."""
+MIN_GAPS = 10
+"""Minimum number of valid gaps for a pose to be rated."""
+TRANSLATION_DAMPING = 10.0
+"""Damping of translation steps [pixels / object's mean distance]: a step of a tenth weighs as much as a pixel."""
+JACOBIAN_STEP = 1e-4
+"""Finite-difference step of `_jacobian` [radians; object's mean distance]."""
+POSE_JUMP = 0.7
+"""Rotation between consecutive frames that counts as a pose jump [radians]; matching fails well below it."""
+MAX_ROTATION_PER_FRAME = 0.2
+"""Maximum rotation per frame between frames that are further apart in time [radians]."""
+GAP_NOISE = 0.5
+"""Standard deviation of a gap [pixels]; large, because errors of a frame's contour are common to all its gaps."""
+ROTATION_STEP = 0.15
+"""Finite-difference step of rotations in `information` [radians]; wide, because contours are polygons."""
+TRANSLATION_STEP = 0.02
+"""Finite-difference step of translations in `information` [object's mean distance]."""
 
 Poses = tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]
-"""`R_cam_obj` and the object's origin, camera frame."""
+"""`R_cam_obj` and the object's origin in the camera frame [object's mean distance], for several frames."""
 Pose = tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]
+"""The same for one frame."""
 
 
 @dataclass(frozen=True)
-class Judge:
-    """What poses of one frame have to agree with: its outline and those of other frames."""
+class ContourConstraints:
+    """Epipolar tangency constraints between the contour of one frame and those of reference frames."""
 
-    others: Poses
-    own: Outlines
-    """Of the frame, one."""
-    outline: Outlines
-    """Of the others."""
+    reference_poses: Poses
+    contour: Contours
+    """Contour of the frame, as a batch of one."""
+    reference_contours: Contours
     camera: Camera
+    """Camera of all frames."""
     radius: float
-    """Of the object, in the poses' unit."""
+    """Object radius [object's mean distance]."""
 
     def gaps(self, R: Float[Tensor, "h 3 3"], t: Float[Tensor, "h 3"]) -> Float[Tensor, "h n"]:
-        """Distances between touching planes [pixels]; NaN where there are none."""
-        h, n = len(R), len(self.others[0])
-        mine = torch.arange(h).repeat_interleave(n)
-        theirs = torch.arange(n).repeat(h)
-        own = Outlines(self.own.corners.expand(h * n, -1, -1), self.own.sure.expand(h * n, -1))
-        others = (self.others[0][theirs], self.others[1][theirs])
-        found = touch((R[mine], t[mine]), others, own, self.outline[theirs], self.camera, radius=self.radius)
-        return torch.where(found.good, found.gap, torch.nan).reshape(h, 2 * n)
+        """Tangency gaps of `h` candidate poses, two per reference frame [pixels]; NaN where they are not valid."""
+        h, n = len(R), len(self.reference_poses[0])
+        candidate = torch.arange(h).repeat_interleave(n)
+        reference = torch.arange(n).repeat(h)
+        contour = Contours(self.contour.vertices.expand(h * n, -1, -1), self.contour.reliable.expand(h * n, -1))
+        reference_poses = (self.reference_poses[0][reference], self.reference_poses[1][reference])
+        tangencies = epipolar_tangencies(
+            (R[candidate], t[candidate]),
+            reference_poses,
+            contour,
+            self.reference_contours[reference],
+            self.camera,
+            radius=self.radius,
+        )
+        return torch.where(tangencies.valid, tangencies.gap, torch.nan).reshape(h, 2 * n)
 
 
-def cost(gaps: Float[Tensor, "h n"], scale: float) -> Float[Tensor, " h"]:
-    """Mean of Cauchy's loss; infinite where too little can be assessed."""
-    known = ~gaps.isnan()
-    loss = torch.log1p((torch.where(known, gaps, 0.0) / scale).square()).sum(1)
-    return torch.where(known.sum(1) < FEW, torch.inf, loss / known.sum(1).clamp_min(1))
+def robust_cost(gaps: Float[Tensor, "h n"], scale: float) -> Float[Tensor, " h"]:
+    """Mean Cauchy loss of each candidate's gaps; infinite where fewer than `MIN_GAPS` are valid.
+
+    Args:
+        gaps: Tangency gaps [pixels], NaN where not valid.
+        scale: Scale of the Cauchy loss [pixels].
+    """
+    valid = ~gaps.isnan()
+    loss = torch.log1p((torch.where(valid, gaps, 0.0) / scale).square()).sum(1)
+    return torch.where(valid.sum(1) < MIN_GAPS, torch.inf, loss / valid.sum(1).clamp_min(1))
 
 
-def hypotheses() -> Float[Tensor, "k 3 3"]:
-    """No turn, and turns about axes in 13 directions."""
+def candidate_rotations() -> Float[Tensor, "k 3 3"]:
+    """The identity, and rotations by `CANDIDATE_ANGLES` about axes in 13 directions."""
     axes = [axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if axis > (0.0, 0.0, 0.0)]
     unit = torch.nn.functional.normalize(torch.tensor(axes, dtype=torch.float64), dim=-1)
-    turns = torch.cat([torch.zeros(1, 3, dtype=torch.float64), *(angle * unit for angle in TURNS)])
-    return SO3.exp(turns).matrix()
+    omega = torch.cat([torch.zeros(1, 3, dtype=torch.float64), *(angle * unit for angle in CANDIDATE_ANGLES)])
+    return SO3.exp(omega).matrix()
 
 
-def unbroken(R: Float[Tensor, "t 3 3"], known: Bool[Tensor, " t"]) -> Bool[Tensor, " t"]:
-    """The most known frames that follow each other without a leap; of more in between, each may turn by PACE."""
-    frames = torch.nonzero(known)[:, 0]
-    turn = angle_between(SO3.from_matrix(R[frames][:, None]), SO3.from_matrix(R[frames]))
-    follows = turn < (PACE * (frames[:, None] - frames).abs()).clamp_min(LEAP)
-    length, before = [], []
+def longest_smooth_sequence(R: Float[Tensor, "t 3 3"], usable: Bool[Tensor, " t"]) -> Bool[Tensor, " t"]:
+    """Mask of the longest sequence of usable frames without a pose jump, by dynamic programming.
+
+    Frames may be skipped. Two successive frames of the sequence differ by less than `POSE_JUMP`, or by less than
+    `MAX_ROTATION_PER_FRAME` times their distance in frames where that is more.
+    """
+    frames = torch.nonzero(usable)[:, 0]
+    angle = angle_between(SO3.from_matrix(R[frames][:, None]), SO3.from_matrix(R[frames]))
+    follows = angle < (MAX_ROTATION_PER_FRAME * (frames[:, None] - frames).abs()).clamp_min(POSE_JUMP)
+    length, predecessor = [], []
     for k in range(len(frames)):
-        reached = [(length[i], i) for i in torch.nonzero(follows[k, :k])[:, 0].tolist()]
-        most, previous = max(reached, default=(0, -1))
-        length.append(most + 1)
-        before.append(previous)
-    found = torch.zeros_like(known)
+        candidates = [(length[i], i) for i in torch.nonzero(follows[k, :k])[:, 0].tolist()]
+        longest, previous = max(candidates, default=(0, -1))
+        length.append(longest + 1)
+        predecessor.append(previous)
+    chosen = torch.zeros_like(usable)
     k = length.index(max(length)) if length else -1
     while k >= 0:
-        found[frames[k]] = True
-        k = before[k]
-    return found
+        chosen[frames[k]] = True
+        k = predecessor[k]
+    return chosen
 
 
-def relocate(judge: Judge, R: Float[Tensor, "h 3 3"], t: Float[Tensor, "h 3"], *, scale: float) -> tuple[Pose, Tensor]:
-    """The best of some poses after refinement, and its cost; the first is always among those refined."""
-    rough = cost(judge.gaps(R, t), 3 * scale)
-    order = torch.cat([torch.zeros(1, dtype=torch.long), rough[1:].argsort()[:KEPT] + 1])
-    (R, t), final = _refine(judge, R[order], t[order], scale)
-    best = int(final.argmin())
-    return (R[best], t[best]), final[best]
+def relocalize(
+    constraints: ContourConstraints, R: Float[Tensor, "h 3 3"], t: Float[Tensor, "h 3"], *, scale: float
+) -> tuple[Pose, Tensor]:
+    """The pose of lowest robust cost after refinement of the best candidates, and its cost.
+
+    Args:
+        constraints: Contours and poses of the reference frames.
+        R: Rotations `R_cam_obj` of the candidates; the first candidate, the current pose, is always refined.
+        t: The object's origin in the camera frame for each candidate [object's mean distance].
+        scale: Scale of the Cauchy loss [pixels].
+    """
+    initial_cost = robust_cost(constraints.gaps(R, t), 3 * scale)
+    order = torch.cat([torch.zeros(1, dtype=torch.long), initial_cost[1:].argsort()[:MAX_REFINED] + 1])
+    (R, t), final_cost = _refine(constraints, R[order], t[order], scale)
+    best = int(final_cost.argmin())
+    return (R[best], t[best]), final_cost[best]
 
 
 def _refine(
-    judge: Judge, R: Tensor, t: Tensor, scale: float, steps: int = 8
+    constraints: ContourConstraints, R: Tensor, t: Tensor, scale: float, steps: int = 8
 ) -> tuple[tuple[Tensor, Tensor], Float[Tensor, " h"]]:
-    """Levenberg-Marquardt on all hypotheses side by side, Jacobians by difference quotients."""
-    hold = torch.diag(torch.tensor([0.0] * 3 + [HOLD**2] * 3, dtype=torch.float64))
+    """Candidates refined side by side by Levenberg-Marquardt with finite-difference Jacobians, and their costs."""
+    translation_damping = torch.diag(torch.tensor([0.0] * 3 + [TRANSLATION_DAMPING**2] * 3, dtype=torch.float64))
 
     def moved(pose: Poses, gaps: Tensor, damping: Tensor) -> Poses:
         R, t = pose
-        J = _jacobian(judge, R, t, gaps)
-        known = ~(gaps.isnan() | J.isnan().any(-1))
-        r, J = torch.where(known, gaps, 0.0), torch.where(known[..., None], J, 0.0)
-        w = known / (1 + (r / scale).square())
-        H = torch.einsum("ho,hoi,hoj->hij", w, J, J) + hold
+        J = _jacobian(constraints, R, t, gaps)
+        valid = ~(gaps.isnan() | J.isnan().any(-1))
+        r, J = torch.where(valid, gaps, 0.0), torch.where(valid[..., None], J, 0.0)
+        w = valid / (1 + (r / scale).square())
+        H = torch.einsum("ho,hoi,hoj->hij", w, J, J) + translation_damping
         g = torch.einsum("ho,hoi,ho->hi", w, J, r)
         H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-6)
         step = torch.linalg.solve(H, -g[..., None])[..., 0]
         return SO3.exp(step[:, :3].clamp(-0.2, 0.2)).matrix() @ R, t + step[:, 3:].clamp(-0.05, 0.05)
 
     def linearised(pose: Poses) -> Linearised:
-        gaps = judge.gaps(*pose)
-        return Linearised(cost(gaps, scale), gaps)
+        gaps = constraints.gaps(*pose)
+        return Linearised(robust_cost(gaps, scale), gaps)
 
     damping = Damping(start=1e-2, accepted=0.3, rejected=5.0)
-    pose, last = minimise((R, t), linearised, moved, rowwise, steps=steps, damping=damping)
+    pose, last = minimise((R, t), linearised, moved, select_rows, steps=steps, damping=damping)
     return pose, last.cost
 
 
-def information(judge: Judge, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> Float[Tensor, "6 6"]:
-    """Of a pose (turn, shift), from gaps of RAGGED pixels of noise [1 / radian^2 and so on].
+def information(
+    constraints: ContourConstraints, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]
+) -> Float[Tensor, "6 6"]:
+    """Fisher information of the gaps about a pose, as (rotation, translation) of the object in the camera frame.
 
-    By wide differences: outlines have corners, and the slope at one of them says little.
+    Units are those of inverse covariances [radians; object's mean distance]. Central differences are wide, because the
+    contours are polygons and derivatives at their vertices are not representative.
     """
     unit = torch.eye(3, dtype=torch.float64)
-    turns = SO3.exp(torch.cat([TURN * unit, -TURN * unit])).matrix()
-    turned = judge.gaps(turns @ R, t.expand(6, 3)) / TURN
-    shifted = judge.gaps(R.expand(6, 3, 3), t + SHIFT * torch.cat([unit, -unit])) / SHIFT
-    J = torch.cat([turned[:3] - turned[3:], shifted[:3] - shifted[3:]]).T / 2
+    rotations = SO3.exp(torch.cat([ROTATION_STEP * unit, -ROTATION_STEP * unit])).matrix()
+    rotated = constraints.gaps(rotations @ R, t.expand(6, 3)) / ROTATION_STEP
+    shifted = constraints.gaps(R.expand(6, 3, 3), t + TRANSLATION_STEP * torch.cat([unit, -unit])) / TRANSLATION_STEP
+    J = torch.cat([rotated[:3] - rotated[3:], shifted[:3] - shifted[3:]]).T / 2
     J = J[~J.isnan().any(-1)]
-    return J.mT @ J / RAGGED**2
+    return J.mT @ J / GAP_NOISE**2
 
 
-def _jacobian(judge: Judge, R: Tensor, t: Tensor, gaps: Tensor) -> Float[Tensor, "h n 6"]:
-    """Derivatives for a left turn of R and a shift of t."""
-    unit = STEP * torch.eye(3, dtype=torch.float64)
-    moved = [(SO3.exp(turn).matrix() @ R, t) for turn in unit] + [(R, t + shift) for shift in unit]
-    return torch.stack([(judge.gaps(*pose) - gaps) / STEP for pose in moved], -1)
+def _jacobian(constraints: ContourConstraints, R: Tensor, t: Tensor, gaps: Tensor) -> Float[Tensor, "h n 6"]:
+    """Derivatives of the gaps with respect to a left rotation of R and a shift of t, by forward differences."""
+    unit = JACOBIAN_STEP * torch.eye(3, dtype=torch.float64)
+    moved = [(SO3.exp(omega).matrix() @ R, t) for omega in unit] + [(R, t + shift) for shift in unit]
+    return torch.stack([(constraints.gaps(*pose) - gaps) / JACOBIAN_STEP for pose in moved], -1)

@@ -1,7 +1,8 @@
-"""Whether an object's silhouettes are those of a body that looks the same when it turns about an axis.
+"""Rotational symmetry of an object, detected from the mirror symmetry of its silhouettes.
 
-Seen from anywhere, a body of revolution is its own mirror image about the picture of its axis; a ball is about every
-line through its middle. Outlines then tell nothing of turns about that axis: only texture can.
+From every viewpoint, the silhouette of a body of revolution is mirror symmetric about the image of its axis; that of a
+sphere is mirror symmetric about every line through its centre. Rotations about such an axis do not change the
+silhouettes, so that they are observable from texture alone.
 """
 
 import math
@@ -15,95 +16,102 @@ from torch.nn.functional import grid_sample
 from tumble.scene import OBJECT, UNKNOWN
 
 GRID = 64
-"""Silhouettes are compared on a grid of this size."""
-LINES, FINE = 45, 9
-"""Lines through the middle that are tried, all 4 degrees, and half degrees about the best of them."""
-SAME = 0.95
-"""Overlap of a silhouette and its mirror image from which they are the same. Median over a capture: cans 0.96 to 0.98,
-on grainy films too (masks `frontier.divided`; bands left unknown add up to 0.06), a bottle 0.91 to 0.94, others 0.90
-and less."""
+"""Resolution at which silhouettes are compared with their mirror images."""
+COARSE_LINES = 45
+"""Number of mirror lines of the coarse search, 4 degrees apart."""
+FINE_LINES = 9
+"""Number of mirror lines of the fine search about the best coarse one, half a degree apart."""
+MIN_OVERLAP = 0.95
+"""Minimum intersection over union, median over frames, for silhouettes to count as mirror symmetric."""
 
 
 @dataclass(frozen=True)
-class Mirrors:
-    """How well each silhouette agrees with its mirror images."""
+class MirrorSymmetry:
+    """Overlap of each silhouette with its mirror images about lines through its centroid."""
 
     best: Float[Tensor, " t"]
-    """Intersection over union for the best line; 0 without an object."""
+    """Intersection over union for the best line; 0 where the object is not visible."""
     worst: Float[Tensor, " t"]
-    """For the worst line."""
-    line: Float[Tensor, " t"]
-    """Angle of the best line from the picture's first axis towards its second [radians]."""
-    width: Float[Tensor, "t 2"]
-    """How far the silhouette reaches across that line, and along it [pixels]."""
+    """Intersection over union for the worst line."""
+    line_angle: Float[Tensor, " t"]
+    """Angle of the best line, from the image's x axis towards its y axis [radians]."""
+    extent: Float[Tensor, "t 2"]
+    """Extent of the silhouette perpendicular to the best line, and along it [pixels]."""
 
     @property
-    def revolves(self) -> bool:
-        """Whether all silhouettes could be those of a body of revolution."""
-        return bool((self.best > 0).any()) and float(self.best[self.best > 0].median()) > SAME
+    def is_revolution(self) -> bool:
+        """Whether the silhouettes are compatible with a body of revolution."""
+        return bool((self.best > 0).any()) and float(self.best[self.best > 0].median()) > MIN_OVERLAP
 
     @property
-    def ball(self) -> bool:
-        """Whether they could be a ball's."""
-        return self.revolves and float(self.worst[self.best > 0].median()) > SAME
+    def is_sphere(self) -> bool:
+        """Whether the silhouettes are compatible with a sphere."""
+        return self.is_revolution and float(self.worst[self.best > 0].median()) > MIN_OVERLAP
 
     @property
     def axis(self) -> Float[Tensor, "2"]:
-        """Direction of the axis in the first picture with an object.
+        """Direction of the axis of revolution in the first image that shows the object, as a unit vector.
 
-        Side views of a can are also symmetric about the line across: the axis is the line across which the body is as
-        wide as in most pictures, which show its ends at different distances.
+        A side view of a can has two mirror lines, the image of the axis and the perpendicular to it. Most other views
+        have only the first, because foreshortening makes the two ends of the can look different. Of the two lines, the
+        axis is therefore the one for which the perpendicular extent is closer to the median over all frames.
         """
-        seen = self.best > 0
-        width = self.width[seen]
-        across = int((width[0] - width[:, 0].median()).abs().argmin())
-        angle = self.line[seen][0] + across * math.pi / 2
+        visible = self.best > 0
+        extent = self.extent[visible]
+        across = int((extent[0] - extent[:, 0].median()).abs().argmin())
+        angle = self.line_angle[visible][0] + across * math.pi / 2
         return torch.stack([angle.cos(), angle.sin()])
 
 
-def mirrors(masks: UInt8[Tensor, "t h w"]) -> Mirrors:
-    """Compare silhouettes with their mirror images; unknown pixels count for neither."""
-    pictures = torch.stack([_about_middle(mask) for mask in masks])
-    every = torch.arange(LINES) * (math.pi / LINES)
-    coarse = torch.stack([_overlap(pictures, angle.expand(len(masks))) for angle in every], 1)
-    near = every[coarse.argmax(1)] + torch.linspace(-0.5, 0.5, FINE)[:, None] * (math.pi / LINES)
-    fine = torch.stack([_overlap(pictures, angle) for angle in near])
+def mirror_symmetry(masks: UInt8[Tensor, "t h w"]) -> MirrorSymmetry:
+    """Compare every silhouette with its mirror images; unknown pixels and their mirror images are ignored."""
+    silhouettes = torch.stack([_centred(mask) for mask in masks])
+    all_angles = torch.arange(COARSE_LINES) * (math.pi / COARSE_LINES)
+    coarse = torch.stack([_overlap(silhouettes, angle.expand(len(masks))) for angle in all_angles], 1)
+    near = all_angles[coarse.argmax(1)] + torch.linspace(-0.5, 0.5, FINE_LINES)[:, None] * (math.pi / COARSE_LINES)
+    fine = torch.stack([_overlap(silhouettes, angle) for angle in near])
     best = fine.max(0)
-    line = near.gather(0, best.indices[None])[0]
-    width = torch.stack([_width(mask, angle) for mask, angle in zip(masks, line, strict=True)])
-    return Mirrors(best.values, coarse.min(1).values, line, width)
+    line_angle = near.gather(0, best.indices[None])[0]
+    extent = torch.stack([_extent(mask, angle) for mask, angle in zip(masks, line_angle, strict=True)])
+    return MirrorSymmetry(best.values, coarse.min(1).values, line_angle, extent)
 
 
-def _width(mask: UInt8[Tensor, "h w"], angle: Float[Tensor, ""]) -> Float[Tensor, "2"]:
-    at = torch.nonzero(mask == OBJECT).flip(-1).float()
-    if not len(at):
+def _extent(mask: UInt8[Tensor, "h w"], angle: Float[Tensor, ""]) -> Float[Tensor, "2"]:
+    """Extent of the object perpendicular to a line at this angle, and along it [pixels]."""
+    xy = torch.nonzero(mask == OBJECT).flip(-1).float()
+    if not len(xy):
         return torch.zeros(2)
-    ways = torch.stack([torch.stack([-angle.sin(), angle.cos()]), torch.stack([angle.cos(), angle.sin()])], 1)
-    return (at @ ways).amax(0) - (at @ ways).amin(0) + 1
+    axes = torch.stack([torch.stack([-angle.sin(), angle.cos()]), torch.stack([angle.cos(), angle.sin()])], 1)
+    return (xy @ axes).amax(0) - (xy @ axes).amin(0) + 1
 
 
-def _overlap(pictures: Float[Tensor, "t 2 g g"], angle: Float[Tensor, " t"]) -> Float[Tensor, " t"]:
-    """Intersection over union with the mirror images about lines at these angles."""
+def _overlap(silhouettes: Float[Tensor, "t 2 g g"], angle: Float[Tensor, " t"]) -> Float[Tensor, " t"]:
+    """Intersection over union of silhouettes with their mirror images, for one angle of the mirror line each.
+
+    Args:
+        silhouettes: Object and known pixels, centred (`_centred`).
+        angle: Angle of the mirror line of each silhouette [radians].
+    """
     c, s, zero = (2 * angle).cos(), (2 * angle).sin(), torch.zeros_like(angle)
     flip = torch.stack([torch.stack([c, s, zero], -1), torch.stack([s, -c, zero], -1)], 1)
-    where = torch.nn.functional.affine_grid(flip, list(pictures.shape), align_corners=False)
-    mirrored = grid_sample(pictures, where, align_corners=False)
-    known = pictures[:, 1] * mirrored[:, 1]
-    both = (torch.minimum(pictures[:, 0], mirrored[:, 0]) * known).sum((1, 2))
-    return both / (torch.maximum(pictures[:, 0], mirrored[:, 0]) * known).sum((1, 2)).clamp_min(1)
+    grid = torch.nn.functional.affine_grid(flip, list(silhouettes.shape), align_corners=False)
+    mirrored = grid_sample(silhouettes, grid, align_corners=False)
+    known = silhouettes[:, 1] * mirrored[:, 1]
+    intersection = (torch.minimum(silhouettes[:, 0], mirrored[:, 0]) * known).sum((1, 2))
+    return intersection / (torch.maximum(silhouettes[:, 0], mirrored[:, 0]) * known).sum((1, 2)).clamp_min(1)
 
 
-def _about_middle(mask: UInt8[Tensor, "h w"]) -> Float[Tensor, "2 g g"]:
-    """Object and known pixels about the object's centroid, as far as its farthest pixel."""
+def _centred(mask: UInt8[Tensor, "h w"]) -> Float[Tensor, "2 g g"]:
+    """Object and known pixels of a mask, resampled to a square about the object's centroid that contains the object."""
     inside: Bool[Tensor, "h w"] = mask == OBJECT
     if not bool(inside.any()):
         return torch.zeros(2, GRID, GRID)
-    at = torch.nonzero(inside).flip(-1).float() + 0.5
-    centre = at.mean(0)
-    reach = (at - centre).norm(dim=-1).max() + 1
+    xy = torch.nonzero(inside).flip(-1).float() + 0.5
+    centre = xy.mean(0)
+    radius = (xy - centre).norm(dim=-1).max() + 1
     size = torch.tensor([mask.shape[1], mask.shape[0]])
-    ticks = ((torch.arange(GRID) + 0.5) / GRID * 2 - 1) * reach
-    where = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1) + centre
+    ticks = ((torch.arange(GRID) + 0.5) / GRID * 2 - 1) * radius
+    grid = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1) + centre
     layers = torch.stack([inside.float(), (mask == UNKNOWN).float()])[None]
-    found = grid_sample(layers, (2 * where / size - 1)[None], align_corners=False)[0]
-    return torch.stack([found[0], 1 - found[1]])
+    resampled = grid_sample(layers, (2 * grid / size - 1)[None], align_corners=False)[0]
+    return torch.stack([resampled[0], 1 - resampled[1]])

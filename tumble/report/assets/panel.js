@@ -11,7 +11,7 @@
   try {
     renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
   } catch (error) {
-    say("This browser offers no WebGL, which the live view needs; the rest of the report does without.");
+    say("The live view needs WebGL, which this browser does not provide. The rest of the report works without it.");
     document.documentElement.dataset.panel = "no-webgl";
     return;
   }
@@ -54,13 +54,13 @@
   let reference = 0;
   const light = (buffer, name) => {
     const { data, width, height } = new THREE.HDRLoader().parse(buffer);
-    if (!width || width !== 2 * height) throw new Error(`a panorama is twice as wide as high, this is ${width} x ${height}`);
+    if (!width || width !== 2 * height) throw new Error(`a panorama must be twice as wide as high, this image is ${width} x ${height}`);
     const texture = new THREE.DataTexture(data, width, height);
     Object.assign(texture, { type: THREE.HalfFloatType, mapping: THREE.EquirectangularReflectionMapping,
       colorSpace: THREE.LinearSRGBColorSpace, minFilter: THREE.LinearFilter, magFilter: THREE.LinearFilter,
       flipY: true, generateMipmaps: false, needsUpdate: true });
     const mean = strength(data, width, height);
-    if (!(mean > 0)) throw new Error("this light is black");
+    if (!(mean > 0)) throw new Error("this panorama is black");
     reference ||= mean;
     scene.environment?.dispose();
     scene.environment = filter.fromEquirectangular(texture).texture;
@@ -86,7 +86,7 @@
   const take = async (file) => {
     if (!file) return;
     try {
-      if (!/\.hdr$/i.test(file.name)) throw new Error("a light is a Radiance .hdr file here");
+      if (!/\.hdr$/i.test(file.name)) throw new Error("only Radiance .hdr files can be used here");
       light(await file.arrayBuffer(), file.name);
       choose(null);
       at("dropped").textContent = file.name;

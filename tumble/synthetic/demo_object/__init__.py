@@ -1,6 +1,6 @@
-"""The demo's own object and lights, made by code alone: a small enamel coffee pot, a room and a sunset."""
+"""Procedural object and environment maps of the demo: a small enamel coffee pot, a room and a sunset."""
 
-from tumble.synthetic.demo_object.lights import LAMP, SUN, WINDOW, environment, other_environment
-from tumble.synthetic.demo_object.pot import write_object
+from tumble.synthetic.demo_object.lights import LAMP, SUN, WINDOW, room_environment, sunset_environment
+from tumble.synthetic.demo_object.pot import write_pot
 
-__all__ = ["LAMP", "SUN", "WINDOW", "environment", "other_environment", "write_object"]
+__all__ = ["LAMP", "SUN", "WINDOW", "room_environment", "sunset_environment", "write_pot"]

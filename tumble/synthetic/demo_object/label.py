@@ -1,6 +1,7 @@
-"""What is printed on the pot: base colour and roughness, painted with Pillow at the same time.
+"""Base colour and roughness textures of the pot, drawn with Pillow.
 
-Positions are pixels of a chart, x to the right and y down; an `Ink` has a colour and a roughness.
+Each chart of the texture atlas is drawn on a `Canvas`, whose shapes have an `Ink`: a colour and a roughness. Positions
+are pixels of the chart, x to the right and y down.
 """
 
 import math
@@ -10,17 +11,19 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-FINE = 2
-"""Charts are painted this many times finer than they are stored, and averaged."""
-DARKEST, BRIGHTEST = 57, 236
-"""Code values of the darkest and the brightest ink: 0.04 and 0.84 in linear albedo."""
+SUPERSAMPLING = 2
+"""Factor between the resolution at which charts are drawn and that at which they are stored; pixels are averaged."""
+DARKEST = 57
+"""sRGB code value of the darkest ink: linear albedo 0.04."""
+BRIGHTEST = 236
+"""sRGB code value of the brightest ink: linear albedo 0.84."""
 
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Ink:
-    """What one brush leaves behind."""
+    """Material of a drawn shape."""
 
     rgb: tuple[int, int, int]
     """sRGB code values, DARKEST to BRIGHTEST."""
@@ -41,86 +44,97 @@ SKY = Ink((150, 190, 196), 0.60)
 WOOD = Ink((164, 108, 68), 0.58)
 BARK = Ink((120, 74, 57), 0.66)
 BRIGHT = (CORAL, MUSTARD, CREAM, SKY, BLUSH)
+"""Inks of small ornaments on dark ground."""
 
 
 class Canvas:
-    """A chart being painted, its colour and its roughness in step. Its state is the paint, as in Pillow's images."""
+    """Colour and roughness images of one chart, drawn together; mutable, like the Pillow images that it holds."""
 
-    def __init__(self, width: int, height: int, ground: Ink) -> None:
-        size = (width * FINE, height * FINE)
+    def __init__(self, width: int, height: int, background: Ink) -> None:
+        size = (width * SUPERSAMPLING, height * SUPERSAMPLING)
         self.width, self.height = width, height
-        self._layers = (Image.new("RGB", size, ground.rgb), Image.new("L", size, _level(ground)))
+        self._layers = (Image.new("RGB", size, background.rgb), Image.new("L", size, _code(background)))
         self._brushes = tuple(ImageDraw.Draw(layer) for layer in self._layers)
 
     def polygon(self, points: list[Point], ink: Ink) -> None:
-        """A filled polygon."""
-        for brush, fill in zip(self._brushes, (ink.rgb, _level(ink)), strict=True):
-            brush.polygon([(FINE * x, FINE * y) for x, y in points], fill=fill)
+        """Draw a filled polygon."""
+        for brush, fill in zip(self._brushes, (ink.rgb, _code(ink)), strict=True):
+            brush.polygon([(SUPERSAMPLING * x, SUPERSAMPLING * y) for x, y in points], fill=fill)
 
     def box(self, left: float, top: float, right: float, bottom: float, ink: Ink, *, corner: float = 0) -> None:
-        """A filled rectangle with rounded corners."""
-        edges = [FINE * left, FINE * top, FINE * right - 1, FINE * bottom - 1]
-        for brush, fill in zip(self._brushes, (ink.rgb, _level(ink)), strict=True):
-            brush.rounded_rectangle(edges, FINE * corner, fill=fill)
+        """Draw a filled rectangle; `corner` is the radius of its rounded corners."""
+        edges = [
+            SUPERSAMPLING * left,
+            SUPERSAMPLING * top,
+            SUPERSAMPLING * right - 1,
+            SUPERSAMPLING * bottom - 1,
+        ]
+        for brush, fill in zip(self._brushes, (ink.rgb, _code(ink)), strict=True):
+            brush.rounded_rectangle(edges, SUPERSAMPLING * corner, fill=fill)
 
     def disc(self, x: float, y: float, radius: float, ink: Ink) -> None:
-        """A filled circle."""
+        """Draw a filled circle."""
         self.polygon([(x + radius * math.cos(a), y + radius * math.sin(a)) for a in _angles(48)], ink)
 
     def star(self, x: float, y: float, radius: float, ink: Ink, *, tips: int = 5, waist: float = 0.45) -> None:
-        """A filled star with one tip upwards."""
+        """Draw a filled star with one tip upwards; `waist` is the ratio of inner to outer radius."""
         radii = [radius, waist * radius] * tips
         corners = zip(radii, _angles(2 * tips), strict=True)
         self.polygon([(x + r * math.sin(a), y - r * math.cos(a)) for r, a in corners], ink)
 
     def leaf(self, x: float, y: float, length: float, angle: float, ink: Ink) -> None:
-        """A pointed leaf that grows from (x, y); angle 0 is upwards, growing clockwise [radians]."""
+        """Draw a pointed leaf with its base at (x, y); its angle is clockwise from upwards [radians]."""
         sides = [(t, 0.24 * math.sin(math.pi * t) ** 0.8) for t in np.linspace(0, 1, 12)]
-        outline = sides + [(t, -w) for t, w in reversed(sides)]
+        contour = sides + [(t, -w) for t, w in reversed(sides)]
         s, c = math.sin(angle), math.cos(angle)
-        self.polygon([(x + length * (t * s + w * c), y - length * (t * c - w * s)) for t, w in outline], ink)
+        self.polygon([(x + length * (t * s + w * c), y - length * (t * c - w * s)) for t, w in contour], ink)
 
-    def text(self, x: float, y: float, words: str, size: float, ink: Ink, *, bold: float = 0, turn: float = 0) -> None:
-        """Words centred on (x, y), drawn with a pen of width `bold`, turned clockwise by `turn` [radians]."""
-        font = ImageFont.load_default(size=size * FINE)
-        pen = round(bold * FINE)
-        left, top, right, bottom = font.getbbox(words, stroke_width=pen)
-        # The height of a capital, not of these words: lines of text keep their distance.
+    def text(
+        self, x: float, y: float, words: str, size: float, ink: Ink, *, bold: float = 0, rotation: float = 0
+    ) -> None:
+        """Draw words centred on (x, y), with strokes wider by `bold`, rotated clockwise by `rotation` [radians]."""
+        font = ImageFont.load_default(size=size * SUPERSAMPLING)
+        stroke = round(bold * SUPERSAMPLING)
+        left, top, right, bottom = font.getbbox(words, stroke_width=stroke)
+        # The height of a capital letter instead of that of the words: lines of text keep their distance.
         middle = (font.getbbox("H")[1] + font.getbbox("H")[3]) / 2
-        half = math.ceil(max(right - left, bottom - top) / 2 + size * FINE)
+        half = math.ceil(max(right - left, bottom - top) / 2 + size * SUPERSAMPLING)
         stencil = Image.new("L", (2 * half, 2 * half))
         corner = (half - (left + right) / 2, half - middle)
-        ImageDraw.Draw(stencil).text(corner, words, 255, font, stroke_width=pen)
-        stencil = stencil.rotate(-math.degrees(turn), Image.Resampling.BICUBIC)
-        place = (round(FINE * x) - half, round(FINE * y) - half)
-        for layer, fill in zip(self._layers, (ink.rgb, _level(ink)), strict=True):
-            layer.paste(fill, place, stencil)
+        ImageDraw.Draw(stencil).text(corner, words, 255, font, stroke_width=stroke)
+        stencil = stencil.rotate(-math.degrees(rotation), Image.Resampling.BICUBIC)
+        top_left = (round(SUPERSAMPLING * x) - half, round(SUPERSAMPLING * y) - half)
+        for layer, fill in zip(self._layers, (ink.rgb, _code(ink)), strict=True):
+            layer.paste(fill, top_left, stencil)
 
     def round_text(
         self, radius: float, words: str, size: float, ink: Ink, *, bold: float = 0, clockwise: bool = True
     ) -> None:
-        """Words spread over a whole circle around the middle; clockwise their feet point inwards, else outwards."""
+        """Draw words along a whole circle around the centre, with the feet of the letters inwards if clockwise, else
+        outwards."""
         sense = 1 if clockwise else -1
         for letter, angle in zip(words, _angles(len(words)), strict=True):
             x, y = radius * math.sin(angle), -sense * radius * math.cos(angle)
-            self.text(self.width / 2 + x, self.height / 2 + y, letter, size, ink, bold=bold, turn=sense * angle)
+            self.text(self.width / 2 + x, self.height / 2 + y, letter, size, ink, bold=bold, rotation=sense * angle)
 
     def textures(self) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 1"]]:
-        """Colour and roughness at the size of the chart."""
-        colour, roughness = (np.asarray(layer.reduce(FINE)) for layer in self._layers)
+        """Colour (sRGB) and roughness textures at the size of the chart."""
+        colour, roughness = (np.asarray(layer.reduce(SUPERSAMPLING)) for layer in self._layers)
         return colour.clip(DARKEST, BRIGHTEST), roughness[..., None]
 
 
-def _level(ink: Ink) -> int:
+def _code(ink: Ink) -> int:
+    """Roughness as an 8-bit code value."""
     return round(255 * ink.roughness)
 
 
 def _angles(n: int) -> list[float]:
+    """`n` equally spaced angles of a revolution, from 0 [radians]."""
     return [2 * math.pi * i / n for i in range(n)]
 
 
 def paint(name: str, width: int, height: int) -> Canvas:
-    """The print of one chart of the pot, by the chart's name."""
+    """Draw the textures of one chart of the pot, by the chart's name."""
     painters = {"body": _body, "lid": _lid, "base": _base, "spout": _spout, "handle": _handle, "knob": _knob}
     canvas = Canvas(width, height, GLOSS if name == "lid_under" else TEAL)
     if name in painters:
@@ -129,17 +143,17 @@ def paint(name: str, width: int, height: int) -> Canvas:
 
 
 def _body(canvas: Canvas) -> None:
-    """Around the pot: a landscape on the back, sprigs under the spout, the label in front, marks behind the handle."""
+    """The pot's wall: a landscape on the back, the label in front, sprigs around spout and handle, two friezes."""
     canvas.box(0, 0, canvas.width, canvas.height, CREAM)
     rng = np.random.default_rng(7)
     _sprigs(canvas, rng)
     _borders(canvas, rng)
     _landscape(canvas, 254, 149)
-    _front(canvas, 762, 149)
+    _label(canvas, 762, 149)
 
 
 def _borders(canvas: Canvas, rng: np.random.Generator) -> None:
-    """A frieze above and one below, no two stretches of them alike."""
+    """A frieze above and one below with random ornaments, so that they do not repeat around the pot."""
     canvas.box(0, 0, canvas.width, 46, TEAL)
     canvas.box(0, 46, canvas.width, 50, MUSTARD)
     canvas.box(0, 246, canvas.width, 250, CORAL)
@@ -172,7 +186,7 @@ def _sprigs(canvas: Canvas, rng: np.random.Generator) -> None:
 
 
 def _landscape(canvas: Canvas, x: float, y: float) -> None:
-    """A printed view: sun, two ranges of hills, firs and a tent, on matte ink."""
+    """A landscape centred on (x, y), mostly in matte inks: sun, two ranges of hills, firs and a tent."""
     left, top, right, bottom = x - 160, y - 84, x + 160, y + 82
     canvas.box(left - 5, top - 5, right + 5, bottom + 5, NIGHT, corner=12)
     canvas.box(left, top, right, bottom, SKY, corner=8)
@@ -194,8 +208,8 @@ def _landscape(canvas: Canvas, x: float, y: float) -> None:
         canvas.star(left + 16 + 23 * i, top + 46 + 7 * (i % 3), 2.5 + i % 3, PAPER, tips=4, waist=0.3)
 
 
-def _front(canvas: Canvas, x: float, y: float) -> None:
-    """The paper label: name, ornaments, colour bar, small print."""
+def _label(canvas: Canvas, x: float, y: float) -> None:
+    """A paper label centred on (x, y): name, ornaments, colour bar, small text."""
     left, top, right, bottom = x - 170, y - 86, x + 170, y + 84
     canvas.box(left - 4, top - 4, right + 4, bottom + 4, TEAL, corner=16)
     canvas.box(left, top, right, bottom, PAPER, corner=13)
@@ -219,7 +233,7 @@ def _front(canvas: Canvas, x: float, y: float) -> None:
 
 
 def _lid(canvas: Canvas) -> None:
-    """Glossy enamel with a sun of unequal rays and a motto around it."""
+    """Glossy enamel: a sun with unequal rays and a motto around it."""
     cx, cy = canvas.width / 2, canvas.height / 2
     canvas.box(0, 0, canvas.width, canvas.height, GLOSS)
     canvas.disc(cx, cy, 67, Ink(NIGHT.rgb, 0.2))
@@ -235,7 +249,7 @@ def _lid(canvas: Canvas) -> None:
 
 
 def _base(canvas: Canvas) -> None:
-    """The maker's mark underneath."""
+    """The underside: a maker's mark."""
     cx, cy = canvas.width / 2, canvas.height / 2
     canvas.box(0, 0, canvas.width, canvas.height, NIGHT)
     canvas.disc(cx, cy, 92, MUSTARD)
@@ -253,7 +267,7 @@ def _base(canvas: Canvas) -> None:
 
 
 def _spout(canvas: Canvas) -> None:
-    """Cream enamel, dark inside, a coral mouth, rings and dots further down."""
+    """The spout: dark inside, a coral mouth, and rings, dots and stars on teal enamel below."""
     canvas.box(0, 0, canvas.width, 22, Ink(BARK.rgb, 0.5))
     canvas.box(0, 22, canvas.width, 46, CORAL)
     canvas.box(0, 46, canvas.width, canvas.height, TEAL)
@@ -268,12 +282,12 @@ def _spout(canvas: Canvas) -> None:
 
 
 def _handle(canvas: Canvas) -> None:
-    """Wound with tape: chevrons of changing colour and width."""
+    """The handle: chevrons of changing colour and width, like wound tape."""
     canvas.box(0, 0, canvas.width, canvas.height, WOOD)
     middle, inks = canvas.width / 2, (CORAL, NIGHT, MUSTARD, CREAM, TEAL)
     y = -24.0
     for n, choice in enumerate((0, 1, 3, 2, 4, 0, 3, 1, 2, 0, 4, 3, 1, 0, 2, 4, 1, 3, 0, 2)):
-        # A chevron is as high at its left end as at its right: the pattern closes on itself at the seam.
+        # Both ends of a chevron are at the same height, so that the pattern closes at the seam.
         thick = 9 + (n * n) % 13
         tip = [(0, y), (middle, y + 24), (canvas.width, y)]
         canvas.polygon([*tip, *[(x, below + thick) for x, below in reversed(tip)]], inks[choice])
@@ -283,7 +297,7 @@ def _handle(canvas: Canvas) -> None:
 
 
 def _knob(canvas: Canvas) -> None:
-    """Turned wood with painted segments."""
+    """The lid's knob: wood with painted segments."""
     canvas.box(0, 0, canvas.width, canvas.height, WOOD)
     inks = (CORAL, BARK, CREAM, NIGHT, MUSTARD, BARK, TEAL)
     for i, ink in enumerate(inks):
