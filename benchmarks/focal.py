@@ -44,6 +44,8 @@ LOSS_SCALES = (1.0, 0.7, *[0.5] * 6)
 """Scale of the robust loss in each round of bundle adjustment at one of these focal lengths [pixels]."""
 COLUMNS = ["capture", "taken for", "start", "found", "median [deg]", "AUC_ATE [%]", "health says [deg]", "verdict"]
 """Keys of a row. "health says [deg]" and "verdict" are the rotation error and the rating that stage 1 reports."""
+TITLES = {"taken for": "focal length", "health says [deg]": "estimated error [deg]", "verdict": "rating"}
+"""Column titles that differ from the key of a row."""
 Row = dict[str, Any]
 
 
@@ -70,7 +72,7 @@ def main() -> None:
             curves.append(curve(case, capture, matches))
         files.write_json(arguments.out, {"command": COMMAND, "machine": machine(), "rows": rows, "curves": curves})
         arguments.out.with_suffix(".md").write_text(report(rows, curves))
-        print(table(COLUMNS, [row for row in rows if row["capture"] == case.name]), flush=True)
+        print(_score_table([row for row in rows if row["capture"] == case.name]), flush=True)
 
 
 def measure(
@@ -118,15 +120,23 @@ def report(rows: Sequence[Row], curves: Sequence[Row]) -> str:
         [
             "# Stage 1 with an unknown focal length\n",
             f"`{COMMAND}`; 72 frames of 128 x 128, the object at a distance of about four times its radius; "
-            "captures as in `poses.md`, on a 2-core x86_64 CPU. Start and found: initial and estimated focal "
-            "length over the true one.\n",
-            table(COLUMNS, rows),
+            "captures and other columns as in [poses.md](poses.md), on a 2-core x86_64 CPU. Focal length: `known`, "
+            "stage 1 does not change it, or `assumed`, stage 1 estimates it. Start and found: initial and final focal "
+            "length, divided by the true one. Objects without texture (`bare_can`, `grey_sphere`) have no scores.\n",
+            _score_table(rows),
             "## Loss over focal length\n",
-            "Loss per observation [pixels^2] after bundle adjustment of all frames at a fixed focal length, given over "
-            "the true one, from the poses estimated with the true one.\n",
+            "Loss per observation [pixels^2] after bundle adjustment of all frames with a fixed focal length, starting "
+            "from the poses that were estimated with the true one. Columns: focal length divided by the true one.\n",
             table(["capture", *map(str, CURVE)], curves),
         ]
     )
+
+
+def _score_table(rows: Sequence[Row]) -> str:
+    """The rows as a Markdown table; "a guess" is printed as "assumed"."""
+    values = {"a guess": "assumed"}
+    titled = [{TITLES.get(key, key): values.get(value, value) for key, value in row.items()} for row in rows]
+    return table([TITLES.get(key, key) for key in COLUMNS], titled)
 
 
 if __name__ == "__main__":

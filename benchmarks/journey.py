@@ -153,16 +153,18 @@ def report(rows: list[Row]) -> str:
         "rotation, median [deg]",
         "position [% of distance]",
         "frames",
-        "poses",
+        "pose rating",
     ]
     titles += ["run [min]", "score [min]", "memory [GiB]"]
     first = rows[0]
     lines = [
         f"# From a video to an asset: {first['frames']} frames of {first['side']} x {first['side']} pixels",
         "",
-        f"`{COMMAND}`: from `clip.mp4` and a box; the videos are rendered from the meshes and light maps in "
-        "`../shared/data` unless FOLDER has them. The focal length is given (`--fov`). One thread per run, on a "
-        "2-core x86_64 CPU shared with other work. Views of region shared, PSNR of sRGB values.",
+        f"`{COMMAND}`: the input is `clip.mp4` and a box around the object in its first frame; the videos are "
+        "rendered from the meshes and light maps in `../shared/data` unless FOLDER has them. The focal length is given "
+        "(`--fov`). One thread per run, on a 2-core x86_64 CPU shared with other work. Scores over the evaluation "
+        "views of region shared, PSNR of sRGB values ([metrics](../docs/metrics.md)). Position: root mean square error "
+        "divided by the mean camera distance. Frames: number of frames with a pose.",
         "",
         f"| {' | '.join(titles)} |",
         "|" + "---|" * len(titles),

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tumble import pipeline
 from tumble.engine import run
-from tumble.evaluation import CaptureWithTruth, Report, align_views, predict_views, read_with_truth, score
+from tumble.evaluation import CaptureWithTruth, Prediction, Report, align_views, predict_views, read_with_truth, score
 from tumble.export import PresetName, write_asset
 from tumble.io import files, load_plugin, video
 from tumble.maths import SE3, to_srgb8
@@ -137,8 +137,8 @@ def _scored(
 ) -> Report:
     """Render a prediction into `folder/prediction`, score it, and write the scores into `where`."""
     alignment, words = aligned
-    answer = predict_views(cfg, asset, known.capture, known.truth, alignment, names=names)
-    answer.write(folder / run.PREDICTION)
+    prediction: Prediction = predict_views(cfg, asset, known.capture, known.truth, alignment, names=names)
+    prediction.write(folder / run.PREDICTION)
     return score(folder / run.PREDICTION, known, where, notes=[words])
 
 

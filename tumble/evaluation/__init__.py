@@ -2,10 +2,12 @@
 
 from tumble.evaluation import metrics
 from tumble.evaluation.evaluate import CaptureWithTruth, Report, read_with_truth, score
+from tumble.evaluation.prediction import Prediction
 from tumble.evaluation.render_prediction import align_views, predict_views
 
 __all__ = [
     "CaptureWithTruth",
+    "Prediction",
     "Report",
     "align_views",
     "metrics",

@@ -6,7 +6,9 @@ module imports nothing heavy, so that `--help` is fast.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import arg
 
 MAX_SURVEY_FRAMES = 400
 """Maximum number of frames that the survey keeps; of a longer video every second, every fourth, ... frame is kept."""
@@ -20,30 +22,33 @@ MIN_FRAMES = 3
 class FootageOptions:
     """How a video or images are converted to a capture."""
 
-    box: tuple[int, int, int, int] | None = None
-    """Box around the object on frame `--at`: left, top, width, height [pixels]. Default: found by motion."""
-    click: tuple[int, int] | None = None
+    box: Annotated[tuple[int, int, int, int] | None, arg(metavar="X Y WIDTH HEIGHT", help_behavior_hint="")] = None
+    """Box around the object on frame `--at`: left, top, width, height [pixels]. Default: found by its motion."""
+    click: Annotated[tuple[int, int] | None, arg(metavar="X Y", help_behavior_hint="")] = None
     """A pixel on the object on frame `--at`, in place of a box: column, row [pixels]."""
     at: int = 0
     """Number of the frame to which the box or the click refers, counted from 0."""
-    masks: Path | None = None
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of mask images, one per frame in order or by name: white object, black background, grey unknown."""
     invert_masks: bool = False
     """Invert the masks: black object, white background."""
     segmenter: Literal["grabcut", "sam2", "sam3"] = "grabcut"
     """Segmentation method if there are no masks. sam2, sam3: packages that you install; they need `--weights`."""
-    weights: Path | None = None
+    weights: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Checkpoint file of sam2 or sam3."""
-    focal: float | None = None
+    focal: Annotated[float | None, arg(metavar="PIXELS", help_behavior_hint="")] = None
     """Focal length [pixels of the video]. Default: from `--fov` or the metadata, else estimated, starting at 28 mm."""
-    fov: float | None = None
+    fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Horizontal field of view of the video [degrees]; an alternative to `--focal`."""
-    fisheye: tuple[float, float, float, float] | None = None
-    """Fisheye lens: OpenCV's coefficients k1 k2 k3 k4; four zeros are an ideal equidistant lens."""
-    distortion: tuple[float, ...] | None = None
-    """Lens distortion, if the lens is not a fisheye: OpenCV's coefficients k1 k2 p1 p2 [k3]."""
+    fisheye: Annotated[tuple[float, float, float, float] | None, arg(metavar="K1 K2 K3 K4", help_behavior_hint="")] = (
+        None
+    )
+    """Fisheye lens: OpenCV's coefficients; four zeros are an ideal equidistant lens."""
+    distortion: Annotated[tuple[float, ...] | None, arg(metavar="K1 K2 P1 P2 [K3]", help_behavior_hint="")] = None
+    """Lens distortion, if the lens is not a fisheye: OpenCV's coefficients."""
     light: Literal["object", "camera"] = "object"
-    """Only for images with a COLMAP model: what the light was fixed to. object: the camera moved around the object.
+    """Only for images with a COLMAP model: what the light was fixed to.
+    object: the camera moved around the object.
     camera: the object was turned in front of the camera, and the background was masked. (Videos: always the camera.)"""
     frames: int = 144
     """Maximum number of frames in the capture."""

@@ -1,8 +1,10 @@
-"""Options of `tumble synth`. The module imports only the standard library, so that `--help` is fast."""
+"""Options of `tumble synth`. The module imports nothing heavy, so that `--help` is fast."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import arg
 
 Setting = Literal["dome", "turntable", "handheld"]
 
@@ -12,10 +14,10 @@ class SynthOptions:
     """How a synthetic capture is rendered."""
 
     env: str
-    """Environment map: a lat-long .hdr or .exr file (+y up), or "white" for uniform light."""
+    """Environment map: an equirectangular .hdr or .exr file (+y up), or "white" for uniform light."""
     setting: Setting = "handheld"
-    """Capture setting. dome: the camera moves around a still object; turntable: the object rotates about the vertical
-    in front of a still camera; handheld: it rotates about changing axes in front of a still camera."""
+    """dome: the camera moves around a still object. Camera and light are still in the other two:
+    turntable: the object rotates about the vertical; handheld: it rotates about changing axes."""
     views: int = 64
     """Number of training frames."""
     resolution: int = 128
@@ -30,21 +32,20 @@ class SynthOptions:
     """Maximum number of path segments: 2 is direct light only, each further one adds one interreflection."""
     material: Literal["original", "diffuse"] = "original"
     """original: base colour and roughness of the file as a dielectric (F0 = 0.04); diffuse: Lambertian."""
-    roughness: float | None = None
+    roughness: Annotated[float | None, arg(metavar="VALUE", help_behavior_hint="")] = None
     """Constant roughness that replaces the one of the file."""
     env_rotation: float = 0.0
     """Rotation of the environment map about the vertical [degrees]."""
     up: Literal["y", "z"] = "y"
     """Upward axis of the object file."""
     relight: tuple[str, ...] = ()
-    """Environment maps for relit ground truth, given like `env` and stored under the stem of the file name. They are
-    fixed to the object frame."""
+    """Environment maps of relit ground truth, given like `--env` and fixed to the object frame."""
     eval_shared: int = 12
     """Number of evaluation views 15 to 35 degrees above the horizon (region "shared")."""
     eval_sphere: int = 6
     """Number of evaluation views from all directions (region "sphere")."""
-    exposure: float | None = None
-    """Factor on the light; if None, it is set so that about one percent of the object's pixels saturate."""
+    exposure: Annotated[float | None, arg(metavar="FACTOR", help_behavior_hint="")] = None
+    """Factor on the light. Default: about one percent of the object's pixels saturate."""
     pose_free: bool = False
     """Omit the poses of the training frames from transforms.json; truth/poses.json still contains them."""
     video: bool = False
