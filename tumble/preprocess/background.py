@@ -1,4 +1,4 @@
-"""The static background of a video, the camera's exposure and white-balance drift, and camera shake.
+"""The static background of a video, and the camera's exposure and white-balance drift.
 
 The camera is on a tripod, so a pixel that nothing covers keeps its radiance, and changes there come from the camera:
 one *gain* per frame and colour channel, in linear light, relative to the median frame.
@@ -34,10 +34,8 @@ MIN_DIFFERENCE = 14.0
 """Lower limit of the difference that counts as different: above shadows and codec artefacts [code values]."""
 UNCLIPPED = (25, 235)
 """Range of the code values from which gains are estimated: neither noise nor clipped."""
-MIN_GRADIENT = 16
-"""Minimum Sobel gradient of a pixel whose optical flow is used: 2 code values per pixel."""
 MIN_USABLE_FRACTION = 0.01
-"""Minimum fraction of usable pixels of an image; with fewer, gain and shift are not estimated."""
+"""Minimum fraction of usable pixels of an image; with fewer, the gain is not estimated."""
 
 
 @dataclass(frozen=True)
@@ -127,32 +125,6 @@ def compensate(image: UInt8[np.ndarray, "h w 3"], gain: Float32[np.ndarray, "3"]
     table = to_srgb8(values).numpy()
     table[255] = 255
     return cv2.LUT(image, table[None])
-
-
-def background_shift(
-    images: UInt8[np.ndarray, "t h w 3"], reference: Background, covered: Bool[np.ndarray, "t h w"]
-) -> Float32[np.ndarray, " t"]:
-    """Displacement of the background per frame, as a fraction of the longer side; 0 if there is too little texture.
-
-    The median length of the optical flow over textured background. Pixels that the object covers in some frame count
-    only where the background is known, because elsewhere the reference may show the object itself.
-
-    Args:
-        reference: The background from which the shift is measured.
-        covered: Pixels that are not background in each frame.
-    """
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    gray = cv2.cvtColor(reference.image, cv2.COLOR_RGB2GRAY)
-    textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > MIN_GRADIENT
-    object_path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
-    textured &= reference.known | ~object_path
-    shift = np.zeros(len(images), np.float32)
-    for i, image in enumerate(images):
-        keep = textured & ~covered[i]
-        if keep.mean() >= MIN_USABLE_FRACTION:
-            flow = dis.calc(gray, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.zeros((*gray.shape, 2), np.float32))
-            shift[i] = np.median(np.linalg.norm(flow[keep], axis=-1)) / max(gray.shape)
-    return shift
 
 
 def channel_max(values: Shaped[np.ndarray, "*b 3"]) -> Shaped[np.ndarray, "*b"]:

@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 
 from tumble.io import video
-from tumble.preprocess import colmap_to_capture, keyframes, video_to_capture
+from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, video_to_capture
 from tumble.preprocess.box_picker import pick_box
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey_footage
 
-CAMERA_MOTION = (0.004, video_to_capture.MAX_CAMERA_MOTION)
+CAMERA_MOTION = (0.004, camera_motion.MAX_CAMERA_MOTION)
 """Limits of the motion of the background [longer side of the image]; 8 and 38 of 1920 pixels."""
 EDGE_BLUR = (1.2, 2.5)
 """Limits of the blur of the object's edges in the selected frames [pixels of the capture's images]."""
@@ -125,7 +125,7 @@ def _inputs(survey: Survey) -> Finding:
 
 
 def _camera(survey: Survey) -> Finding:
-    motion = video_to_capture.camera_motion(survey)
+    motion = camera_motion.camera_motion(survey)
     state = f"the background moves by {100 * motion:.1f} % of the image"
     return _finding("camera", _rate(motion, CAMERA_MOTION), state, "put the camera on a tripod: it must stand still")
 

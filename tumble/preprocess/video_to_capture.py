@@ -24,7 +24,8 @@ from tumble.datasets import capture_document, training_frame
 from tumble.io import BadFile, files, video
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.preprocess import keyframes, segmentation
-from tumble.preprocess.background import background_shift, compensate
+from tumble.preprocess.background import compensate
+from tumble.preprocess.camera_motion import refuse_camera_motion
 from tumble.preprocess.footage import FootageFrame, read_frames
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
 from tumble.preprocess.survey import MIN_GAIN_CHANGE, Survey, downsample_mask, survey_footage, undistort_frame
@@ -32,10 +33,6 @@ from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
 MIN_ROTATION = math.radians(40)
 """Minimum total rotation of the object; a smaller one cannot be reconstructed and may be noise [radians]."""
-MAX_CAMERA_MOTION = 0.02
-"""Maximum motion of the background; beyond it segmentation fails [longer side of the image] (38 of 1920 pixels)."""
-N_MOTION_SAMPLES = 12
-"""Number of frames on which the motion of the camera is measured."""
 MARGIN = 0.08
 """Margin of the crop window around the object's path, as a fraction of the path's longer side."""
 UNCERTAIN_EDGE = (220, 30, 30)
@@ -109,13 +106,8 @@ def select_frames(survey: Survey, options: FootageOptions) -> list[int]:
         BadFile: The camera moved, the object hardly rotates, or too few frames show it.
     """
     path, usable = survey.footage.path, survey.usable
-    if (
-        survey.seed is not None
-        and options.segmenter == "grabcut"
-        and (motion := camera_motion(survey)) > MAX_CAMERA_MOTION
-    ):
-        rule = f"was recorded by a moving camera: the background moves by {100 * motion:.1f} % of the image"
-        raise BadFile(path, rule, "put the camera on a tripod, or give --masks")
+    if survey.seed is not None and options.segmenter == "grabcut":
+        refuse_camera_motion(survey)
     if survey.footage.images:
         candidates = np.nonzero(usable)[0]
         spread = np.linspace(0, len(candidates) - 1, min(options.frames, len(candidates))).round().astype(int)
@@ -130,13 +122,6 @@ def select_frames(survey: Survey, options: FootageOptions) -> list[int]:
     if len(kept) < MIN_FRAMES:
         raise BadFile(path, f"shows the object on {len(kept)} usable frames only", "run `tumble check` to find out why")
     return kept
-
-
-def camera_motion(survey: Survey) -> float:
-    """Upper quartile over frames of the motion of the background, as a fraction of the image's longer side."""
-    samples = np.unique(np.linspace(0, len(survey.images) - 1, N_MOTION_SAMPLES).round().astype(int))
-    covered = survey.masks.labels[samples] != BACKGROUND
-    return float(np.percentile(background_shift(survey.images[samples], survey.background, covered), 75))
 
 
 def crop_window(survey: Survey, kept: list[int]) -> tuple[int, int, int, int]:

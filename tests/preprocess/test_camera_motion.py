@@ -1,0 +1,30 @@
+"""The motion of the camera is that of the background, whatever the object does."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.films import scene
+from tumble.preprocess.background import estimate_background, fill_unknown
+from tumble.preprocess.camera_motion import background_shift
+
+
+def test_background_shift_is_the_displacement_of_the_background() -> None:
+    wall = scene().background
+    big = cv2.resize(wall, (320, 260), interpolation=cv2.INTER_CUBIC)
+    pictures = np.stack([big, np.roll(big, 4, 1)])
+    shift = background_shift(pictures, estimate_background(pictures[:1]), np.zeros(pictures.shape[:3], bool))
+    assert shift[0] == pytest.approx(0, abs=1e-3)
+    # 4 of 320 pixels; the error of the flow is one or two tenths of a pixel.
+    assert shift[1] == pytest.approx(4 / 320, abs=0.2 * 4 / 320)
+
+
+def test_an_object_that_rotates_over_black_does_not_count_as_camera_motion() -> None:
+    """Over black the only texture is the object's, which is in the background where the object never moves away."""
+    video = scene()
+    pictures = np.where(video.object[..., None], video.pictures, np.uint8(0))
+    covered = video.object.copy()
+    background = estimate_background(pictures, covered)
+    # Where the mask is lost on some frames, the object is not covered.
+    covered[[4, 11]] = False
+    assert background_shift(pictures, fill_unknown(background, estimate_background(pictures)), covered).max() == 0

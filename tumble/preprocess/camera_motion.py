@@ -1,0 +1,63 @@
+"""Whether the camera moved, from the optical flow of the background; footage of a moving camera is refused."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from tumble.io import BadFile
+from tumble.preprocess.background import Background
+from tumble.preprocess.survey import Survey
+from tumble.scene import BACKGROUND
+
+MAX_CAMERA_MOTION = 0.02
+"""Maximum motion of the background; beyond it segmentation fails [longer side of the image] (38 of 1920 pixels)."""
+N_MOTION_SAMPLES = 12
+"""Number of frames on which the motion of the camera is measured."""
+MIN_GRADIENT = 16
+"""Minimum Sobel gradient of a pixel whose optical flow is used: 2 code values per pixel."""
+MIN_USABLE_FRACTION = 0.01
+"""Minimum fraction of usable pixels of an image; with fewer, its shift is not estimated."""
+
+
+def refuse_camera_motion(survey: Survey) -> None:
+    """Nothing if the camera stood still.
+
+    Raises:
+        BadFile: The background moves by more than `MAX_CAMERA_MOTION`.
+    """
+    if (motion := camera_motion(survey)) > MAX_CAMERA_MOTION:
+        rule = f"was recorded by a moving camera: the background moves by {100 * motion:.1f} % of the image"
+        raise BadFile(survey.footage.path, rule, "put the camera on a tripod, or give --masks")
+
+
+def camera_motion(survey: Survey) -> float:
+    """Upper quartile over frames of the motion of the background, as a fraction of the image's longer side."""
+    samples = np.unique(np.linspace(0, len(survey.images) - 1, N_MOTION_SAMPLES).round().astype(int))
+    covered = survey.masks.labels[samples] != BACKGROUND
+    return float(np.percentile(background_shift(survey.images[samples], survey.background, covered), 75))
+
+
+def background_shift(
+    images: UInt8[np.ndarray, "t h w 3"], reference: Background, covered: Bool[np.ndarray, "t h w"]
+) -> Float32[np.ndarray, " t"]:
+    """Displacement of the background per frame, as a fraction of the longer side; 0 if there is too little texture.
+
+    The median length of the optical flow over textured background. Pixels that the object covers in some frame count
+    only where the background is known, because elsewhere the reference may show the object itself.
+
+    Args:
+        reference: The background from which the shift is measured.
+        covered: Pixels that are not background in each frame.
+    """
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    gray = cv2.cvtColor(reference.image, cv2.COLOR_RGB2GRAY)
+    textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > MIN_GRADIENT
+    object_path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
+    textured &= reference.known | ~object_path
+    shift = np.zeros(len(images), np.float32)
+    for i, image in enumerate(images):
+        keep = textured & ~covered[i]
+        if keep.mean() >= MIN_USABLE_FRACTION:
+            flow = dis.calc(gray, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.zeros((*gray.shape, 2), np.float32))
+            shift[i] = np.median(np.linalg.norm(flow[keep], axis=-1)) / max(gray.shape)
+    return shift
