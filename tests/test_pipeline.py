@@ -232,7 +232,7 @@ def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monke
 def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Path, tmp_path: Path) -> None:
     """A film of eight frames of which the second to last and the third were kept, and one that the capture lacks."""
     kept = {"0000.png": 6, "0001.png": 2, "0002.png": 8}
-    files.write_json(tmp_path / runs.POSES, kept)
+    files.write_json(tmp_path / runs.POSES, dict.fromkeys(kept, np.eye(4).tolist()))
     known = folder.load(capture)
     assert actions.source_names(tmp_path, known) == tuple(kept)
     said = [{"name": name, "source_frame": number} for name, number in kept.items()]

@@ -23,7 +23,7 @@ from tumble.evaluation import CaptureWithTruth, Prediction, Report, align_views,
 from tumble.export import PresetName, write_asset
 from tumble.io import files, load_plugin, video
 from tumble.maths import SE3, to_srgb8
-from tumble.preprocess import PROVENANCE, FootageOptions, pick_box
+from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
 from tumble.rendering import relight as relighting
@@ -222,24 +222,24 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
 def _focal_ratio(out: Path, asset: Asset, capture: Capture) -> float:
     """Ratio of the capture's focal length to the run's, in the same pixels; 1 if the run's was given by the user."""
     focal, _, cx, _ = asset.camera.fx_fy_cx_cy.tolist()
-    whole, note = asset.camera.width, out / run.CAPTURE / PROVENANCE
-    if note.is_file():
-        said = files.read_json(note)
-        if said.get("focal_source") != "guess":
+    whole, made = asset.camera.width, read_provenance(out / run.CAPTURE)
+    if made is not None:
+        if made.focal_source != "guess" or made.window_top_left_height_width is None:
             return 1.0
         # The principal point is the centre of the video; the run's images are a window of it.
-        _, left, _, width = said["window_top_left_height_width"]
+        _, left, _, width = made.window_top_left_height_width
         whole = 2 * (cx + left * asset.camera.width / width)
     return float(capture.camera.fx_fy_cx_cy[0]) / (focal * capture.camera.width / whole)
 
 
 def source_names(out: Path, capture: Capture) -> tuple[str, ...]:
     """Names in a capture of the frames of a run, in order; frames of a video are identified by their numbers."""
-    names, note = tuple(files.read_json(out / run.POSES)), out / run.CAPTURE / PROVENANCE
-    if not note.is_file():
+    names, made = tuple(run.frame_names(out)), read_provenance(out / run.CAPTURE)
+    if made is None:
         return names
-    numbers = {said["name"]: said.get("source_frame", len(capture)) for said in files.read_json(note)["frames"]}
-    return tuple(capture.names[i] if (i := numbers.get(name, len(capture))) < len(capture) else name for name in names)
+    numbers = {frame.name: frame.source_frame for frame in made.frames}
+    known = range(len(capture))
+    return tuple(capture.names[i] if (i := numbers.get(name)) in known and i is not None else name for name in names)
 
 
 def relight_run(out: Path, env: Path, images: Path | None = None, *, fast: bool, exposure: float = 0.0) -> Path:
@@ -269,7 +269,7 @@ def _relit_folder(out: Path, env: Path) -> Path:
     for number in itertools.count(1):
         folder = out / run.RELIT / (env.stem if number == 1 else f"{env.stem}-{number}")
         note = folder / LIGHT_FILE
-        if not note.is_file() or files.read_json(note).get("sha256") == content:
+        if not note.is_file() or files.read_json(note, dict[str, Any]).get("sha256") == content:
             files.write_json(note, {"light": str(env.resolve()), "sha256": content})
             return folder
     raise AssertionError("unreachable")
@@ -310,9 +310,11 @@ def export_run(out: Path, folder: Path | None, preset: PresetName, scale_mm: flo
     if scale_mm is not None and not 0 < scale_mm < 1e6:
         raise ValueError(f"--scale-mm is out of range: {scale_mm:g}; give millimetres above 0")
     folder = folder or out / run.EXPORT / preset
-    return export_asset(finished(out), folder, preset, names=list(files.read_json(out / run.POSES)), scale_mm=scale_mm)
+    asset = finished(out)
+    names = run.frame_names(out, len(asset.trajectory))
+    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm)
 
 
 def _relighting(out: Path) -> relighting.Config:
     """The relighting settings of the run's recipe."""
-    return relighting.Config(**run.recipe(out)["relight"])
+    return run.settings(out, "relight", relighting.Config)

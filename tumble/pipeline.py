@@ -19,7 +19,7 @@ from tumble.io import BadFile, files, tree
 from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
-from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, footage_fingerprint, input_kind, to_capture
+from tumble.preprocess import FOOTAGE, FootageOptions, footage_fingerprint, input_kind, read_provenance, to_capture
 from tumble.recipes import DRAFT, Recipe
 from tumble.scene import Asset, Capture, Trajectory, content_key
 
@@ -70,9 +70,8 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
     with run.exclusive_access(out):
         if not made.exists():
             return to_capture(path, made, options)
-    note = made / PROVENANCE
-    found, wanted = files.read_json(note) if note.exists() else {}, footage_fingerprint(path, options)
-    different = [line for name in wanted for line in run.differences(found.get(name), wanted[name], name)]
+    found, wanted = read_provenance(made), footage_fingerprint(path, options)
+    different = [line for name in wanted for line in run.differences(getattr(found, name, None), wanted[name], name)]
     if different:
         rule = f"holds a capture of other footage or made with other options: {'; '.join(different)}"
         raise BadFile(out, rule, "choose another folder with -o, or remove this one")

@@ -96,6 +96,6 @@ def test_errors_name_files_that_are_not_videos(tmp_path: Path) -> None:
 
 def test_frames_over_the_size_limit_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     encode(tmp_path / "x.mp4", [QUARTERS])
-    monkeypatch.setattr("tumble.io.files.MAX_PIXELS", 1000)
+    monkeypatch.setattr("tumble.io.limits.MAX_PIXELS", 1000)
     with pytest.raises(BadFile, match="96 x 64 pixels, over the limit of 1000"):
         next(video.timed_frames(tmp_path / "x.mp4"))

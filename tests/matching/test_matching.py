@@ -248,7 +248,7 @@ def test_the_error_of_a_damaged_cache_names_the_fix(tmp_path) -> None:
     match_pairs(views, [(0, 1)], "dis", cache=tmp_path)
     (path,) = tmp_path.iterdir()
     path.write_bytes(b"no tensors")
-    with pytest.raises(BadFile, match="delete it"):
+    with pytest.raises(BadFile, match="remove it"):
         match_pairs(views, [(0, 1)], "dis", cache=tmp_path)
     safetensors.torch.save_file({"uv_i": torch.zeros(1, 2)}, path)
     with pytest.raises(BadFile, match="is not a match"):

@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
-import safetensors
+import msgspec
 import safetensors.torch
 import torch
 from jaxtyping import UInt8
@@ -175,7 +175,7 @@ def peek(path: Path) -> tuple[int, dict[str, Tensor]]:
         BadFile: The file is not a checkpoint.
     """
     about, tensors = _read(path)
-    return about["step"], {
+    return about.step, {
         name.removeprefix("params/"): value for name, value in tensors.items() if name.startswith("params/")
     }
 
@@ -227,6 +227,14 @@ def _write_preview(stage: Stage, cfg: Any, inputs: Any, state: State, path: Path
 # Checkpoints ----------------------------------------------------------------------------------------------------------
 
 
+class _SavedState(msgspec.Struct, frozen=True):
+    """The part of a checkpoint that is no tensor."""
+
+    key: str
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    seconds: float
+
+
 def _parts(state: State) -> dict[str, dict[str, Tensor]]:
     """The tensors of a state, by part and by name."""
     moments = optim.pack(state.optimizer) if state.optimizer else {}
@@ -245,7 +253,7 @@ def _save(state: State, path: Path, key: str, seconds: float) -> None:
     tensors = {f"{part}/{name}": x for part, named in _parts(state).items() for name, x in named.items()}
     tensors["rng"] = state.rng.get_state()
     owned = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
-    about = {"key": key, "step": state.step, "seconds": seconds}
+    about = {"key": key, "step": state.step, "seconds": seconds}  # a `_SavedState`
     data = safetensors.torch.save(owned, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
     files.write_atomically(path, lambda partial: partial.write_bytes(data))
 
@@ -255,7 +263,7 @@ def _restore(state: State, path: Path, key: str) -> float:
     if not path.exists():
         return 0.0
     about, tensors = _read(path)
-    if about["key"] != key:
+    if about.key != key:
         return 0.0
     parts: dict[str, dict[str, Tensor]] = {"params": {}, "optimizer": {}, "memory": {}}
     for name, value in tensors.items():
@@ -270,21 +278,20 @@ def _restore(state: State, path: Path, key: str) -> float:
         state.params = optim.overwrite(state.params, state.optimizer, params)
         if state.optimizer:
             optim.unpack(state.optimizer, parts["optimizer"])
-    except (KeyError, ValueError) as error:
+        state.rng.set_state(tensors["rng"])
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
         raise BadFile(path, f"does not match this stage: {error}", "remove it to restart the stage") from None
     state.memory = {name: x.to(devices.get(name, default), copy=True) for name, x in parts["memory"].items()}
-    state.rng.set_state(tensors["rng"])
-    state.step = about["step"]
-    return about["seconds"]
+    state.step = about.step
+    return about.seconds
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read(path: Path) -> tuple[_SavedState, dict[str, Tensor]]:
     try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {})["state"])
-            return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (safetensors.SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
-        raise BadFile(path, f"is not a checkpoint: {error}", "remove it to restart the stage") from None
+        header, tensors = tree.read_tensors(path)
+        return files.parse_json(path, header.get("state", ""), _SavedState), tensors
+    except BadFile as error:
+        raise BadFile(path, f"is not a checkpoint: {error.rule}", "remove it to restart the stage") from None
 
 
 # Interrupts and progress ----------------------------------------------------------------------------------------------

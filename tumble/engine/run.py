@@ -18,8 +18,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Annotated, Any, NotRequired, TypedDict, TypeVar
 
+import msgspec
 import torch
 from torch import Tensor
 
@@ -72,6 +73,37 @@ IGNORED_PACKAGES = tuple(f"{__name__.partition('.')[0]}.{name}" for name in ("en
 """Subpackages whose constants affect no result, only timing and files."""
 MAX_CHECKPOINTS = 20
 """Approximate maximum number of checkpoints per stage; on a GPU one save takes as long as hundreds of steps."""
+
+
+WRONG_FOLDER = "choose another folder with -o"
+"""Fix that errors suggest for a folder that holds something else."""
+
+
+class _CaptureRecord(TypedDict):
+    """ "capture" of `recipe.json`."""
+
+    path: str
+    content: NotRequired[str]
+
+
+class _RunRecord(TypedDict):
+    """The content of `recipe.json`."""
+
+    capture: _CaptureRecord
+    recipe: dict[str, Any]
+    format: NotRequired[int]
+
+
+class _LogRecord(TypedDict, total=False):
+    """Entries of a line of the log that other rooms read."""
+
+    name: str
+    event: str
+    seconds: float
+    step: int
+    of: int
+    eta: float
+    metrics: dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -203,11 +235,39 @@ def recipe(path: Path) -> dict[str, Any]:
     return _document(path)["recipe"]
 
 
-def _document(path: Path, *, of_any_format: bool = False) -> dict[str, Any]:
+def settings(path: Path, part: str, cls: type[T]) -> T:
+    """One part of the settings of a run, such as "relight", as its dataclass.
+
+    Raises:
+        BadFile: As for `recipe`, or the part does not match the dataclass.
+    """
+    try:
+        return msgspec.convert(recipe(path).get(part), cls)
+    except msgspec.ValidationError as error:
+        raise BadFile(path / RECIPE, f'"recipe.{part}": {files.violated_rule(error)}', WRONG_FOLDER) from None
+
+
+def frame_names(path: Path, count: int | None = None) -> list[str]:
+    """File names of the frames of a finished run, in order.
+
+    Args:
+        count: Number of poses in the run's asset, if it is known.
+
+    Raises:
+        BadFile: `poses.json` is damaged, or holds another number of frames.
+    """
+    names = list(files.read_json(path / POSES, dict[str, list[Annotated[list[float], msgspec.Meta(max_length=4)]]]))
+    if count is not None and len(names) != count:
+        raise BadFile(path / POSES, f"holds {len(names)} frames, the asset {count}", "repeat the command that made it")
+    return names
+
+
+def _document(path: Path, *, of_any_format: bool = False) -> _RunRecord:
     """The content of `recipe.json`."""
-    document = files.read_json(path / RECIPE)
-    if not isinstance(document, dict) or not {"capture", "recipe"} <= document.keys():
-        raise BadFile(path / RECIPE, "is not the recipe of a run", "choose another folder with -o")
+    try:
+        document = files.read_json(path / RECIPE, _RunRecord)
+    except BadFile as error:
+        raise BadFile(path / RECIPE, f"is not the recipe of a run: {error.rule}", WRONG_FOLDER) from None
     if document.get("format") != FORMAT and not of_any_format:
         rule = f"is a run of format {document.get('format', 1)}, made by another version; this version reads {FORMAT}"
         raise BadFile(path, rule, "run the capture again, into another folder with -o")
@@ -241,7 +301,7 @@ def _require_run_folder(path: Path) -> None:
     names = [p.name for p in path.iterdir()]
     others = [name for name in names if name not in (CAPTURE, LOCK) and not name.startswith(files.PARTIAL_PREFIX)]
     if others and not (path / RECIPE).is_file():
-        raise BadFile(path, "exists and is not a run directory", "choose another folder with -o")
+        raise BadFile(path, "exists and is not a run directory", WRONG_FOLDER)
 
 
 def stage(
@@ -362,13 +422,20 @@ def log(run: Run, record: dict[str, Any]) -> None:
 
 
 def log_records(path: Path) -> list[dict[str, Any]]:
-    """The records in the log of a run directory, without lines that a killed process left incomplete."""
+    """The records in the log of a run directory, without damaged and incomplete lines.
+
+    A record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
+    """
     lines = (path / LOG).read_text("utf-8", errors="replace").splitlines() if (path / LOG).is_file() else []
     records = []
     for line in lines:
-        with contextlib.suppress(json.JSONDecodeError):
-            records.append(json.loads(line))
-    return [record for record in records if isinstance(record, dict)]
+        with contextlib.suppress(ValueError, RecursionError):
+            record = json.loads(line)
+            msgspec.convert(record, _LogRecord)
+            needed = {"name", "of", "eta", "metrics"} if "step" in record else {"name", "seconds"}
+            if needed <= record.keys() or not ("step" in record or record.get("event") == "done"):
+                records.append(record)
+    return records
 
 
 # Folder of a stage ----------------------------------------------------------------------------------------------------
@@ -378,8 +445,7 @@ def _is_done(folder: Path, own_key: str) -> bool:
     """Whether the folder of a stage holds an output with this key."""
     if not ((folder / OUT).is_file() and (folder / DONE).is_file()):
         return False
-    about = files.read_json(folder / DONE)
-    return isinstance(about, dict) and about.get("key") == own_key
+    return files.read_json(folder / DONE, dict[str, Any]).get("key") == own_key
 
 
 def _store(output: Any, folder: Path, about: dict[str, Any]) -> None:

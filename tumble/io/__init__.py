@@ -3,13 +3,14 @@
 Every file is written atomically. Every reader raises `BadFile` with the rule that the file breaks and the fix.
 """
 
-from tumble.io import files, tree, video, weights
-from tumble.io.files import BadFile
+from tumble.io import files, limits, tree, video, weights
+from tumble.io.errors import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
 
 __all__ = [
     "BadFile",
     "files",
+    "limits",
     "load_plugin",
     "plugin_names",
     "tree",

@@ -2,8 +2,8 @@
 
 *Code values* are 8-bit numbers as a file stores them (sRGB for photos); *radiance* is linear float32. Writers are
 atomic: they fill a *partial* file, whose name holds the number of the writing process, and rename it when it is
-complete. Readers raise `BadFile` with the file, the rule it breaks and the fix. They check the size of an image before
-decoding its pixels and reject more than `MAX_PIXELS`.
+complete. Readers raise `BadFile` with the file, the rule it breaks and the fix. They check the stated size of a file
+against `limits` before decoding it. Documents are parsed and validated at once, by msgspec.
 """
 
 import contextlib
@@ -11,44 +11,50 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
+import struct
 import tempfile
+import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
+import Imath
+import msgspec
 import numpy as np
 import OpenEXR
 import safetensors
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-MAX_PIXELS = 1 << 26
-"""Largest image that is read [pixels]: 64 megapixels, an 8k x 8k environment map. Larger ones are errors or attacks."""
+from tumble.io import limits
+from tumble.io.errors import BadFile, WriteError
+
+T = TypeVar("T")
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
+"""Formats of 8-bit images that are read; others that Pillow knows are rare, and some of them run programs."""
+EXR_CHANNELS = (("R", "G", "B"), ("Y",), ("V",))
+"""Channels of an OpenEXR file that are read: the first of these sets that it has."""
 PARTIAL_PREFIX = ".partial-"
 """Start of the name of an incomplete file or folder; the number of the writing process follows."""
-
-
-class BadFile(ValueError):
-    """Error for a file that breaks a rule of its format; the message holds the file, the rule and the fix."""
-
-    def __init__(self, path: Path, rule: str, fix: str = "") -> None:
-        super().__init__(f"{path}: {rule}" + (f" ({fix})" if fix else ""))
-
-
-class WriteError(OSError):
-    """Error for a file that could not be written; the message holds the file, the reason and the fix."""
 
 
 def path_inside(root: Path, name: str) -> Path:
     """Path of the file `name` in the folder `root`.
 
     Raises:
-        BadFile: The name points outside the folder (an absolute path, `..`, or a link).
+        BadFile: The name points outside the folder (an absolute path, `..`, or a link), or no file can have it.
     """
     path = root / name
-    if Path(name).is_absolute() or not path.resolve().is_relative_to(root.resolve()):
+    try:
+        inside = not Path(name).is_absolute() and path.resolve().is_relative_to(root.resolve())
+        path.exists()
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a zero byte, a name that is too long
+        raise BadFile(root, f"the path {name[:80]!r} cannot be opened: {_first_line(error)}") from None
+    if not inside:
         raise BadFile(root, f"the path {name!r} leaves the folder", "use paths relative to the folder, without ..")
     return path
 
@@ -119,21 +125,39 @@ def remove_partial_files(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def read_json(path: Path) -> Any:
-    """The parsed JSON document.
+def read_json(path: Path, kind: type[T] | Any = Any) -> T:
+    """The JSON document in a file, as `kind`: a record of msgspec, a dict or list of them, or any type that it knows.
+
+    Keys that a record does not have are ignored.
 
     Raises:
-        BadFile: The file is missing, is not valid JSON, or holds NaN or infinity, which JSON does not define.
+        BadFile: The file is missing, too large, no valid JSON, or does not match `kind`; the message names the key.
     """
+    limits.require_file(path, limits.MAX_DOCUMENT_BYTES)
+    return parse_json(path, path.read_bytes(), kind)
 
-    def reject(word: str) -> None:
-        raise BadFile(path, f"holds {word}, which is not a JSON number")
 
-    _require_file(path)
+def parse_json(path: Path, content: bytes | str, kind: type[T] | Any = Any) -> T:
+    """A JSON document that was read from `path`, as `kind`; see `read_json`.
+
+    Raises:
+        BadFile: The document is no valid JSON, or does not match `kind`; the message names the key.
+    """
     try:
-        return json.loads(path.read_text("utf-8"), parse_constant=reject)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise BadFile(path, f"is not valid JSON: {error}") from None
+        return msgspec.json.decode(content, type=kind)
+    except msgspec.ValidationError as error:
+        raise BadFile(path, violated_rule(error)) from None
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+        reason = str(error).removeprefix("JSON is malformed: ")
+        raise BadFile(path, f"is not valid JSON: {reason}", "JSON has no NaN, no Infinity, no comments") from None
+
+
+def violated_rule(error: msgspec.ValidationError) -> str:
+    """The rule that a document violates, with the key, from an error of msgspec."""
+    rule, _, place = str(error).partition(" - at ")
+    rule = re.sub(r"`str` matching regex '\^\((.*)\)\$'", lambda match: "one of " + match[1].replace("|", ", "), rule)
+    place = place.replace("`", "").removeprefix("$").removeprefix(".")
+    return (f'"{place}": ' if place else "") + rule.replace("`", "")
 
 
 def write_json(path: Path, document: Any) -> None:
@@ -144,7 +168,7 @@ def write_json(path: Path, document: Any) -> None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Height and width of an 8-bit image [pixels], read without decoding it."""
-    with _open(path) as image:
+    with open_image(path) as image:
         return image.height, image.width
 
 
@@ -152,19 +176,32 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w c"]:
     """Code values of an 8-bit PNG or JPEG: 1, 3 or 4 channels as stored (a palette becomes RGB or RGBA).
 
     Raises:
-        BadFile: The file is missing, is not an 8-bit image, is damaged, or has more than `MAX_PIXELS` pixels.
+        BadFile: The file is missing, is not an 8-bit image, is damaged, or exceeds a limit of `limits`.
     """
-    with _open(path) as image:
+    with open_image(path) as image:
         if image.mode in ("I", "F") or image.mode.startswith("I;16"):
             raise BadFile(path, f"has pixels of type {image.mode}, not 8-bit ones", "convert it to 8-bit sRGB")
         mode = {"L": "L", "1": "L", "RGB": "RGB", "RGBA": "RGBA", "LA": "RGBA"}.get(image.mode)
         if mode is None:
             mode = "RGBA" if "transparency" in image.info else "RGB"
-        try:
+        with _image_errors(path, "cannot be decoded"):
             values = np.asarray(image.convert(mode))
-        except (OSError, SyntaxError) as error:
-            raise BadFile(path, f"cannot be decoded: {error}") from None
     return values if values.ndim == 3 else values[..., None]
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open an image without decoding its pixels; its size is within the limits.
+
+    Raises:
+        BadFile: The file is missing, is not an image, or exceeds a limit of `limits`.
+    """
+    limits.require_file(path)
+    with _image_errors(path, "is not an image"), warnings.catch_warnings():
+        # Pillow warns of large images; the limits refuse them.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        image = Image.open(path, formats=IMAGE_FORMATS)
+    limits.require_image_size(path, image.width, image.height, 4)
+    return image
 
 
 def write_png(path: Path, values: UInt8[np.ndarray, "h w c"]) -> None:
@@ -179,7 +216,7 @@ def read_radiance(path: Path) -> Float32[np.ndarray, "h w c"]:
     Raises:
         BadFile: The file is missing, of another format, damaged, too large, or holds NaN or infinity.
     """
-    _require_file(path)
+    limits.require_file(path)
     readers = {".exr": _read_exr, ".hdr": _read_hdr}
     if path.suffix.lower() not in readers:
         raise BadFile(path, f"has the ending {path.suffix!r}, not .exr or .hdr")
@@ -226,47 +263,61 @@ def _is_running(process: int) -> bool:
     return True
 
 
-def _require_file(path: Path) -> None:
-    if not path.is_file():
-        raise BadFile(path, "is missing" if not path.exists() else "is not a file")
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0][:200]
 
 
-def _open(path: Path) -> Image.Image:
-    _require_file(path)
+@contextlib.contextmanager
+def _image_errors(path: Path, rule: str) -> Iterator[None]:
+    """Context in which the exceptions of Pillow's parsers, which are of many types, become a `BadFile`."""
     try:
-        image = Image.open(path)
-    except (OSError, Image.DecompressionBombError) as error:
-        raise BadFile(path, f"is not an image: {error}") from None
-    if image.width * image.height > MAX_PIXELS:
-        raise BadFile(path, f"has {image.width} x {image.height} pixels, over the limit of {MAX_PIXELS}")
-    return image
+        yield
+    except (OSError, ValueError, SyntaxError, LookupError, TypeError, OverflowError, struct.error, zlib.error) as error:
+        raise BadFile(path, f"{rule}: {_first_line(error)}") from None
+    except Image.DecompressionBombError as error:
+        raise BadFile(path, f"is over the limit of {limits.MAX_PIXELS} pixels: {error}") from None
 
 
 def _read_exr(path: Path) -> np.ndarray:
+    """Linear pixels of the first part of an OpenEXR file: only its colours are kept in memory."""
     try:
-        window = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-        width, height = (int(high - low) + 1 for low, high in zip(*window, strict=True))
-        if not 0 < width * height <= MAX_PIXELS:
-            raise BadFile(path, f"has {width} x {height} pixels, over the limit of {MAX_PIXELS}")
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-    except (RuntimeError, OSError, KeyError, ValueError, TypeError) as error:
-        if isinstance(error, BadFile):
-            raise
-        raise BadFile(path, f"is not an OpenEXR file: {error}") from None
-    for names in (("R", "G", "B"), ("Y",), ("V",)):
-        if set(names) <= set(channels):
-            return np.stack([channels[name].pixels.astype(np.float32) for name in names], -1)
-    raise BadFile(path, f"has channels {sorted(channels)}, not R, G, B or Y")
+        file = OpenEXR.InputFile(str(path))
+        header = file.header()
+        width, height = _require_exr_size(path, header)
+        names = next((names for names in EXR_CHANNELS if set(names) <= set(header["channels"])), None)
+        if names is None:
+            found = ", ".join(sorted(header["channels"]))[:80]
+            raise BadFile(path, f"has the channels {found}, not R, G, B or Y")
+        planes = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT))
+        values = np.empty((height, width, len(names)), np.float32)
+        for i in range(len(names)):
+            values[..., i] = np.frombuffer(planes.pop(0), np.float32).reshape(height, width)
+        return values
+    except BadFile:
+        raise
+    except (RuntimeError, OSError, LookupError, ValueError, TypeError, AttributeError) as error:
+        raise BadFile(path, f"is not an OpenEXR file: {_first_line(error)}") from None
+
+
+def _require_exr_size(path: Path, header: dict[str, Any]) -> tuple[int, int]:
+    """Width and height of an OpenEXR file; all its channels, and its tiles, are within the limits."""
+    low, high = header["dataWindow"].min, header["dataWindow"].max
+    width, height = high.x - low.x + 1, high.y - low.y + 1
+    half = Imath.PixelType.HALF
+    pixel = sum(2 if channel.type.v == half else 4 for channel in header["channels"].values())
+    limits.require_image_size(path, width, height, pixel)
+    if "tiles" in header:
+        limits.require_image_size(path, header["tiles"].xSize, header["tiles"].ySize, pixel)
+    return width, height
 
 
 def _read_hdr(path: Path) -> np.ndarray:
     height, width = _hdr_size(path)
-    if not 0 < width * height <= MAX_PIXELS:
-        raise BadFile(path, f"has {width} x {height} pixels, over the limit of {MAX_PIXELS}")
+    limits.require_image_size(path, width, height, 12)
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if values is None or values.dtype != np.float32 or values.ndim != 3:
         raise BadFile(path, "is not a Radiance HDR file")
-    return values[..., ::-1]
+    return cv2.cvtColor(values, cv2.COLOR_BGR2RGB, dst=values)
 
 
 def _hdr_size(path: Path) -> tuple[int, int]:

@@ -8,12 +8,13 @@ header under the key "facts". Nothing is pickled.
 
 import dataclasses
 import json
-import types
 import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jaxtyping
+import msgspec
 import safetensors
 import safetensors.torch
 import torch
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from tumble import __version__
 from tumble.io import files
-from tumble.io.files import BadFile
+from tumble.io.errors import BadFile
 
 T = TypeVar("T")
 FIX = "remove it and run the command that made it again"
@@ -63,24 +64,37 @@ def save(tree: object, path: Path) -> None:
 
 
 def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
-    """The tree of class `cls` stored in a file.
+    """The tree of class `cls` stored in a file; types and shapes of all fields are those of the class.
 
     Raises:
-        BadFile: The file is damaged, holds another class, or lacks a field.
+        BadFile: The file is damaged, holds another class, lacks a field, or has one of another type or shape.
+    """
+    header, tensors = read_tensors(path, device)
+    if header.get("type") != cls.__name__:
+        raise BadFile(path, f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}", FIX)
+    try:
+        # Not the JSON of msgspec, because plain values may be infinite.
+        tree = msgspec.convert(_nested(json.loads(header["facts"]), tensors, ""), cls, dec_hook=_tensor)
+        _require_shapes(tree)
+        return tree
+    except msgspec.ValidationError as error:
+        raise BadFile(path, f"holds no valid {cls.__name__}: {files.violated_rule(error)}", FIX) from None
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, AssertionError) as error:
+        raise BadFile(path, f"is damaged: {type(error).__name__}: {str(error)[:200]}", FIX) from None
+
+
+def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Metadata and tensors of a safetensors file.
+
+    Raises:
+        BadFile: The file is missing or damaged.
     """
     try:
         with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
-            header = file.metadata() or {}
-            if header.get("type") != cls.__name__:
-                rule = f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}"
-                raise BadFile(path, rule, FIX)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        return _build(cls, tensors, json.loads(header["facts"]), "")
-    except safetensors.SafetensorError as error:
+            # `file` is not a dict.
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, OSError, ValueError, TypeError, LookupError, RuntimeError) as error:
         raise BadFile(path, f"is damaged: {error}", FIX) from None
-    except KeyError as missing:
-        rule = f"lacks {missing}, a field of {cls.__name__}; written by another version?"
-        raise BadFile(path, rule, FIX) from None
 
 
 def _fields(tree: object) -> dict[str, Any]:
@@ -112,23 +126,34 @@ def _plain_values(tree: object) -> dict[str, Any]:
     return facts
 
 
-def _build(cls: Any, tensors: dict[str, Tensor], facts: dict[str, Any], prefix: str) -> Any:
-    """The tree of class `cls` from its tensors and what `_plain_values` returned; names begin with `prefix`."""
-    hints = {} if cls is dict else typing.get_type_hints(cls)
+def _nested(facts: dict[str, Any], tensors: dict[str, Tensor], prefix: str) -> dict[str, Any]:
+    """The tree as nested dicts, from what `_plain_values` returned and the tensors, whose names begin with `prefix`."""
     values: dict[str, Any] = {}
-    for name in facts if cls is dict else hints:
-        key, entry = prefix + name, facts[name]
+    for name, entry in facts.items():
+        key = prefix + name
         if entry == "tensor":
             values[name] = tensors[key]
-        elif "tree" in entry:
-            values[name] = _build(_tree_class(hints.get(name, dict)), tensors, entry["tree"], key + ".")
         else:
-            values[name] = tuple(entry["fact"]) if isinstance(entry["fact"], list) else entry["fact"]
-    return values if cls is dict else cls(**values)
+            values[name] = _nested(entry["tree"], tensors, f"{key}.") if "tree" in entry else entry["fact"]
+    return values
 
 
-def _tree_class(hint: Any) -> Any:
-    """The dataclass (or dict) in the annotation of a field: `Material` for `Material | None`."""
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        hint = next(option for option in typing.get_args(hint) if option is not type(None))
-    return dict if typing.get_origin(hint) is dict else hint
+def _tensor(kind: type, value: Any) -> Any:
+    """The value of a field whose type is no plain one: a tensor."""
+    if not isinstance(value, Tensor):
+        raise ValueError(f"Expected {kind.__name__}, got `{type(value).__name__}`")
+    return value
+
+
+def _require_shapes(tree: object) -> None:
+    """Raise `ValueError` unless the tensors of every dataclass of a tree have the shapes of their annotations."""
+    if not dataclasses.is_dataclass(tree):
+        return
+    hints = typing.get_type_hints(type(tree))
+    with jaxtyping.jaxtyped("context"):  # so that a name stands for one number in all fields
+        for name, value in _fields(tree).items():
+            if isinstance(value, Tensor) and not isinstance(value, hints[name]):
+                kind = getattr(hints[name], "__name__", hints[name])
+                raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, not {kind}")
+    for value in _fields(tree).values():
+        _require_shapes(value)

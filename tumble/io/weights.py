@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from tumble.io import files
-from tumble.io.files import BadFile
+from tumble.io.errors import BadFile
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import safetensors
 import safetensors.torch
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tumble.io import BadFile, files, load_plugin
+from tumble.io import BadFile, files, load_plugin, tree
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
@@ -107,8 +106,8 @@ def _write(path: Path, match: Match) -> None:
 
 def _read(path: Path, i: int, j: int) -> Match:
     """Match of a file in the cache, between frames `i` and `j`."""
+    tensors = tree.read_tensors(path)[1]
     try:
-        tensors = safetensors.torch.load_file(path)
         return Match(i, j, tensors["uv_i"], tensors["uv_j"], tensors["confidence"])
-    except (safetensors.SafetensorError, KeyError) as error:
-        raise BadFile(path, f"is not a match: {error}", "delete it, it is computed again") from None
+    except (KeyError, AssertionError, TypeError) as error:
+        raise BadFile(path, f"is not a match: {error}", "remove it, it is computed again") from None

@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from tumble.preprocess.box_picker import pick_box
     from tumble.preprocess.check import check_footage, passes
     from tumble.preprocess.options import FootageOptions
+    from tumble.preprocess.provenance import PROVENANCE, read_provenance
     from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
-    from tumble.preprocess.video_to_capture import PREVIEW, PROVENANCE, footage_fingerprint
+    from tumble.preprocess.video_to_capture import PREVIEW, footage_fingerprint
 
 __all__ = [
     "FOOTAGE",
@@ -24,6 +25,7 @@ __all__ = [
     "input_kind",
     "footage_fingerprint",
     "pick_box",
+    "read_provenance",
     "to_capture",
 ]
 
@@ -34,6 +36,7 @@ __getattr__ = lazy_getattr(
         "check": ("check_footage", "passes"),
         "options": ("FootageOptions",),
         "source": ("FOOTAGE", "input_kind", "to_capture"),
-        "video_to_capture": ("PREVIEW", "PROVENANCE", "footage_fingerprint"),
+        "provenance": ("PROVENANCE", "read_provenance"),
+        "video_to_capture": ("PREVIEW", "footage_fingerprint"),
     },
 )

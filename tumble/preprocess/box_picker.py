@@ -5,7 +5,6 @@ the server stops when a box is received.
 """
 
 import base64
-import json
 import re
 import secrets
 from collections.abc import Callable
@@ -16,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from tumble.io import BadFile, files
-from tumble.preprocess import footage, video_to_capture
+from tumble.preprocess import footage
 from tumble.preprocess.footage import FootageFrame
 from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.provenance import PROVENANCE
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import lens_of, undistort_frame
 
@@ -31,6 +32,19 @@ MAX_REQUEST_BYTES = 256
 """Maximum size of a request that is read [bytes]."""
 
 Box = tuple[int, int, int, int]
+
+
+class _Choice(msgspec.Struct, frozen=True):
+    """Box and frame number among the options of `ingest.json`."""
+
+    box: Box | None
+    at: int
+
+
+class _Marked(msgspec.Struct, frozen=True):
+    """The entry of `ingest.json` that holds the user's choice."""
+
+    options: _Choice
 
 
 def pick_box(
@@ -52,10 +66,9 @@ def pick_box(
         )
     if input_kind(path) not in ("video", "images"):
         raise BadFile(path, "is neither a video nor a folder of images", "--pick works only for those: leave it out")
-    provenance = capture / video_to_capture.PROVENANCE
-    if provenance.is_file():
-        saved = files.read_json(provenance)["options"]
-        return replace(options, box=None if saved["box"] is None else tuple(saved["box"]), at=saved["at"])
+    if (capture / PROVENANCE).is_file():
+        saved = files.read_json(capture / PROVENANCE, _Marked).options
+        return replace(options, box=saved.box, at=saved.at)
     frame = sharpest_frame(path, options)
     box = request_box(frame, output)
     output(f"--box {' '.join(map(str, box))} --at {frame.number}")
@@ -125,12 +138,9 @@ def request_box(frame: FootageFrame, output: Callable[[str], Any] = print) -> Bo
 def _parse_box(content: bytes, height: int, width: int) -> Box | None:
     """The box sent by the page; None if it is no box inside the image."""
     try:
-        values = json.loads(content)
-    except (json.JSONDecodeError, UnicodeDecodeError):
+        left, top, w, h = msgspec.json.decode(content, type=Box)
+    except (msgspec.DecodeError, UnicodeError):
         return None
-    if not isinstance(values, list) or len(values) != 4 or not all(type(v) is int for v in values):
-        return None
-    left, top, w, h = values
     inside = left >= 0 and top >= 0 and min(w, h) >= 2 and left + w <= width and top + h <= height
     return (left, top, w, h) if inside else None
 

@@ -24,6 +24,7 @@ from tumble.preprocess import colmap, video_to_capture
 from tumble.preprocess.colmap import PosedImage, SparseModel
 from tumble.preprocess.footage import find_mask, read_mask
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
+from tumble.preprocess.provenance import PROVENANCE
 from tumble.preprocess.survey import downsample_mask
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Trajectory, mask_from_alpha, undistortion
 
@@ -294,6 +295,6 @@ def _write(posed: PosedImages, path: Path, out: Path, options: FootageOptions) -
             for entry, s in zip(entries, posed.silhouettes, strict=True)
         ],
     }
-    files.write_json(out / video_to_capture.PROVENANCE, provenance)
+    files.write_json(out / PROVENANCE, provenance)
     document = capture_document(camera, options.light, entries, setting=None, with_light=False)
     files.write_json(out / "transforms.json", document | {"focal_source": "model"})

@@ -28,6 +28,7 @@ from tumble.preprocess.background import compensate
 from tumble.preprocess.camera_motion import refuse_camera_motion
 from tumble.preprocess.footage import FootageFrame, read_frames
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
+from tumble.preprocess.provenance import PROVENANCE
 from tumble.preprocess.survey import MIN_GAIN_CHANGE, Survey, downsample_mask, survey_footage, undistort_frame
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
@@ -43,8 +44,6 @@ DROPPED_EDGE = (60, 60, 60)
 """Border colour of the other frames in the preview (grey)."""
 PREVIEW = "mask_preview.mp4"
 """File name of the preview of the masks."""
-PROVENANCE = "ingest.json"
-"""File name, in a capture, of the record of how it was made."""
 
 
 def capture_from_video(path: Path, out: Path, options: FootageOptions | None = None) -> Path:

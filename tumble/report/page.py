@@ -79,7 +79,7 @@ def write_report(out: Path, *, capture: Path | None = None) -> Path:
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
     full_capture = reader_for(path).load(path)
-    run_capture = frames_of_run(full_capture, asset, list(files.read_json(out / run.POSES)), path)
+    run_capture = frames_of_run(full_capture, asset, run.frame_names(out, len(asset.trajectory)), path)
     tracked = run.output(out, run.TRACK, PoseResult)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
     assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.io import files
+from tumble.io import BadFile, files
 from tumble.maths import equirect_from_direction, texel_directions, texel_solid_angles
 
 MIN_RADIANCE = 1e-6
@@ -43,10 +43,10 @@ class Environment:
         if pixels.shape[2] != 3 or pixels.shape[1] != 2 * pixels.shape[0]:
             size = f"{pixels.shape[1]} x {pixels.shape[0]} x {pixels.shape[2]}"
             rule = f"an equirectangular environment map must be RGB and twice as wide as high, not {size}"
-            raise files.BadFile(path, rule)
+            raise BadFile(path, rule)
         if pixels.min() < 0:
             rule = f"an environment map must have no negative values, but the least is {pixels.min():.3g}"
-            raise files.BadFile(path, rule, "clamp at 0")
+            raise BadFile(path, rule, "clamp at 0")
         return Environment.from_radiance(torch.from_numpy(pixels))
 
     def write(self, path: Path) -> None:

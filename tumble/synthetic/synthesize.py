@@ -140,7 +140,7 @@ def _prepare_folder(out: Path, manifest: dict[str, Any]) -> bool:
         return False
     if not path.is_file():
         raise BadFile(out, "exists already and was not made by tumble synth", "choose another folder with -o")
-    if {k: v for k, v in files.read_json(path).items() if k in manifest} != manifest:
+    if {k: v for k, v in files.read_json(path, dict[str, Any]).items() if k in manifest} != manifest:
         raise BadFile(
             out, "holds a capture made with other options", f"remove it or choose another -o; see {SETTINGS_FILE}"
         )

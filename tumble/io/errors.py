@@ -1,0 +1,15 @@
+"""Errors of reading and writing files: one line with the file, the rule or the reason, and the fix."""
+
+from pathlib import Path
+
+
+class BadFile(ValueError):
+    """Error for a file that breaks a rule of its format; the message holds the file, the rule and the fix."""
+
+    def __init__(self, path: Path, rule: str, fix: str = "") -> None:
+        self.rule = rule
+        super().__init__(f"{path}: {rule}" + (f" ({fix})" if fix else ""))
+
+
+class WriteError(OSError):
+    """Error for a file that could not be written; the message holds the file, the reason and the fix."""
