@@ -32,6 +32,8 @@ from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "light.json"
 """File in a folder of relit images that records the environment map."""
+MAX_EXPOSURE = 32
+"""Maximum exposure of relit images [stops]."""
 TURNTABLE_FRAMES = 90
 """Frames of a turntable video: three seconds."""
 TURNTABLE_SIDE = 384
@@ -254,13 +256,15 @@ def relight_run(out: Path, env: Path, images: Path | None = None, *, fast: bool,
 
     Raises:
         BadFile: There is no finished run in `out`, or the light cannot be read.
+        ValueError: The exposure is out of range.
     """
+    gain = _gain(exposure)
     asset = finished(out)
     views = relight(asset, env, cfg=_relighting(out), fast=fast)
     images = images or _relit_folder(out, env)
     n = len(asset.trajectory)
     for number, linear in enumerate(track(views, f"relighting under {env.stem}", n, transient=True)):
-        files.write_png(images / f"{number:04}.png", to_srgb8(2**exposure * linear).numpy())
+        files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).numpy())
     return images
 
 
@@ -286,7 +290,9 @@ def relight_turntable(out: Path, env: Path, clip: Path, *, fast: bool, exposure:
 
     Raises:
         BadFile: There is no finished run in `out`, or the light cannot be read.
+        ValueError: The exposure is out of range.
     """
+    gain = _gain(exposure)
     asset, light, cfg = finished(out), Environment.read(env), _relighting(out)
     # A quarter of the rays is enough: in a video the noise averages out over frames.
     cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
@@ -297,8 +303,15 @@ def relight_turntable(out: Path, env: Path, clip: Path, *, fast: bool, exposure:
     camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     views = relight(asset, light.rotated(R_gl_obj), turning, camera, cfg=cfg, fast=fast)
     frames = track(views, f"turning under {env.stem}", TURNTABLE_FRAMES, transient=True)
-    video.write_clip(clip, (to_srgb8(2**exposure * linear).cpu().numpy() for linear in frames))
+    video.write_clip(clip, (to_srgb8(gain * linear).cpu().numpy() for linear in frames))
     return clip
+
+
+def _gain(exposure: float) -> float:
+    """Factor of an exposure [stops]."""
+    if not abs(exposure) <= MAX_EXPOSURE:
+        raise ValueError(f"--exposure is out of range: {exposure:g}; give -{MAX_EXPOSURE} to {MAX_EXPOSURE} stops")
+    return 2.0**exposure
 
 
 def export_run(out: Path, folder: Path | None, preset: PresetName, scale_mm: float | None) -> Path:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 
 from tumble import matching, recipes
-from tumble.datasets import reader_for
+from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import BadFile, files, tree
@@ -91,6 +91,7 @@ def estimate_poses(
         BadFile: The capture has too few frames, or too few of them could be tracked.
     """
     capture = replace(capture, trajectory=None)
+    check_plausible(capture, IN_MEMORY)
     return _track(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
 
 
@@ -131,6 +132,7 @@ def reconstruct(
         capture = replace(capture, trajectory=None)
     elif isinstance(poses, Trajectory):
         capture = replace(capture, trajectory=poses)
+    check_plausible(capture, where)
     found = poses if isinstance(poses, PoseResult) else None
     if out is None:
         return _reconstruct(run.Run(None, recipe, progress), capture, where, found, device)[0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tumble.io import limits
 from tumble.io.files import BadFile
 from tumble.preprocess import colmap
 
@@ -227,6 +228,6 @@ def test_a_text_file_with_a_broken_line_is_refused(name: str, line: str, message
 def test_a_file_over_the_size_limit_is_refused(tmp_path: Path) -> None:
     file = write_binary(tmp_path / "sparse" / "0") / "points3D.bin"
     with file.open("r+b") as handle:
-        handle.truncate(colmap.MAX_BYTES + 1)
+        handle.truncate(limits.MAX_MODEL_BYTES + 1)
     with pytest.raises(BadFile, match=r"points3D\.bin: has 1073741825 bytes, over the limit"):
         colmap.read(tmp_path)

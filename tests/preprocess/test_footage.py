@@ -157,7 +157,7 @@ def test_a_fisheye_lens_is_undistorted(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"fov": 500.0}, "--fov is out of range"),
-        ({"focal": -1.0}, "--focal must be positive"),
+        ({"focal": -1.0}, "--focal is out of range"),
         ({"fisheye": (0.0,) * 4, "distortion": (0.0,) * 4}, "different lens models"),
     ],
 )

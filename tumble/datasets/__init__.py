@@ -13,11 +13,15 @@ from types import ModuleType
 
 from tumble.datasets import folder
 from tumble.datasets._capture_folder import MAPS, capture_document, evaluation_frame, save_capture, training_frame
+from tumble.datasets._plausibility import MAX_DISTORTION, check_plausible, plausible_focal
 from tumble.datasets.folder import read_poses
 from tumble.io import BadFile, load_plugin, plugin_names
 
 __all__ = [
     "MAPS",
+    "MAX_DISTORTION",
+    "check_plausible",
+    "plausible_focal",
     "capture_document",
     "evaluation_frame",
     "folder",

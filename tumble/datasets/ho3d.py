@@ -22,13 +22,13 @@ import torch
 from jaxtyping import UInt8
 
 from tumble.datasets import _images, _unpickle
+from tumble.datasets._lens import FrameLens
 from tumble.datasets.folder import decode_nonempty_mask
 from tumble.io import BadFile, files
 from tumble.maths import SE3, SO3
 from tumble.scene import (
     OBJECT,
     UNKNOWN,
-    Camera,
     Capture,
     Trajectory,
     Truth,
@@ -56,7 +56,7 @@ def load(path: Path | str) -> Capture:
     root = Path(path)
     images = _list_images(root)
     masked = ((image, mask) for image in images if (mask := _mask(root, image)) is not None)
-    return _images.build_capture(root, masked, _camera(root, images), "camera")
+    return _images.build_capture(root, masked, dict.fromkeys(images, _lens(root, images)), "camera")
 
 
 def load_truth(path: Path | str) -> Truth | None:
@@ -74,7 +74,7 @@ def load_truth(path: Path | str) -> Truth | None:
     T_gl_obj = SE3.from_rotation(SO3.exp(rotations), positions)
     T_cam_obj = SE3.from_rotation_matrix(opengl_from_opencv(rotations)) @ T_gl_obj
     return replace(
-        truth_without_views(_camera(root, images)),
+        truth_without_views(_lens(root, images).camera),
         poses=Trajectory(SE3(T_cam_obj.wxyz.float(), T_cam_obj.xyz.float()), "camera"),
         pose_names=tuple(poses),
         units="m",
@@ -115,11 +115,11 @@ def _array(path: Path, meta: dict[str, Any], name: str, size: int) -> np.ndarray
     return values.astype(np.float64).ravel()
 
 
-def _camera(root: Path, images: list[Path]) -> Camera:
-    """The camera of the sequence, from the first frame that has a camera matrix."""
+def _lens(root: Path, images: list[Path]) -> FrameLens:
+    """The lens of the sequence, from the first frame that has a camera matrix."""
     for image in images:
         if (K := _array(image, _meta(root, image), "camMat", 9)) is not None:
-            return _images.opencv_camera(K.reshape(3, 3), images[0])
+            return _images.opencv_lens(image, K.reshape(3, 3), *files.image_size(images[0]))
     raise BadFile(root / "meta", 'has no frame with the camera matrix "camMat"')
 
 

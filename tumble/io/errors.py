@@ -7,7 +7,7 @@ class BadFile(ValueError):
     """Error for a file that breaks a rule of its format; the message holds the file, the rule and the fix."""
 
     def __init__(self, path: Path, rule: str, fix: str = "") -> None:
-        self.rule = rule
+        self.rule, self.fix = rule, fix
         super().__init__(f"{path}: {rule}" + (f" ({fix})" if fix else ""))
 
 

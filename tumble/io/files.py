@@ -11,7 +11,6 @@ import errno
 import json
 import math
 import os
-import re
 import shutil
 import struct
 import tempfile
@@ -154,10 +153,9 @@ def parse_json(path: Path, content: bytes | str, kind: type[T] | Any = Any) -> T
 
 def violated_rule(error: msgspec.ValidationError) -> str:
     """The rule that a document violates, with the key, from an error of msgspec."""
-    rule, _, place = str(error).partition(" - at ")
-    rule = re.sub(r"`str` matching regex '\^\((.*)\)\$'", lambda match: "one of " + match[1].replace("|", ", "), rule)
-    place = place.replace("`", "").removeprefix("$").removeprefix(".")
-    return (f'"{place}": ' if place else "") + rule.replace("`", "")
+    rule, _, place = str(error).replace("`", "").partition(" - at ")
+    key = place.removesuffix(" in $").removeprefix("$").removeprefix(".")
+    return (f'"{key}": ' if key else "") + rule[:1].lower() + rule[1:]
 
 
 def write_json(path: Path, document: Any) -> None:

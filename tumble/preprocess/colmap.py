@@ -5,7 +5,7 @@
 
 Of several numbered models the one with most images is read. Poses are world to camera, with OpenCV axes. The principal
 points of the files put the centre of the first pixel at (0.5, 0.5), OpenCV's functions at (0, 0). Files larger than
-`MAX_BYTES` are refused, and so is any count that exceeds its file.
+`limits.MAX_MODEL_BYTES` are refused, and so is any count that exceeds its file.
 """
 
 import math
@@ -19,11 +19,10 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from tumble.io import BadFile
+from tumble.datasets import MAX_DISTORTION, plausible_focal
+from tumble.io import BadFile, limits
 from tumble.maths import SO3
 
-MAX_BYTES = 1 << 30
-"""Maximum size of a file that is read; a model of a thousand images has a tenth of it."""
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -131,7 +130,7 @@ def _read(folder: Path) -> SparseModel:
         raise BadFile(images, "lists no image")
     if len({view.name for view in views}) < len(views):
         raise BadFile(images, "lists two images of the same name")
-    rows = np.array(list(_points(points)) if points is not None else [], np.float64).reshape(-1, 4)
+    rows = np.fromiter(_points(points) if points is not None else (), np.dtype((np.float64, 4)))
     if points is not None and not np.isfinite(rows).all():
         raise BadFile(points, "contains NaN or infinity")
     return SparseModel(folder, tuple(views), rows[:, :3], rows[:, 3])
@@ -164,8 +163,11 @@ def _optics(path: Path, model: str, width: int, height: int, values: Float64[np.
     """Optics from the parameters of a COLMAP camera model."""
     two_focals = model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
     fx, fy, cx, cy = values[:4] if two_focals else (values[0], values[0], values[1], values[2])
-    if not np.isfinite(values).all() or min(fx, fy) <= 0 or not (0 < width < 1 << 16 and 0 < height < 1 << 16):
-        raise BadFile(path, f"has a camera of {width} x {height} pixels with the parameters {values.tolist()}")
+    plausible = np.isfinite(values).all() and 0 < width <= limits.MAX_SIDE and 0 < height <= limits.MAX_SIDE
+    plausible = plausible and plausible_focal(fx, height, width) and plausible_focal(fy, height, width)
+    if not plausible or np.abs(values[4 if two_focals else 3 :]).max(initial=0) > MAX_DISTORTION:
+        rule = f"has a camera of {width} x {height} pixels with the parameters {values.tolist()}"
+        raise BadFile(path, rule, "no lens has them")
     coefficients = np.zeros(4 if "FISHEYE" in model else 8)
     distortion = values[4 if two_focals else 3 :]
     coefficients[: len(distortion)] = distortion
@@ -207,8 +209,7 @@ class _ByteReader:
 
 
 def _content(path: Path) -> bytes:
-    if path.stat().st_size > MAX_BYTES:
-        raise BadFile(path, f"has {path.stat().st_size} bytes, over the limit of {MAX_BYTES}")
+    limits.require_file(path, limits.MAX_MODEL_BYTES)
     return path.read_bytes()
 
 

@@ -30,6 +30,8 @@ from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Trajectory, mask_f
 
 RADIUS_MARGIN = 1.02
 """Radius of the object's sphere divided by the radius that the silhouettes determine."""
+MAX_SLOPE = 100.0
+"""Maximum distance of an undistorted ray from the optical axis, on the plane at depth 1: 89.4 degrees."""
 MIN_PART_FRACTION = 0.05
 """Minimum area of a component of a mask, as a fraction of the largest one; a smaller one is noise."""
 SPHERE_STEPS = 2000
@@ -168,7 +170,10 @@ def _silhouette(path: Path, root: Path, view: PosedImage, options: FootageOption
     hull = cv2.convexHull(np.stack([columns, rows], -1).astype(np.int32))[:, 0].astype(np.float64)
     cropped = bool(inside[[0, -1]].any() or inside[:, [0, -1]].any())
     diameter = 2 * math.sqrt(len(rows) / math.pi)
-    return Silhouette(view, image, mask, view.optics.normalised(hull), diameter, cropped)
+    rays = view.optics.normalised(hull)
+    if not (np.isfinite(rays).all() and np.abs(rays).max() <= MAX_SLOPE):
+        raise BadFile(image, "has a lens whose distortion cannot be inverted", "calibrate it again, or crop the images")
+    return Silhouette(view, image, mask, rays, diameter, cropped)
 
 
 def _read_image_and_mask(

@@ -8,6 +8,7 @@ whole name (`0001.jpg.png`). Without other masks the alpha channel of an image i
 
 import math
 import re
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,6 +20,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
+from tumble.datasets import MAX_DISTORTION, plausible_focal
 from tumble.io import BadFile, files, video
 from tumble.scene import Camera, decode_mask, mask_from_alpha, undistortion
 
@@ -96,8 +98,7 @@ def open_footage(path: Path, masks: Path | None = None) -> Footage:
     images = _list_images(path / "images" if with_images else path)
     masks = path / "masks" if masks is None and with_images and (path / "masks").is_dir() else masks
     mask_files = () if masks is None else tuple(find_mask(image, masks) for image in images)
-    with Image.open(images[0]) as first:
-        equivalent_focal = first.getexif().get_ifd(EXIF_IFD).get(EXIF_EQUIVALENT_FOCAL)
+    equivalent_focal = _exif(images[0]).get_ifd(EXIF_IFD).get(EXIF_EQUIVALENT_FOCAL)
     return Footage(path, images, mask_files, _positive_number(equivalent_focal), None)
 
 
@@ -155,8 +156,12 @@ def resolve_lens(
         raise ValueError("--fisheye and --distortion are different lens models: give only one of them")
     if fov is not None and not 1 <= fov <= (179 if fisheye is None else 240):
         raise ValueError(f"--fov is out of range: {fov:g} degrees")
-    if focal is not None and not focal > 0:
-        raise ValueError(f"--focal must be positive: {focal:g} pixels")
+    if focal is not None and not plausible_focal(focal, height, width):
+        raise ValueError(f"--focal is out of range: {focal:g} pixels for a video of {width} x {height}")
+    if not all(abs(value) <= MAX_DISTORTION for value in (*(fisheye or ()), *(distortion or ()))):
+        raise ValueError(f"--fisheye and --distortion take coefficients up to {MAX_DISTORTION:g}")
+    if distortion is not None and len(distortion) not in (4, 5):
+        raise ValueError(f"--distortion takes 4 or 5 coefficients, these are {len(distortion)}")
     source: Literal["given", "metadata", "guess"] = "given"
     if focal is None and fov is not None:
         half = math.radians(fov) / 2
@@ -170,6 +175,15 @@ def resolve_lens(
         return Lens(camera, source, None)
     values = np.array(coefficients, np.float64)
     return Lens(camera, source, undistortion(camera.opencv_matrix, values, camera, fisheye=fisheye is not None))
+
+
+def _exif(path: Path) -> Image.Exif:
+    """EXIF tags of an image; none if they are damaged."""
+    with files.open_image(path) as image:
+        try:
+            return image.getexif()
+        except (OSError, ValueError, SyntaxError, LookupError, TypeError, struct.error):
+            return Image.Exif()
 
 
 def _positive_number(text: object) -> float | None:
@@ -227,8 +241,7 @@ def _image_frames(footage: Footage, invert: bool) -> Iterator[tuple[float, np.nd
 
 
 def _upright(path: Path, values: np.ndarray) -> np.ndarray:
-    with Image.open(path) as image:
-        orientation = image.getexif().get(EXIF_ORIENTATION, 1)
+    orientation = _exif(path).get(EXIF_ORIENTATION, 1)
     quarter_turns, mirror = ORIENTATIONS[orientation] if orientation in range(len(ORIENTATIONS)) else ORIENTATIONS[1]
     rotated = np.rot90(values, quarter_turns)
     return np.ascontiguousarray(rotated[:, ::-1] if mirror else rotated)

@@ -10,11 +10,11 @@ from tumble.scene.capture import (
     BACKGROUND,
     OBJECT,
     REGIONS,
-    UNITS,
     UNKNOWN,
     Capture,
     TargetView,
     Truth,
+    Units,
     content_key,
     decode_mask,
     mask_from_alpha,
@@ -25,7 +25,7 @@ from tumble.scene.environment import Environment, bilinear
 from tumble.scene.gaussians import Gaussians, constant_sh, opacity, quats_from_normals, sdf_from_opacity
 from tumble.scene.match import Match, View, empty_match
 from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
-from tumble.scene.trajectory import LIGHTS, Light, Trajectory, env_from_obj, opengl_from_opencv
+from tumble.scene.trajectory import Light, Trajectory, env_from_obj, opengl_from_opencv
 
 __all__ = [
     "Asset",
@@ -35,7 +35,6 @@ __all__ = [
     "DIELECTRIC",
     "Environment",
     "Gaussians",
-    "LIGHTS",
     "Light",
     "Match",
     "Material",
@@ -45,7 +44,7 @@ __all__ = [
     "TargetView",
     "Trajectory",
     "Truth",
-    "UNITS",
+    "Units",
     "UNKNOWN",
     "View",
     "bilinear",

@@ -8,7 +8,7 @@ capture setting show the same part of the object, else "sphere" (docs/format.md)
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -29,7 +29,6 @@ BACKGROUND = 0
 REGIONS = ("shared", "sphere")
 """Regions of evaluation views."""
 Units = Literal["m", "arbitrary"]
-UNITS: tuple[str, ...] = get_args(Units)
 
 
 def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:

@@ -7,7 +7,7 @@ map is up in the image; with `light == "object"` it is the object frame (docs/fo
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,6 @@ from tumble.maths import SE3
 
 Light = Literal["camera", "object"]
 """Frame in which the light is static."""
-LIGHTS: tuple[str, ...] = get_args(Light)
 
 
 def opengl_from_opencv(like: Tensor) -> Float[Tensor, "3 3"]:
