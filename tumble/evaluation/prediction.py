@@ -204,8 +204,8 @@ def _read_image(path: Path) -> np.ndarray:
 def _read_poses(path: Path, capture: Capture) -> tuple[tuple[str, ...], Trajectory | None]:
     if not path.exists():
         return (), None
-    document: Any = files.read_json(path)
-    if not isinstance(document, dict) or not document:
+    document = files.read_json(path, dict[str, Any])
+    if not document:
         raise BadFile(path, 'is not of the form {"0000.png": 4 x 4 matrix, ...}')
     if unknown := sorted(set(document) - set(capture.names)):
         raise BadFile(path, f"has a pose for {unknown[0]}, which is not a training frame of the capture")

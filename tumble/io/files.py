@@ -182,7 +182,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w c"]:
         mode = {"L": "L", "1": "L", "RGB": "RGB", "RGBA": "RGBA", "LA": "RGBA"}.get(image.mode)
         if mode is None:
             mode = "RGBA" if "transparency" in image.info else "RGB"
-        with _image_errors(path, "cannot be decoded"):
+        with image_errors(path, "cannot be decoded"):
             values = np.asarray(image.convert(mode))
     return values if values.ndim == 3 else values[..., None]
 
@@ -194,12 +194,26 @@ def open_image(path: Path) -> Image.Image:
         BadFile: The file is missing, is not an image, or exceeds a limit of `limits`.
     """
     limits.require_file(path)
-    with _image_errors(path, "is not an image"), warnings.catch_warnings():
-        # Pillow warns of large images; the limits refuse them.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+    with image_errors(path, "is not an image"):
         image = Image.open(path, formats=IMAGE_FORMATS)
     limits.require_image_size(path, image.width, image.height, 4)
     return image
+
+
+@contextlib.contextmanager
+def image_errors(path: Path, rule: str) -> Iterator[None]:
+    """Context in which the exceptions of Pillow's parsers, which are of many types, become a `BadFile`."""
+    try:
+        with warnings.catch_warnings():
+            # Pillow warns of large images, which the limits refuse, and of damaged metadata.
+            warnings.simplefilter("ignore")
+            yield
+    except BadFile:
+        raise
+    except (OSError, ValueError, SyntaxError, LookupError, TypeError, OverflowError, struct.error, zlib.error) as error:
+        raise BadFile(path, f"{rule}: {_first_line(error)}") from None
+    except Image.DecompressionBombError as error:
+        raise BadFile(path, f"is over the limit of {limits.MAX_PIXELS} pixels: {error}") from None
 
 
 def write_png(path: Path, values: UInt8[np.ndarray, "h w c"]) -> None:
@@ -263,17 +277,6 @@ def _is_running(process: int) -> bool:
 
 def _first_line(error: Exception) -> str:
     return str(error).partition("\n")[0][:200]
-
-
-@contextlib.contextmanager
-def _image_errors(path: Path, rule: str) -> Iterator[None]:
-    """Context in which the exceptions of Pillow's parsers, which are of many types, become a `BadFile`."""
-    try:
-        yield
-    except (OSError, ValueError, SyntaxError, LookupError, TypeError, OverflowError, struct.error, zlib.error) as error:
-        raise BadFile(path, f"{rule}: {_first_line(error)}") from None
-    except Image.DecompressionBombError as error:
-        raise BadFile(path, f"is over the limit of {limits.MAX_PIXELS} pixels: {error}") from None
 
 
 def _read_exr(path: Path) -> np.ndarray:

@@ -21,6 +21,7 @@ from torch import Tensor
 from tumble.io import BadFile
 from tumble.maths import SE3, direction_from_equirect
 from tumble.scene import Camera, Environment
+from tumble.synthetic.glb import require_glb
 
 MIN_LLVM = 17
 """Oldest major version of libLLVM that is used: LLVM 15 and 16 abort the process on some processors while they compile
@@ -132,14 +133,13 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
     """
     import trimesh
 
-    if not path.is_file():
-        raise BadFile(path, "is missing")
+    require_glb(path)
     try:
-        scene = trimesh.load_scene(path, process=False)
+        scene = trimesh.load_scene(path, file_type="glb", process=False)
+        meshes = [(*scene.graph[node],) for node in scene.graph.nodes_geometry]
+        parts = [_part(scene.geometry[name], T) for T, name in meshes if hasattr(scene.geometry[name], "faces")]
     except Exception as error:  # trimesh's parsers raise exceptions of many types on an invalid file
-        raise BadFile(path, f"is not a readable GLB: {error}") from None
-    meshes = [(*scene.graph[node],) for node in scene.graph.nodes_geometry]
-    parts = [_part(scene.geometry[name], T) for T, name in meshes if hasattr(scene.geometry[name], "faces")]
+        raise BadFile(path, f"is not a readable GLB: {type(error).__name__}: {str(error)[:200]}") from None
     n_triangles = sum(len(part.faces) for part in parts)
     if not 0 < n_triangles <= MAX_TRIANGLES:
         raise BadFile(path, f"has {n_triangles} triangles", f"1 to {MAX_TRIANGLES} can be rendered")
@@ -147,9 +147,17 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
     vertices = np.concatenate([part.vertices for part in parts]) @ R_obj_file.T
     center = (vertices.min(0) + vertices.max(0)) / 2
     radius = np.linalg.norm(vertices - center, axis=1).max()
+    if not 1e-12 < radius < 1e12 or not all(_consistent(part) for part in parts):
+        raise BadFile(path, f"has vertices or faces that are no object: its radius is {radius:.3g}")
     T_obj_file = np.eye(4)
     T_obj_file[:3, :3], T_obj_file[:3, 3] = R_obj_file / radius, -center / radius
     return ObjectModel(tuple(_transformed(part, R_obj_file, T_obj_file) for part in parts), T_obj_file)
+
+
+def _consistent(part: Part) -> bool:
+    """Whether the values of a part are finite and its faces refer to its vertices."""
+    finite = all(np.isfinite(x).all() for x in (part.normals, part.uv, part.albedo, part.roughness))
+    return bool(finite and part.faces.min(initial=0) >= 0 and part.faces.max(initial=0) < len(part.vertices))
 
 
 def _transformed(part: Part, R_obj_file: np.ndarray, T_obj_file: np.ndarray) -> Part:
@@ -173,13 +181,19 @@ def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray]:
     material: Any = getattr(visual, "material", None)
     material = material.to_pbr() if hasattr(material, "to_pbr") else material
     factor = np.ones(3) if getattr(material, "baseColorFactor", None) is None else _colour(material.baseColorFactor)
-    albedo, roughness = np.ones((1, 1, 3)), np.ones((1, 1, 1))
+    given = getattr(material, "roughnessFactor", None)
+    roughness_factor = 1.0 if given is None else given
+    albedo, roughness = np.ones((1, 1, 3)) * factor, np.ones((1, 1, 1)) * roughness_factor
+    # By tables of all code values, in the precision of the renderer, because textures have many pixels.
+    code_values = np.arange(256) / 255.0
     if getattr(material, "baseColorTexture", None) is not None:
-        albedo = _linear(np.asarray(material.baseColorTexture.convert("RGB")) / 255.0)
+        table = (_linear(code_values)[:, None] * factor).astype(np.float32)
+        pixels = np.asarray(material.baseColorTexture.convert("RGB"))
+        albedo = np.stack([table[pixels[..., channel], channel] for channel in range(3)], -1)
     if getattr(material, "metallicRoughnessTexture", None) is not None:
-        roughness = np.asarray(material.metallicRoughnessTexture.convert("RGB"))[..., 1:2] / 255.0
-    roughness_factor = getattr(material, "roughnessFactor", None)
-    return albedo * factor, roughness * (1.0 if roughness_factor is None else roughness_factor)
+        table = (code_values * roughness_factor).astype(np.float32)
+        roughness = table[np.asarray(material.metallicRoughnessTexture.convert("RGB"))[..., 1:2]]
+    return albedo, roughness
 
 
 def _colour(factor: Any) -> np.ndarray:
@@ -196,7 +210,7 @@ def write_model(source: Path, model: ObjectModel, path: Path) -> None:
     """Write the GLB `source`, transformed into the object frame of `model`, to `path` (truth/mesh.glb)."""
     import trimesh
 
-    scene = trimesh.load_scene(source, process=False)
+    scene = trimesh.load_scene(source, file_type="glb", process=False)
     scene.apply_transform(model.T_obj_file)
     path.write_bytes(cast(bytes, scene.export(file_type="glb")))
 

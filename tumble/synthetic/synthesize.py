@@ -87,11 +87,12 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
         BadFile: The model or a light cannot be read, or `out` holds something else.
         ModuleNotFoundError: The extra `synth` is not installed.
     """
-    pathtracer.mitsuba()
     # All inputs are read before anything is written.
     manifest = _manifest(model, options)
-    context = _context(model, out, options)
+    parts = pathtracer.read_model(model, options.up)
     unexposed = _unexposed_lights(options)
+    pathtracer.mitsuba()
+    context = _context(parts, out, options)
     resuming = _prepare_folder(out, manifest)
     frames = list(_frames(options))
     lights = _expose_lights(context, unexposed, frames, resuming)
@@ -147,9 +148,8 @@ def _prepare_folder(out: Path, manifest: dict[str, Any]) -> bool:
     return True
 
 
-def _context(model: Path, out: Path, options: SynthOptions) -> _RenderContext:
+def _context(parts: pathtracer.ObjectModel, out: Path, options: SynthOptions) -> _RenderContext:
     camera = Camera.from_fov(math.radians(options.fov), options.resolution, options.resolution)
-    parts = pathtracer.read_model(model, options.up)
     shapes = pathtracer.mitsuba_shapes(parts, options.material, options.roughness)
     return _RenderContext(options, parts, camera, out, shapes, pathtracer.unlit_scenes(parts, options.roughness))
 
