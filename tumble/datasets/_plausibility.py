@@ -27,7 +27,7 @@ MAX_FOCAL_RATIO = 2.0
 MAX_CENTRE_OFFSET = 1000.0
 """Maximum distance of the principal point from the image [longer side of the image]; crops far from the centre have
 10."""
-MAX_DISTORTION = 1e4
+MAX_DISTORTION = 1e3
 """Maximum size of a distortion coefficient; the denominators of OpenCV's rational model have 100."""
 MIN_ROTATION = math.radians(2)
 """Minimum rotation of the object between any two frames [radians]."""
@@ -149,7 +149,8 @@ def _outside(capture: Capture) -> float | None:
     for i in range(0, len(capture), max(1, len(capture) // N_SAMPLED)):
         x = capture.trajectory.T_cam_obj.xyz[i].to(rays)
         d = rays[capture.masks[i] == OBJECT]
-        missed += int(((x - (d @ x)[:, None] * d).norm(dim=-1) > SPHERE_RADIUS).sum())
+        nearest = (d @ x).clamp_min(0)[:, None] * d  # rays begin at the camera
+        missed += int(((x - nearest).norm(dim=-1) > SPHERE_RADIUS).sum())
         total += len(d)
     return missed / max(total, 1)
 

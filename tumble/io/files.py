@@ -13,6 +13,7 @@ import math
 import os
 import shutil
 import struct
+import sys
 import tempfile
 import warnings
 import zlib
@@ -21,7 +22,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
-import Imath
 import msgspec
 import numpy as np
 import OpenEXR
@@ -232,7 +232,8 @@ def read_radiance(path: Path) -> Float32[np.ndarray, "h w c"]:
     readers = {".exr": _read_exr, ".hdr": _read_hdr}
     if path.suffix.lower() not in readers:
         raise BadFile(path, f"has the ending {path.suffix!r}, not .exr or .hdr")
-    values = readers[path.suffix.lower()](path)
+    with _hidden_library_messages():
+        values = readers[path.suffix.lower()](path)
     if not np.isfinite(values).all():
         raise BadFile(path, "holds NaN or infinity", "linear pixels must be finite")
     return np.ascontiguousarray(values, np.float32)
@@ -279,43 +280,64 @@ def _first_line(error: Exception) -> str:
     return str(error).partition("\n")[0][:200]
 
 
-def _read_exr(path: Path) -> np.ndarray:
-    """Linear pixels of the first part of an OpenEXR file: only its colours are kept in memory."""
+@contextlib.contextmanager
+def _hidden_library_messages() -> Iterator[None]:
+    """Context in which nothing is printed on stderr, where OpenEXR and OpenCV report what becomes a `BadFile`."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
     try:
-        file = OpenEXR.InputFile(str(path))
-        header = file.header()
-        width, height = _require_exr_size(path, header)
-        names = next((names for names in EXR_CHANNELS if set(names) <= set(header["channels"])), None)
-        if names is None:
-            found = ", ".join(sorted(header["channels"]))[:80]
-            raise BadFile(path, f"has the channels {found}, not R, G, B or Y")
-        planes = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT))
-        values = np.empty((height, width, len(names)), np.float32)
-        for i in range(len(names)):
-            values[..., i] = np.frombuffer(planes.pop(0), np.float32).reshape(height, width)
-        return values
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    try:
+        _require_exr_size(path, OpenEXR.File(str(path), header_only=True))
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
     except BadFile:
         raise
     except (RuntimeError, OSError, LookupError, ValueError, TypeError, AttributeError) as error:
         raise BadFile(path, f"is not an OpenEXR file: {_first_line(error)}") from None
+    names = next((names for names in EXR_CHANNELS if set(names) <= set(channels)), None)
+    if names is None:
+        raise BadFile(path, f"has the channels {', '.join(sorted(channels))[:80]}, not R, G, B or Y")
+    planes = [channels[name].pixels for name in names]
+    del channels  # the others are not needed
+    if any(plane.ndim != 2 or plane.shape != planes[0].shape for plane in planes):
+        raise BadFile(path, f"has channels {', '.join(names)} of different sizes")
+    values = np.empty((*planes[0].shape, len(names)), np.float32)
+    for i in range(len(names)):
+        values[..., i] = planes.pop(0)
+    return values
 
 
-def _require_exr_size(path: Path, header: dict[str, Any]) -> tuple[int, int]:
-    """Width and height of an OpenEXR file; all its channels, and its tiles, are within the limits."""
-    low, high = header["dataWindow"].min, header["dataWindow"].max
-    width, height = high.x - low.x + 1, high.y - low.y + 1
-    half = Imath.PixelType.HALF
-    pixel = sum(2 if channel.type.v == half else 4 for channel in header["channels"].values())
-    limits.require_image_size(path, width, height, pixel)
-    if "tiles" in header:
-        limits.require_image_size(path, header["tiles"].xSize, header["tiles"].ySize, pixel)
-    return width, height
+def _require_exr_size(path: Path, file: OpenEXR.File) -> None:
+    """Check the stated sizes of all parts of an OpenEXR file with all their channels, and of their tiles."""
+    total = 0
+    for part in file.parts:
+        if part.type() not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+            raise BadFile(path, "is a deep image", "save it as a flat image")
+        low, high = part.header["dataWindow"]
+        width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
+        pixel = 4 * len(part.header["channels"])
+        limits.require_image_size(path, width, height, pixel)
+        if "tiles" in part.header:
+            limits.require_image_size(path, part.header["tiles"].xSize, part.header["tiles"].ySize, pixel)
+        total += width * height * pixel
+    limits.require_bytes(path, total, f"{len(file.parts)} parts")
 
 
 def _read_hdr(path: Path) -> np.ndarray:
     height, width = _hdr_size(path)
     limits.require_image_size(path, width, height, 12)
-    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise BadFile(path, f"is not a Radiance HDR file: {_first_line(error)}") from None
     if values is None or values.dtype != np.float32 or values.ndim != 3:
         raise BadFile(path, "is not a Radiance HDR file")
     return cv2.cvtColor(values, cv2.COLOR_BGR2RGB, dst=values)
@@ -328,7 +350,8 @@ def _hdr_size(path: Path) -> tuple[int, int]:
             raise BadFile(path, "is not a Radiance HDR file")
         for _ in range(64):
             words = file.readline(512).split()
-            if len(words) == 4 and words[0] == b"-Y" and words[2] == b"+X":
+            digits = [word for word in words[1::2] if word.isdigit() and len(word) < 10]
+            if len(words) == 4 and words[0] == b"-Y" and words[2] == b"+X" and len(digits) == 2:
                 return int(words[1]), int(words[3])
     raise BadFile(path, "has no resolution line of the form -Y height +X width")
 

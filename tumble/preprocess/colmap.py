@@ -37,6 +37,8 @@ CAMERA_MODELS = {
 """Name and number of parameters of the camera models, by their number in binary files."""
 N_PARAMETERS = dict(CAMERA_MODELS.values())
 """Number of parameters of the camera models, by name."""
+MAX_POSITION = 1e9
+"""Maximum entry of a translation [unit of the model]."""
 QUATERNION_TOLERANCE = 1e-3
 """Maximum deviation of a quaternion's length from 1."""
 
@@ -149,9 +151,11 @@ def _views(path: Path, optics: dict[int, Optics]) -> Iterator[PosedImage]:
         values = np.array(pose)
         if camera not in optics:
             raise BadFile(path, f"{name} refers to camera {camera}, which does not exist")
-        length = math.sqrt(float((values[:4] ** 2).sum()))
-        if not np.isfinite(values).all() or abs(length - 1) > QUATERNION_TOLERANCE:
+        length = math.hypot(*pose[:4])
+        if not abs(length - 1) <= QUATERNION_TOLERANCE:
             raise BadFile(path, f"{name} has no valid rotation: its quaternion has length {length:.4g}")
+        if not np.abs(values).max() <= MAX_POSITION:
+            raise BadFile(path, f"{name} has the translation {pose[4:]}", "no camera is that far away")
         yield PosedImage(name, optics[camera], SO3(torch.from_numpy(values[:4] / length)).matrix().numpy(), values[4:])
 
 

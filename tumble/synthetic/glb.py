@@ -20,6 +20,8 @@ ACCESSOR_BYTES = 16
 """Memory of an element of an accessor [bytes]."""
 VERTEX_BYTES = 160
 """Memory of a vertex of one instance of a mesh, with position, normal, texture coordinates and copies [bytes]."""
+NODE_BYTES = 1 << 15
+"""Memory of a node, which limits their number to 16000 [bytes]."""
 INDEX_BYTES = 24
 """Memory of an index of one instance of a mesh [bytes]."""
 
@@ -108,8 +110,8 @@ def _require_tree(path: Path, document: _Gltf) -> None:
 
 
 def _geometry_bytes(document: _Gltf) -> int:
-    """Memory of all accessors and of all instances of all meshes [bytes]."""
-    total = sum(ACCESSOR_BYTES * accessor.count for accessor in document.accessors)
+    """Memory of all nodes and accessors, and of all instances of all meshes [bytes]."""
+    total = NODE_BYTES * len(document.nodes) + sum(ACCESSOR_BYTES * accessor.count for accessor in document.accessors)
     for node in document.nodes:
         for primitive in document.meshes[node.mesh].primitives if node.mesh is not None else []:
             total += VERTEX_BYTES * max((document.accessors[i].count for i in primitive.attributes.values()), default=0)

@@ -135,9 +135,10 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
 
     require_glb(path)
     try:
-        scene = trimesh.load_scene(path, file_type="glb", process=False)
-        meshes = [(*scene.graph[node],) for node in scene.graph.nodes_geometry]
-        parts = [_part(scene.geometry[name], T) for T, name in meshes if hasattr(scene.geometry[name], "faces")]
+        with np.errstate(all="ignore"):  # infinite values are refused below
+            scene = trimesh.load_scene(path, file_type="glb", process=False)
+            meshes = [(*scene.graph[node],) for node in scene.graph.nodes_geometry]
+            parts = [_part(scene.geometry[name], T) for T, name in meshes if hasattr(scene.geometry[name], "faces")]
     except Exception as error:  # trimesh's parsers raise exceptions of many types on an invalid file
         raise BadFile(path, f"is not a readable GLB: {type(error).__name__}: {str(error)[:200]}") from None
     n_triangles = sum(len(part.faces) for part in parts)
@@ -146,7 +147,8 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
     R_obj_file = np.eye(3) if up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     vertices = np.concatenate([part.vertices for part in parts]) @ R_obj_file.T
     center = (vertices.min(0) + vertices.max(0)) / 2
-    radius = np.linalg.norm(vertices - center, axis=1).max()
+    with np.errstate(all="ignore"):
+        radius = np.linalg.norm(vertices - center, axis=1).max()
     if not 1e-12 < radius < 1e12 or not all(_consistent(part) for part in parts):
         raise BadFile(path, f"has vertices or faces that are no object: its radius is {radius:.3g}")
     T_obj_file = np.eye(4)
