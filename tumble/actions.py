@@ -21,7 +21,7 @@ from tumble import pipeline
 from tumble.engine import run
 from tumble.evaluation import CaptureWithTruth, Prediction, Report, align_views, predict_views, read_with_truth, score
 from tumble.export import PresetName, write_asset
-from tumble.io import files, load_plugin, video
+from tumble.io import BadFile, files, load_plugin, video
 from tumble.maths import SE3, to_srgb8
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
@@ -32,6 +32,8 @@ from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "light.json"
 """File in a folder of relit images that records the environment map."""
+MAX_RAYS = 1 << 16
+"""Maximum number of rays per pixel."""
 MAX_EXPOSURE = 32
 """Maximum exposure of relit images [stops]."""
 TURNTABLE_FRAMES = 90
@@ -330,4 +332,7 @@ def export_run(out: Path, folder: Path | None, preset: PresetName, scale_mm: flo
 
 def _relighting(out: Path) -> relighting.Config:
     """The relighting settings of the run's recipe."""
-    return run.settings(out, "relight", relighting.Config)
+    cfg = run.settings(out, "relight", relighting.Config)
+    if not all(0 < n <= MAX_RAYS for n in (cfg.brdf_samples, cfg.light_samples, cfg.preview_directions)):
+        raise BadFile(out / run.RECIPE, '"recipe.relight" has an impossible number of rays', f"the limit is {MAX_RAYS}")
+    return cfg

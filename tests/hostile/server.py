@@ -75,7 +75,9 @@ def command(words: list[str], folder: Path, said: Path, seconds: int) -> int:
     os.chdir(folder)
     for number, path in ((0, os.devnull), (1, os.devnull), (2, said)):
         os.dup2(os.open(path, os.O_RDWR | os.O_CREAT), number)
-    os.environ |= {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / ".cache")}
+    # Compiled kernels stay where they are; anything else at home would be a file outside of the output folder.
+    cache = os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
+    os.environ |= {"HOME": str(folder), "XDG_CACHE_HOME": cache}
     resource.setrlimit(resource.RLIMIT_DATA, (MAX_DATA, MAX_DATA))
     signal.alarm(seconds)
     sys.argv = ["tumble", *words]

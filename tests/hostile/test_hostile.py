@@ -11,14 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.hostile import documents, light_maps, models, pictures
+from tests.hostile import documents, films, light_maps, models, pictures, runs
 from tests.hostile.cases import Case
 
 FAMILIES = {
     "pictures": pictures.cases,
+    "films": films.cases,
     "documents": documents.cases,
     "models": models.cases,
     "light maps": light_maps.cases,
+    "runs": runs.cases,
 }
 CASES = {f"{family}: {case.name}": case for family, cases in FAMILIES.items() for case in cases()}
 N_SAMPLED = 60

@@ -145,6 +145,8 @@ def probe(path: Path) -> VideoHeader:
                 raise BadFile(path, "has no video stream", "it is an audio file or truncated: copy it again")
             stream = container.streams.video[0]
             codec = stream.codec_context
+            if codec is None:
+                raise BadFile(path, "has a video stream of an unknown codec", "convert it to H.264")
             limits.require_image_size(path, codec.width, codec.height, 4)
             hdr = HDR_CURVES.get(int(codec.color_trc))
             tags = {**container.metadata, **stream.metadata}
