@@ -1,7 +1,8 @@
 """A process that has imported the package and runs commands of it in forks, so that a case costs no start.
 
 It reads one JSON document per line, {"words", "folder", "seconds"}, and answers each with {"code", "error", "bytes",
-"seconds"}. It runs outside of pytest, whose import hook checks types that nothing checks for a user.
+"seconds"}. The words are those of the command line; or "read", the name of one of the `readers`, and a path. It runs
+outside of pytest, whose import hook checks types that nothing checks for a user.
 """
 
 import json
@@ -11,6 +12,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 MAX_DATA = 6 << 30
@@ -20,6 +22,35 @@ MODULES = (
     *("preprocess.check", "preprocess.colmap_to_capture", "preprocess.video_to_capture", "synthetic.synthesize"),
 )
 """Modules that commands import when they run."""
+
+
+def readers() -> dict[str, Callable[[Path], object]]:
+    """Every reader of the package, by name."""
+    from tumble import datasets
+    from tumble.datasets import bop
+    from tumble.engine import loop, run
+    from tumble.io import files, tree, video
+    from tumble.preprocess import colmap, provenance
+    from tumble.rendering import relight
+    from tumble.scene import Asset, Environment
+    from tumble.synthetic import pathtracer
+
+    return {
+        "capture": lambda path: datasets.reader_for(path).load(path),
+        "truth": lambda path: datasets.reader_for(path).load_truth(path),
+        "bop": bop.load_truth,
+        "picture": files.read_image,
+        "film": lambda path: sum(1 for _ in video.timed_frames(path)),
+        "light map": Environment.read,
+        "model": pathtracer.read_model,
+        "colmap": colmap.read,
+        "asset": lambda path: tree.load(Asset, path),
+        "checkpoint": loop.peek,
+        "recipe": lambda path: run.settings(path, "relight", relight.Config),
+        "poses": run.frame_names,
+        "log": run.log_records,
+        "provenance": provenance.read_provenance,
+    }
 
 
 def serve() -> None:
@@ -83,7 +114,13 @@ def command(words: list[str], folder: Path, said: Path, seconds: int) -> int:
     sys.argv = ["tumble", *words]
     code = 0
     try:
-        cli.main()
+        if words[0] == "read":
+            readers()[words[1]](Path(words[2]))
+        else:
+            cli.main()
+    except (ValueError, OSError) as error:
+        print(f"tumble: {error}", file=sys.stderr)
+        code = 1
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     except BaseException:

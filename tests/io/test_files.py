@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
-from tumble.io import files
+from tumble.io import files, limits
 from tumble.io.files import BadFile
 
 RNG = np.random.default_rng(0)
@@ -80,6 +81,48 @@ def test_too_large_images_are_rejected_before_decoding(tmp_path: Path) -> None:
     (tmp_path / "x.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 200000\n")
     with pytest.raises(BadFile, match="over the limit"):
         files.read_radiance(tmp_path / "x.hdr")
+
+
+def test_limits_count_the_bytes_of_all_channels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three channels of 64 x 128 floats have 96 KiB, with sixteen more 608."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    names = ["R", "G", "B", *(f"layer{i}" for i in range(16))]
+    OpenEXR.File(header, {name: np.zeros((64, 128), np.float32) for name in names}).write(str(tmp_path / "x.exr"))
+    files.write_exr(tmp_path / "rgb.exr", np.zeros((64, 128, 3), np.float32))
+    monkeypatch.setattr(limits, "MAX_DECODED_BYTES", 100 << 10)
+    assert files.read_radiance(tmp_path / "rgb.exr").shape == (64, 128, 3)
+    with pytest.raises(BadFile, match=r"x\.exr: holds 128 x 64 pixels of 76 bytes"):
+        files.read_radiance(tmp_path / "x.exr")
+
+
+def test_limits_count_the_bytes_of_all_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    planes = {name: np.zeros((64, 128), np.float32) for name in "RGB"}
+    parts = [OpenEXR.Part({**header, "name": f"part{i}"}, planes) for i in range(3)]
+    OpenEXR.File(parts).write(str(tmp_path / "x.exr"))
+    assert files.read_radiance(tmp_path / "x.exr").shape == (64, 128, 3)
+    monkeypatch.setattr(limits, "MAX_DECODED_BYTES", 200 << 10)
+    with pytest.raises(BadFile, match=r"x\.exr: holds 3 parts"):
+        files.read_radiance(tmp_path / "x.exr")
+
+
+def test_an_image_that_is_millions_of_pixels_wide_is_rejected(tmp_path: Path) -> None:
+    """OpenCV raises an error of its own above 2^20 pixels a side, and its functions end at 2^15."""
+    (tmp_path / "x.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 4000000\n" + bytes(16_000_000))
+    with pytest.raises(BadFile, match="has 4000000 x 1 pixels, over the limit"):
+        files.read_radiance(tmp_path / "x.hdr")
+
+
+def test_a_document_is_validated_with_its_keys(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text('{"a": [{"b": 1}, {"b": null}]}')
+    with pytest.raises(BadFile, match=r'x\.json: "\[\.\.\.\]\[1\]\[\.\.\.\]": expected int, got null'):
+        files.read_json(tmp_path / "x.json", dict[str, list[dict[str, int]]])
+
+
+def test_control_characters_of_file_names_are_escaped_in_messages(tmp_path: Path) -> None:
+    with pytest.raises(BadFile, match=r"a\\nb\\x1b\.png: is missing") as error:
+        files.read_image(tmp_path / "a\nb\x1b.png")
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_non_finite_pixels_are_rejected(tmp_path: Path) -> None:

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 from torch import Tensor
 
 from tumble.io import plugins, tree
+from tumble.io.errors import BadFile
 from tumble.maths.se3 import SE3
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
@@ -70,6 +72,36 @@ def test_loading_another_class_is_rejected(tmp_path: Path) -> None:
     tree.save(Camera.from_fov(0.5, 2, 2), tmp_path / "camera")
     with pytest.raises(ValueError, match="holds a Camera, not a Asset"):
         tree.load(Asset, tmp_path / "camera")
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "rule"),
+    [
+        ("gaussians.means", torch.zeros(5, 4), r"means\": expected Float\[Tensor, 'n 3'\], got torch.float32 \[5, 4\]"),
+        ("gaussians.sdf", torch.zeros(4), r"sdf is torch.float32 \[4\]"),
+        ("gamma", torch.zeros(()).int(), '"gamma": expected .*, got torch.int32'),
+        ("gamma", None, "lacks|KeyError: 'gamma'"),
+    ],
+)
+def test_tensors_of_another_shape_or_type_are_rejected(
+    tmp_path: Path, name: str, tensor: Tensor | None, rule: str
+) -> None:
+    tree.save(make_asset(), tmp_path / "asset")
+    header, tensors = tree.read_tensors(tmp_path / "asset")
+    tensors = {key: value for key, value in tensors.items() if key != name} | ({} if tensor is None else {name: tensor})
+    safetensors.torch.save_file(tensors, tmp_path / "asset", header)
+    with pytest.raises(BadFile, match=rule):
+        tree.load(Asset, tmp_path / "asset")
+
+
+def test_plain_values_of_another_type_are_rejected(tmp_path: Path) -> None:
+    tree.save(make_asset(), tmp_path / "asset")
+    header, tensors = tree.read_tensors(tmp_path / "asset")
+    wrong = {**header, "facts": header["facts"].replace('"fact": 6', '"fact": "six"')}
+    assert wrong != header
+    safetensors.torch.save_file(tensors, tmp_path / "asset", wrong)
+    with pytest.raises(BadFile, match=r'asset: holds no valid Asset: "camera\.height": expected int, got str'):
+        tree.load(Asset, tmp_path / "asset")
 
 
 def test_map_changes_every_tensor_and_no_plain_value() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.hostile.pictures import stated
 from tumble.io import files, video
 from tumble.io.files import BadFile
 from tumble.preprocess import footage
@@ -153,11 +154,21 @@ def test_a_fisheye_lens_is_undistorted(tmp_path: Path) -> None:
     assert float(fov.camera.fx_fy_cx_cy[0]) == pytest.approx(320 / math.pi, rel=1e-6)
 
 
+def test_a_first_image_that_is_a_decompression_bomb_is_refused(tmp_path: Path) -> None:
+    """Its header states 3.6 gigapixels; the EXIF tags are read from it before any pixel."""
+    (tmp_path / "a.png").write_bytes(stated(60_000, 60_000))
+    with pytest.raises(BadFile, match=r"a\.png: (is over the limit|has 60000 x 60000 pixels)"):
+        footage.open_footage(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"fov": 500.0}, "--fov is out of range"),
         ({"focal": -1.0}, "--focal is out of range"),
+        ({"focal": math.inf}, "--focal is out of range"),
+        ({"focal": 1e-30}, "--focal is out of range"),
+        ({"distortion": (math.nan, 0.0, 0.0, 0.0)}, "--fisheye and --distortion take"),
         ({"fisheye": (0.0,) * 4, "distortion": (0.0,) * 4}, "different lens models"),
     ],
 )

@@ -35,17 +35,18 @@ def require_image_size(path: Path, width: int, height: int, bytes_per_pixel: int
     require_bytes(path, width * height * bytes_per_pixel, f"{width} x {height} pixels of {bytes_per_pixel} bytes")
 
 
-def require_bytes(path: Path, size: int, what: str, limit: int = MAX_DECODED_BYTES) -> None:
+def require_bytes(path: Path, size: int, what: str, limit: int | None = None) -> None:
     """Check the size of a file after decoding.
 
     Args:
         size: Stated size [bytes].
         what: What has this size, for the message.
-        limit: Maximum size [bytes].
+        limit: Maximum size [bytes]. Default: `MAX_DECODED_BYTES`.
 
     Raises:
         BadFile: The size exceeds the limit.
     """
+    limit = MAX_DECODED_BYTES if limit is None else limit
     if size > limit:
         raise BadFile(path, f"holds {what}: {size >> 20} MiB when decoded, over the limit of {limit >> 20} MiB")
 

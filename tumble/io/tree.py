@@ -75,7 +75,7 @@ def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
     try:
         # Not the JSON of msgspec, because plain values may be infinite.
         tree = msgspec.convert(_nested(json.loads(header["facts"]), tensors, ""), cls, dec_hook=_tensor)
-        _require_shapes(tree)
+        _require_consistent(tree)
         return tree
     except msgspec.ValidationError as error:
         raise BadFile(path, f"holds no valid {cls.__name__}: {files.violated_rule(error)}", FIX) from None
@@ -139,21 +139,22 @@ def _nested(facts: dict[str, Any], tensors: dict[str, Tensor], prefix: str) -> d
 
 
 def _tensor(kind: type, value: Any) -> Any:
-    """The value of a field whose type is no plain one: a tensor."""
-    if not isinstance(value, Tensor):
-        raise ValueError(f"Expected {kind.__name__}, got `{type(value).__name__}`")
+    """The value of a field whose type is no plain one: a tensor, whose annotation states its shape."""
+    if not isinstance(value, kind):
+        found = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"expected {kind.__name__}, got {found}")
     return value
 
 
-def _require_shapes(tree: object) -> None:
-    """Raise `ValueError` unless the tensors of every dataclass of a tree have the shapes of their annotations."""
+def _require_consistent(tree: object) -> None:
+    """Raise `ValueError` unless a name of a dimension stands for one number in every dataclass of a tree."""
     if not dataclasses.is_dataclass(tree):
         return
     hints = typing.get_type_hints(type(tree))
-    with jaxtyping.jaxtyped("context"):  # so that a name stands for one number in all fields
+    with jaxtyping.jaxtyped("context"):
         for name, value in _fields(tree).items():
             if isinstance(value, Tensor) and not isinstance(value, hints[name]):
                 kind = getattr(hints[name], "__name__", hints[name])
                 raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, not {kind}")
     for value in _fields(tree).values():
-        _require_shapes(value)
+        _require_consistent(value)

@@ -63,7 +63,7 @@ class VideoHeader:
     codec: str
     """FFmpeg's name of the codec."""
     hdr: str | None
-    """"PQ" or "HLG" for HDR videos, whose code values are not sRGB; else None."""
+    """"PQ" or "HLG" for HDR videos, whose code values are converted to sRGB; else None."""
     tags: dict[str, str]
     """Text metadata of the container and the stream, such as the lens."""
 

@@ -106,8 +106,7 @@ def _video(survey: Survey) -> Finding:
     camera, n = survey.lens.camera, len(survey.numbers)
     state = f"{camera.width} x {camera.height}, {n} frames surveyed, {survey.times[-1] - survey.times[0]:.1f} s"
     hdr = survey.footage.hdr
-    advice = f"recorded in HDR ({hdr}), whose colours are not sRGB: switch HDR video off and record again"
-    return _finding("video", "good" if hdr is None else "warn", state, advice)
+    return Finding("video", "good", state if hdr is None else f"{state}, HDR ({hdr}) converted to sRGB")
 
 
 def _inputs(survey: Survey) -> Finding:

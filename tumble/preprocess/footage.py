@@ -56,7 +56,7 @@ class Footage:
     equivalent_focal: float | None
     """35 mm equivalent focal length from the metadata [mm]."""
     hdr: str | None
-    """"PQ" or "HLG" if the code values of the video are not sRGB."""
+    """"PQ" or "HLG" if the video is HDR, whose code values are converted to sRGB."""
 
 
 @dataclass(frozen=True)
