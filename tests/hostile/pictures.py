@@ -77,9 +77,9 @@ def cases() -> Iterator[Case]:
     for name, content in contents().items():
         for place in ("images/0000.png", "masks/0003.png"):
             write = partial(put, contents={**capture(), f"in/{place}": content})
-            yield Case(f"{place} is {name}", write, RUN, "in/(images|masks)/000.")
+            yield Case(f"{place} is {name}", write, RUN, "in/(images|masks)/000.", large=callable(content))
         write = partial(put, contents={**bare, "in/images/0000.png": content})
-        yield Case(f"the first image is {name}", write, RUN, "in/(images|masks)/000.")
+        yield Case(f"the first image is {name}", write, RUN, "in/(images|masks)/000.", large=callable(content))
     for kind in ("folder", "pipe", "device", "terabyte"):
         for place in ("images/0000.png", "masks/0000.png"):
             yield Case(f"{place} is a {kind}", partial(special, name=place, kind=kind), RUN, r"in[:/]")
