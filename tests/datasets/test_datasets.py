@@ -419,6 +419,10 @@ BROKEN_BOP: dict[str, tuple[Callable[[Path], Any], str]] = {
         change(bop.ANNOTATION, lambda d: d["10"][0].update(cam_R_m2c=(2 * np.eye(3)).ravel().tolist())),
         "frame 10: the rotation matrix is not a rotation",
     ),
+    "a rotation of 1e200": (
+        change(bop.ANNOTATION, lambda d: d["10"][0].update(cam_R_m2c=[1e200] * 9)),
+        "frame 10: the rotation matrix is not a rotation",
+    ),
     "a position with two numbers": (
         change(bop.ANNOTATION, lambda d: d["10"][0].update(cam_t_m2c=[1, 2])),
         r"cam_t_m2c\": expected array of length 3",

@@ -326,9 +326,11 @@ def test_the_key_of_a_capture_does_not_depend_on_ground_truth(tmp_path: Path) ->
     pixels = np.random.default_rng(0).integers(1, 255, (6, 8, 3), dtype=np.uint8)
     pose = np.eye(4)
     pose[2, 3] = 4.0
+    mask = np.full((6, 8, 1), 255, np.uint8)
+    mask[0] = 0
     for n in range(2):
         files.write_png(tmp_path / "images" / f"{n}.png", pixels)
-        files.write_png(tmp_path / "masks" / f"{n}.png", np.full((6, 8, 1), 255, np.uint8))
+        files.write_png(tmp_path / "masks" / f"{n}.png", mask)
     files.write_exr(tmp_path / "truth" / "albedo" / "1.exr", np.full((6, 8, 3), 0.5, np.float32))
     frames = [
         _capture_folder.training_frame("0.png", pose.tolist()),

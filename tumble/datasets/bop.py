@@ -159,7 +159,8 @@ def _rigid_matrix(path: Path, frame: int, rotation: Nine, translation: Three) ->
     matrix = np.eye(4)
     matrix[:3, :3] = R = np.array(rotation).reshape(3, 3)
     matrix[:3, 3] = 1e-3 * np.array(translation)
-    if not np.abs(R.T @ R - np.eye(3)).max() <= RIGID_TOLERANCE or np.linalg.det(R) < 0:
+    # The entries first, because squares of large numbers overflow.
+    if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0:
         raise BadFile(path, f"frame {frame}: the rotation matrix is not a rotation")
     if not np.abs(matrix).max() <= MAX_DISTANCE:
         raise BadFile(path, f"frame {frame}: the translation is {translation}", "it is in millimetres")
