@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
-from tumble.backends._cache import SOURCES, NoCache, folders, writable
+from tumble.backends._cache import SOURCES, NoCache, is_private, user_folder, writable
 from tumble.backends._structs import STRUCTURES
 
 FLAGS = (
@@ -56,8 +56,8 @@ def library() -> ctypes.CDLL | SimpleNamespace:
 def _by_compiler() -> ctypes.CDLL:
     compiler = find_compiler()
     name = f"kernels-{_build_hash(compiler)}.so"
-    path = next((folder / name for folder in folders() if (folder / name).is_file()), None)
-    if path is None:
+    path = user_folder() / name
+    if not (is_private(path.parent) and is_private(path)):
         path = _place(name)
         compile_to(path, compiler)
     return ctypes.CDLL(str(path))
@@ -117,6 +117,7 @@ def compile_to(path: Path, compiler: str) -> None:
             command = [compiler, *FLAGS, *variant, str(SOURCES / "kernels.cpp"), "-o", partial]
             run = subprocess.run(command, capture_output=True, text=True, check=False)
             if run.returncode == 0:
+                Path(partial).chmod(0o700)  # linkers create the file anew, with the mode of the umask
                 Path(partial).replace(path)
                 return
             output = run.stderr
