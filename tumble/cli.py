@@ -130,7 +130,8 @@ def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) ->
 
     Args:
         run: Run directory.
-        host: Address to listen on; 0.0.0.0 admits other machines.
+        host: Address to listen on. 0.0.0.0 admits other machines, to whoever has the printed address with its token;
+            nothing is encrypted.
         port: First port to try.
     """
     from tumble.viewer import serve
