@@ -258,15 +258,15 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
     light = tmp_path / "sun.hdr"
     Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
     before = finished_run(whole)
-    with full_disk(100), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
+    with full_disk(300), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
         actions.relight_run(whole, light, tmp_path / "pictures", fast=True)
-    assert list((tmp_path / "pictures").iterdir()) == []
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == [actions.LIGHT_FILE]
     with full_disk(3000), pytest.raises(OSError, match=r"asset\.ply: cannot be written"):
         actions.export_run(whole, tmp_path / "export", "splat", None)
+    assert [path.name for path in (tmp_path / "export").iterdir()] == ["export.json"]
     for name, write in (("x.exr", files.write_exr), ("x.hdr", files.write_hdr)):
         with full_disk(100), pytest.raises(OSError, match=rf"{name}: cannot be written: .*(too large|full)"):
             write(tmp_path / name, torch.rand(8, 16, 3).numpy())
-    assert list((tmp_path / "export").iterdir()) == []
     assert finished_run(whole) == before
 
     def refuse(*_: object, **__: object) -> None:

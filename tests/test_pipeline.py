@@ -269,7 +269,7 @@ def test_a_run_can_be_put_under_another_light(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, fast: bool
 ) -> None:
     actions.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
-    pictures = [files.read_image(path) for path in sorted(tmp_path.iterdir())]
+    pictures = [files.read_image(path) for path in sorted(tmp_path.glob("*.png"))]
     assert len(pictures) == 8
     assert all(0 < picture.mean() < 255 for picture in pictures)
 

@@ -4,6 +4,7 @@ Torch and OpenCV are imported only when a command runs, so that `--help` answers
 """
 
 import os
+import signal
 import sys
 import warnings
 
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 Folder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
 OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR", help_behavior_hint="")]
+Overwrite = Annotated[
+    bool, arg(help="Write even if the folder holds other files; those with the same names are replaced.")
+]
 OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 
@@ -63,6 +67,7 @@ def check(
     options: Annotated[FootageOptions, arg(name="")],
     out: OptionalFolder = None,
     pick: bool = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Check whether a video is suitable for reconstruction, and what to record again; exit code 1 if it is not.
 
@@ -75,7 +80,7 @@ def check(
     from tumble.preprocess import PREVIEW, check_footage, passes
 
     folder = out or Path("runs/check") / footage.stem
-    findings = check_footage(footage, folder, options, pick=pick)
+    findings = check_footage(footage, folder, options, pick=pick, overwrite=overwrite)
     for finding in findings:
         mark = {"good": "+", "warn": "!", "stop": "x"}[finding.rating]
         _print_finding(mark, finding.subject, finding.state, finding.advice, width=10)
@@ -147,6 +152,7 @@ def relight(
     turntable: OptionalFile = None,
     fast: bool = False,
     exposure: float = 0.0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render a reconstructed object under another light, in the poses of its training frames or as a turntable video.
 
@@ -154,16 +160,16 @@ def relight(
         run: Run directory.
         env: Environment map, an equirectangular .hdr or .exr file, +y up in the object's frame.
         out: Folder for the images. Default: RUN/relit/<name of the map>, numbered if another map has that name.
-        turntable: Write this video (.mp4) instead: one revolution about the object's +y axis.
+        turntable: Write this video (.mp4, .mov or .mkv) instead: one revolution about the object's +y axis.
         fast: Use prefiltered light without shadows instead of ray tracing.
         exposure: Exposure of the images, relative to the environment map [stops].
     """
     from tumble.actions import relight_run, relight_turntable
 
     if turntable is not None:
-        print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure))
+        print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure, overwrite=overwrite))
     else:
-        print(relight_run(run, env, out, fast=fast, exposure=exposure))
+        print(relight_run(run, env, out, fast=fast, exposure=exposure, overwrite=overwrite))
 
 
 def export(
@@ -172,6 +178,7 @@ def export(
     preset: Literal["web", "game", "film", "splat"] = "web",
     scale_mm: Annotated[float | None, arg(metavar="MM", help_behavior_hint="")] = None,
     out: OptionalFolder = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Export a reconstructed object: textured GLB, Gaussian PLYs, environment map, poses (docs/export.md).
 
@@ -183,7 +190,7 @@ def export(
     """
     from tumble.actions import export_run
 
-    print(export_run(run, out, preset, scale_mm))
+    print(export_run(run, out, preset, scale_mm, overwrite=overwrite))
 
 
 def report(run: Positional[Path], /, capture: OptionalCapture = None) -> None:
@@ -203,6 +210,7 @@ def evaluate(
     capture: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="")] = None,
     /,
     out: OptionalFolder = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Score a run, or a prediction folder of any other method, against the ground truth of a capture.
 
@@ -213,7 +221,7 @@ def evaluate(
     """
     from tumble.actions import evaluate_folder
 
-    _print_scores(evaluate_folder(prediction, capture, out))
+    _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite))
     print((out or prediction) / "report.json")
 
 
@@ -251,13 +259,14 @@ COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, 
 
 
 def main() -> None:
-    """Entry point of the `tumble` command: errors print one line and exit with code 1, Ctrl-C exits with 130."""
+    """Entry point of the `tumble` command: errors print one line and exit with code 1, Ctrl-C and SIGTERM with 130."""
     from tumble import __version__
 
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
         return
     warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}

@@ -15,7 +15,7 @@ from tumble import matching, recipes
 from tumble.datasets import reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import decompose, refine
-from tumble.io import BadFile, files, tree
+from tumble.io import BadFile, files, outputs, tree
 from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
@@ -62,10 +62,12 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
         out: The run directory; a capture converted earlier from the same footage is reused.
 
     Raises:
-        BadFile: The footage cannot be converted, or `out` holds a capture of other footage or other options.
+        BadFile: The footage cannot be converted, or `out` lies in it or holds a capture of other footage or other
+            options.
     """
     if input_kind(path) not in FOOTAGE:
         return path
+    outputs.require_outside(out, path)
     made = out / run.CAPTURE
     with run.exclusive_access(out):
         if not made.exists():

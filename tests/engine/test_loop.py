@@ -201,18 +201,33 @@ def test_a_checkpoint_of_other_settings_is_ignored(tmp_path: Path, other: dict[s
     assert bits(drive(THIS, inputs=Inputs(), checkpoint=tmp_path / "state", **changed)) == bits(fresh)
 
 
-def test_a_second_ctrl_c_stops_immediately_and_the_handler_is_restored(tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_stops_immediately_and_the_handler_is_restored(
+    tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = signal.getsignal(number)
 
-    def press_twice(state: State) -> None:
-        press_ctrl_c(state)
-        press_ctrl_c(state)
+    def twice(state: State) -> None:
+        signal.raise_signal(number)
+        signal.raise_signal(number)
 
     path = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
-        drive(THIS, Config(), Inputs(at={10: press_twice}), seed=3, checkpoint=path, every=8)
-    assert signal.getsignal(signal.SIGINT) is before
+        drive(THIS, Config(), Inputs(at={10: twice}), seed=3, checkpoint=path, every=8)
+    assert signal.getsignal(number) is before
+    signal.signal(signal.SIGTERM, found)
     assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == uninterrupted()
+
+
+def test_sigterm_saves_a_checkpoint_and_ends_the_stage_like_ctrl_c(tmp_path: Path) -> None:
+    found, path = signal.signal(signal.SIGTERM, signal.SIG_DFL), tmp_path / "state"
+    terminate = lambda state: signal.raise_signal(signal.SIGTERM)  # noqa: E731
+    with pytest.raises(KeyboardInterrupt, match=r"stopped at step 11 of 30; .*continue from .*state"):
+        drive(THIS, Config(), Inputs(at={10: terminate}), seed=3, checkpoint=path, every=100)
+    assert loop.peek(path)[0] == 11
+    assert signal.signal(signal.SIGTERM, found) == signal.SIG_DFL
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=100)) == uninterrupted()
 
 
 def test_without_a_checkpoint_the_message_of_ctrl_c_is_that_nothing_was_saved() -> None:

@@ -124,8 +124,8 @@ def drive(
 ) -> Any:
     """Train a stage from its start or its checkpoint to the end, and return its output.
 
-    On a terminal a progress bar shows the remaining time and the latest scalars. Ctrl-C stops after the current step
-    and saves a checkpoint; a second Ctrl-C stops immediately.
+    On a terminal a progress bar shows the remaining time and the latest scalars. Ctrl-C or SIGTERM stops after the
+    current step and saves a checkpoint; a second one stops immediately.
 
     Args:
         stage: The stage module.
@@ -142,7 +142,7 @@ def drive(
         NotFinite: A tensor became NaN or infinite; the last valid checkpoint is kept.
         BadFile: The file is not a checkpoint, or does not match the stage.
         OSError: The checkpoint cannot be written; the previous one is kept.
-        KeyboardInterrupt: Training was stopped by Ctrl-C; the message holds the checkpoint.
+        KeyboardInterrupt: Training was stopped by Ctrl-C or SIGTERM; the message holds the checkpoint.
     """
     started = time.perf_counter()
     key = fingerprint(key, stage.VERSION, cfg, seed)
@@ -292,25 +292,29 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[Callable[[], bool]]:
-    """A function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts immediately.
+    """A function that returns whether Ctrl-C was pressed or SIGTERM received; a second one has its usual effect.
 
-    In other threads than the main one, where Python cannot handle signals, the function always returns False.
+    In other threads than the main one, where Python cannot handle signals, the function always returns False. Signals
+    that the process ignores, as in a background job of a shell, stay ignored.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
     received: list[int] = []
 
     def handle(number: int, frame: Any) -> None:
         received.append(number)
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before[signal.Signals(number)])
 
-    signal.signal(signal.SIGINT, handle)
+    for number in before:
+        signal.signal(number, handle)
     try:
         yield lambda: bool(received)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -34,6 +34,8 @@ IDENTITY_TOLERANCE = 1e-3
 camera distances]."""
 
 _VIEWS = "per view; a region's score is the mean over its views"
+SHEET = "sheet.png"
+"""Contact sheet of an evaluation, by which its folder is recognised; written first."""
 PROTOCOLS = {
     "psnr_fg_linear": f"PSNR [dB], peak 1, foreground pixels only, linear values clipped to [0, 1], {_VIEWS}",
     "psnr_full_linear": f"PSNR [dB], peak 1, all pixels over black, linear values clipped to [0, 1], {_VIEWS}",
@@ -154,7 +156,7 @@ def score(
         **scores,
     }
     sheet = score_sheet.draw(report, predicted, target.truth)
-    files.write_png(out / "sheet.png", sheet)
+    files.write_png(out / SHEET, sheet)
     files.write_json(out / "report.json", report)
     return cast(Report, report)
 

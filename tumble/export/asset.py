@@ -44,6 +44,8 @@ PRESETS: dict[str, Preset | None] = {
     "splat": None,
 }
 """Settings by name. "web" stays below 10 MB; "splat" has no mesh."""
+EXPORT_FILE = "export.json"
+"""Unit and settings of an exported folder, by which it is recognised; written first."""
 CONFIDENCE_FILE = "confidence.png"
 """Confidence of the material as a texture, beside the GLB."""
 SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
@@ -63,12 +65,6 @@ def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, s
     settings = PRESETS[preset]
     shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
     metres = 1.0 if scale_mm is None or shape is None else scale_mm / 1000 / mesh.diameter(shape.vertices)
-    if settings and shape:
-        write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
-    ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
-    ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
-    _write_light(asset, out)
-    write_poses(asset, names, metres, out)
     facts = {
         "preset": preset,
         "metres_per_object_radius": metres,
@@ -78,7 +74,13 @@ def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, s
         "f0": float(asset.material.f0),
         "tumble": __version__,
     }
-    files.write_json(out / "export.json", facts)
+    files.write_json(out / EXPORT_FILE, facts)
+    if settings and shape:
+        write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
+    ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
+    ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
+    _write_light(asset, out)
+    write_poses(asset, names, metres, out)
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:

@@ -1,9 +1,10 @@
-"""Images, videos, JSON documents and trees of tensors on disk, network weights, and loading plugins by file name.
+"""Images, videos, JSON documents and trees of tensors on disk, network weights, the rules for
+outputs, and loading plugins by file name.
 
 Every file is written atomically. Every reader raises `BadFile` with the rule that the file breaks and the fix.
 """
 
-from tumble.io import files, tree, video, weights
+from tumble.io import files, outputs, tree, video, weights
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
 
@@ -11,6 +12,7 @@ __all__ = [
     "BadFile",
     "files",
     "load_plugin",
+    "outputs",
     "plugin_names",
     "tree",
     "video",

@@ -30,6 +30,8 @@ HDR_CURVES = {16: "PQ", 18: "HLG"}
 """Code points of HDR transfer curves (ITU-T H.273), whose code values are not sRGB."""
 HD_HEIGHT = 720
 """Frame height [pixels] from which an unspecified colour matrix means BT.709, else BT.601, as in video players."""
+CLIP_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""FFmpeg's names of the containers that are written, by extension."""
 MIN_DECODED_FRACTION = 0.9
 """Minimum fraction of announced frames in a complete video; edit lists hide a few frames of complete videos."""
 
@@ -56,13 +58,13 @@ def write_clip(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, qual
     """Write sRGB code values as an H.264 video in the most compatible format (yuv420p, BT.709).
 
     Args:
-        path: File to write.
+        path: File to write, with an extension of `CLIP_FORMATS`.
         frames: Frames of even height and width.
         quality: Constant rate factor: 0 is lossless, 14 has no visible artefacts, 28 is a small preview.
     """
 
     def write(partial: Path) -> None:
-        with av.open(str(partial), "w", format="mp4") as container:
+        with av.open(str(partial), "w", format=CLIP_FORMATS[path.suffix.lower()]) as container:
             stream = None
             for values in frames:
                 if stream is None:

@@ -69,7 +69,9 @@ def require_new_folder(out: Path) -> None:
     Raises:
         BadFile: It is something else.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not out.is_dir():
+        raise BadFile(out, "is a file, where a folder is to be written", "choose a new folder")
+    if out.exists() and any(out.iterdir()):
         raise BadFile(out, "exists already", "choose a new folder")
 
 

@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from tumble import __version__
 from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
-from tumble.io import BadFile, files, video
+from tumble.io import BadFile, files, outputs, video
 from tumble.maths import SE3, SO3, to_srgb8
 from tumble.scene import BACKGROUND, OBJECT, Camera, Environment, Light, env_from_obj, opengl_from_opencv
 from tumble.synthetic import pathtracer
@@ -87,6 +87,7 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
         BadFile: The model or a light cannot be read, or `out` holds something else.
         ModuleNotFoundError: The extra `synth` is not installed.
     """
+    outputs.claim_folder(out, SETTINGS_FILE, fix="choose another folder with -o")
     pathtracer.mitsuba()
     # All inputs are read before anything is written.
     manifest = _manifest(model, options)
@@ -135,11 +136,9 @@ def _prepare_folder(out: Path, manifest: dict[str, Any]) -> bool:
         BadFile: `out` holds something else.
     """
     path = out / SETTINGS_FILE
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+    if not path.is_file():
         files.write_json(path, manifest)
         return False
-    if not path.is_file():
-        raise BadFile(out, "exists already and was not made by tumble synth", "choose another folder with -o")
     if {k: v for k, v in files.read_json(path).items() if k in manifest} != manifest:
         raise BadFile(
             out, "holds a capture made with other options", f"remove it or choose another -o; see {SETTINGS_FILE}"
