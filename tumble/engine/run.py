@@ -362,13 +362,26 @@ def log(run: Run, record: dict[str, Any]) -> None:
 
 
 def log_records(path: Path) -> list[dict[str, Any]]:
-    """The records in the log of a run directory, without lines that a killed process left incomplete."""
+    """The records in the log of a run directory.
+
+    Lines that a killed process left incomplete are left out, and so are records whose values are of the wrong type.
+    """
     lines = (path / LOG).read_text("utf-8", errors="replace").splitlines() if (path / LOG).is_file() else []
     records = []
     for line in lines:
-        with contextlib.suppress(json.JSONDecodeError):
+        with contextlib.suppress(ValueError, RecursionError):
             records.append(json.loads(line))
-    return [record for record in records if isinstance(record, dict)]
+    return [record for record in records if _is_record(record)]
+
+
+def _is_record(value: Any) -> bool:
+    """Whether a JSON value has the types of a record of the log; names and events are any text."""
+    if not isinstance(value, dict) or not isinstance(metrics := value.get("metrics", {}), dict):
+        return False
+    texts = [value[key] for key in ("name", "event") if key in value]
+    numbers = [value[key] for key in ("seconds", "step", "of", "eta") if key in value]
+    numbers += [x for x in metrics.values() if x is not None]
+    return all(isinstance(x, str) for x in texts) and all(isinstance(x, int | float) for x in numbers)
 
 
 # Folder of a stage ----------------------------------------------------------------------------------------------------
