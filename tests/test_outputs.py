@@ -1,5 +1,6 @@
 """Outputs of all commands: nothing is overwritten silently, and every refusal is one line that names the fix."""
 
+import contextlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 from tests.films import scene, written
 from tests.test_cli import run
 from tests.test_interrupt import RECIPE, capture, whole  # noqa: F401 (fixtures)
-from tumble import actions, pipeline
+from tumble import actions, cli, pipeline
 from tumble.io import files, video
 from tumble.io.files import BadFile
 from tumble.preprocess.options import FootageOptions
@@ -40,6 +41,7 @@ def command(
 ) -> Callable[..., str]:
     """A function that runs a command and returns its error message, which has one line; "" if there is none."""
     monkeypatch.delenv("TUMBLE_DEBUG", raising=False)
+    monkeypatch.setattr(cli, "_progress_lines", contextlib.nullcontext)
     monkeypatch.setattr(actions, "TURNTABLE_FRAMES", 2)
     monkeypatch.setattr(actions, "TURNTABLE_SIDE", 32)
     words = {

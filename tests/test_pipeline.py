@@ -153,8 +153,14 @@ def test_finished_stages_are_not_run_again(
     assert_same(pipeline.reconstruct(capture, finished[0], RECIPE), finished[1])
 
 
-def test_a_run_is_scored_with_known_poses_as_they_are(finished: tuple[Path, Asset], capture: Path) -> None:
+def test_a_run_is_scored_with_known_poses_as_they_are(
+    finished: tuple[Path, Asset], capture: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "tumble")
     report = actions.evaluate_run(finished[0], capture)
+    told = [message.partition(" (")[0] for message in caplog.messages]
+    assert told[:2] == ["rendering maps of the evaluation views", "rendering views under the estimated light"]
+    assert told[-1] == "scoring views"
     assert set(report["regions"]) == {"shared", "sphere"}
     shared = report["regions"]["shared"]
     for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_full_srgb", "normal.mean_fg_degrees"):

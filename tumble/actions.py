@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from tumble import pipeline
@@ -30,7 +29,7 @@ from tumble.evaluation import (
     score,
 )
 from tumble.export import EXPORT_FILE, PresetName, write_asset
-from tumble.io import files, load_plugin, outputs, video
+from tumble.io import files, load_plugin, outputs, progress, video
 from tumble.maths import SE3, to_srgb8
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box
 from tumble.recipes import Recipe
@@ -302,7 +301,7 @@ def relight_run(
     files.write_json(images / LIGHT_FILE, note)
     views = relight(asset, light, cfg=_relighting(out), fast=fast)
     n = len(asset.trajectory)
-    for number, linear in enumerate(track(views, f"relighting under {env.stem}", n, transient=True)):
+    for number, linear in enumerate(progress.track(views, f"relighting under {env.stem}", n)):
         files.write_png(images / f"{number:04}.png", to_srgb8(2**exposure * linear).numpy())
     return images
 
@@ -343,7 +342,7 @@ def relight_turntable(
     scale = TURNTABLE_SIDE / max(camera.height, camera.width)
     camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     views = relight(asset, light.rotated(R_gl_obj), turning, camera, cfg=cfg, fast=fast)
-    frames = track(views, f"turning under {env.stem}", TURNTABLE_FRAMES, transient=True)
+    frames = progress.track(views, f"turning under {env.stem}", TURNTABLE_FRAMES)
     video.write_clip(clip, (to_srgb8(2**exposure * linear).cpu().numpy() for linear in frames))
     return clip
 

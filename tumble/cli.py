@@ -3,6 +3,8 @@
 Torch and OpenCV are imported only when a command runs, so that `--help` answers at once.
 """
 
+import contextlib
+import logging
 import os
 import signal
 import sys
@@ -11,6 +13,7 @@ import warnings
 # Idle OpenMP threads of torch otherwise spin on the cores that the kernels need. Torch reads this on import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -255,6 +258,8 @@ def demo(out: Folder = Path("runs/demo")) -> None:
     print(page)
 
 
+VERSION_HELP = "tumble --version prints the version."
+"""End of the help text, about an option that is not one of a command."""
 COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, demo, weights)
 
 
@@ -270,7 +275,8 @@ def main() -> None:
     try:
         about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}
-        tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=about)
+        with _progress_lines():
+            tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=f"{about}\n\n{VERSION_HELP}")
     except KeyboardInterrupt:
         print("tumble: interrupted; finished work is kept, repeat the command to resume", file=sys.stderr)
         raise SystemExit(130) from None
@@ -282,6 +288,21 @@ def main() -> None:
 
 
 # Printing -------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _progress_lines() -> Iterator[None]:
+    """Context in which the log of tasks is printed to standard error; terminals show bars instead (`io.progress`)."""
+    log, handler = logging.getLogger("tumble"), logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("tumble: %(message)s"))
+    before = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
 
 
 def _print_finding(mark: str, subject: str, state: str, advice: str, *, width: int) -> None:

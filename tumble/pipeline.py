@@ -15,7 +15,7 @@ from tumble import matching, recipes
 from tumble.datasets import reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import decompose, refine
-from tumble.io import BadFile, files, outputs, tree
+from tumble.io import BadFile, files, outputs, progress, tree
 from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
@@ -71,7 +71,8 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
     made = out / run.CAPTURE
     with run.exclusive_access(out):
         if not made.exists():
-            return to_capture(path, made, options)
+            with progress.task(f"converting {path.name} to a capture"):
+                return to_capture(path, made, options)
     note = made / PROVENANCE
     found, wanted = files.read_json(note) if note.exists() else {}, footage_fingerprint(path, options)
     different = [line for name in wanted for line in run.differences(found.get(name), wanted[name], name)]
@@ -186,9 +187,10 @@ def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tupl
     matches = matching.match_pairs(matching.views_of(capture), near, recipe.matcher, cache=cache)
     route = stage_of(recipe.track)
     try:
-        inputs: Any = sfm.gather(capture, matches, recipe.matcher)
-        if route is progressive:
-            inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
+        with progress.task("observations in all frames"):
+            inputs: Any = sfm.gather(capture, matches, recipe.matcher)
+            if route is progressive:
+                inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]

@@ -20,7 +20,7 @@ from torch import Tensor
 from tumble.engine import loop, optim
 from tumble.engine.loop import Progress, Stage, State, drive, fingerprint
 from tumble.engine.optim import NotFinite
-from tumble.io import files, tree
+from tumble.io import files, progress, tree
 from tumble.io.files import BadFile
 
 # A stage: points that move to a target with densification and pruning, and a light on a growing grid ------------------
@@ -230,6 +230,12 @@ def test_sigterm_saves_a_checkpoint_and_ends_the_stage_like_ctrl_c(tmp_path: Pat
     assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=100)) == uninterrupted()
 
 
+def test_every_stage_is_a_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "tumble")
+    drive(THIS, Config(), Inputs(), seed=3, name="refine")
+    assert caplog.messages == ["refine (30 steps)"]
+
+
 def test_without_a_checkpoint_the_message_of_ctrl_c_is_that_nothing_was_saved() -> None:
     with pytest.raises(KeyboardInterrupt, match="nothing was saved"):
         drive(THIS, Config(), Inputs(at={2: press_ctrl_c}), seed=3)
@@ -382,8 +388,8 @@ def test_reports_are_rate_limited_and_complete(tmp_path: Path, monkeypatch: pyte
 
 def test_a_terminal_shows_the_stage_its_metric_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
-    monkeypatch.setattr(loop, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120))
-    monkeypatch.setattr(loop, "BAR_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120))
+    monkeypatch.setattr(progress, "BAR_SECONDS", 0.0)
     drive(THIS, Config(), Inputs(), seed=3, name="toy")
     text = screen.getvalue()
     assert all(word in text for word in ("toy", "30/30", "loss", "0:00:0"))

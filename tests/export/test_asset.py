@@ -210,6 +210,16 @@ def test_the_light_file_documents_its_orientation(folder: Path, asset: Asset) ->
     assert torch.allclose(R @ forward_obj, torch.tensor([0.0, 0, -1]), atol=1e-5)
 
 
+def test_every_part_of_an_export_that_takes_long_is_a_line_of_the_log(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(export.PRESETS, "web", Preset(triangles=100, texture=32, cells=12, views=4, pixels=32))
+    caplog.set_level("INFO", "tumble")
+    export.write_asset(asset, NAMES, tmp_path, "web")
+    first = ["fusing depth maps", "extracting the mesh", "texture coordinates", "baking textures"]
+    assert caplog.messages == [*first, "confidence of the material"]
+
+
 def test_splats_alone_need_no_mesh(asset: Asset, tmp_path: Path) -> None:
     export.write_asset(asset, NAMES, tmp_path, "splat")
     assert not (tmp_path / "asset.glb").exists()

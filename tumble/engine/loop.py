@@ -23,18 +23,13 @@ import safetensors
 import safetensors.torch
 import torch
 from jaxtyping import UInt8
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
 from torch import Tensor
 
 from tumble import __version__
 from tumble.engine import optim
 from tumble.engine.optim import NotFinite
-from tumble.io import BadFile, files, tree
+from tumble.io import BadFile, files, progress, tree
 
-BAR_SECONDS = 0.5
-"""Minimum time between two updates of the progress bar [s]; reading a metric waits for the device."""
 REPORT_SECONDS = 5.0
 """Minimum time between two reports [s]."""
 PREVIEW = "preview.png"
@@ -124,8 +119,8 @@ def drive(
 ) -> Any:
     """Train a stage from its start or its checkpoint to the end, and return its output.
 
-    On a terminal a progress bar shows the remaining time and the latest scalars. Ctrl-C or SIGTERM stops after the
-    current step and saves a checkpoint; a second one stops immediately.
+    On a terminal a progress bar shows the remaining time and the latest scalars (`io.progress`). Ctrl-C or SIGTERM
+    stops after the current step and saves a checkpoint; a second one stops immediately.
 
     Args:
         stage: The stage module.
@@ -147,25 +142,27 @@ def drive(
     started = time.perf_counter()
     key = fingerprint(key, stage.VERSION, cfg, seed)
     total = stage.length(cfg, inputs)
-    state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
-    seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
+    with progress.task(name or "training", total) as update:
+        state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
+        seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
 
-    def save() -> None:
-        _check(state, checkpoint)
-        if checkpoint:
-            _save(state, checkpoint, key, seconds + time.perf_counter() - started)
-            _write_preview(stage, cfg, inputs, state, checkpoint.with_name(PREVIEW))
+        def save() -> None:
+            _check(state, checkpoint)
+            if checkpoint:
+                _save(state, checkpoint, key, seconds + time.perf_counter() - started)
+                _write_preview(stage, cfg, inputs, state, checkpoint.with_name(PREVIEW))
 
-    with _progress_display(name, total, state.step, started - seconds, report) as show, _interrupts() as interrupted:
-        while state.step < total:
-            scalars = _step(stage, cfg, inputs, state, checkpoint)
-            state.step += 1
-            show(state.step, scalars)
-            if state.step % every == 0 or state.step == total or interrupted():
-                save()
-            if interrupted():
-                raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
-    return stage.finish(cfg, inputs, state)
+        show = _step_reports(name, total, state.step, started - seconds, update, report)
+        with _interrupts() as interrupted:
+            while state.step < total:
+                scalars = _step(stage, cfg, inputs, state, checkpoint)
+                state.step += 1
+                show(state.step, scalars)
+                if state.step % every == 0 or state.step == total or interrupted():
+                    save()
+                if interrupted():
+                    raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
+        return stage.finish(cfg, inputs, state)
 
 
 def peek(path: Path) -> tuple[int, dict[str, Tensor]]:
@@ -317,41 +314,29 @@ def _interrupts() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-@contextlib.contextmanager
-def _progress_display(
-    name: str, total: int, first: int, started: float, report: Callable[[Progress], None] | None
-) -> Iterator[Callable[[int, Mapping[str, Tensor | float]], None]]:
-    """A function that shows a step in the progress bar and passes it to `report`, at limited rates."""
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[metrics]}"),
-    )
-    # Without auto_refresh, which would run a thread of its own beside training.
-    bar = ProgressBar(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
-    task = bar.add_task(name or "training", total=total, completed=first, metrics="")
+def _step_reports(
+    name: str,
+    total: int,
+    first: int,
+    started: float,
+    update: progress.Update,
+    report: Callable[[Progress], None] | None,
+) -> Callable[[int, Mapping[str, Tensor | float]], None]:
+    """A function that passes a step to the progress display and to `report`, at limited rates."""
     start = time.perf_counter()
-    drawn = reported = -float("inf")
+    reported = -float("inf")
 
     def show(step: int, scalars: Mapping[str, Tensor | float]) -> None:
-        nonlocal drawn, reported
+        nonlocal reported
+
+        def metrics() -> dict[str, float]:
+            return {key: float(torch.as_tensor(value).detach()) for key, value in scalars.items()}
+
+        update(step, lambda: "  ".join(f"{key} {value:.4g}" for key, value in metrics().items()))
         now = time.perf_counter()
-        draws = not bar.disable and now - drawn >= BAR_SECONDS
-        reports = report is not None and (now - reported >= REPORT_SECONDS or step == total)
-        if not (draws or reports):
-            return
-        metrics = {key: float(torch.as_tensor(value).detach()) for key, value in scalars.items()}
-        if draws:
-            drawn = now
-            text = "  ".join(f"{key} {value:.4g}" for key, value in metrics.items())
-            bar.update(task, completed=step, metrics=text, refresh=True)
-        if report is not None and reports:
+        if report is not None and (now - reported >= REPORT_SECONDS or step == total):
             reported = now
             eta = (now - start) / (step - first) * (total - step)
-            report(Progress(name, step, total, round(now - started, 3), round(eta, 1), metrics))
+            report(Progress(name, step, total, round(now - started, 3), round(eta, 1), metrics()))
 
-    with bar:
-        yield show
+    return show

@@ -13,7 +13,7 @@ from tumble.export import bake, confidence, gltf, mesh, ply
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
-from tumble.io import files
+from tumble.io import files, progress
 from tumble.scene import Asset
 
 CHART_PADDING = 8
@@ -89,26 +89,30 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
     Raises:
         ValueError: The Gaussians have no surface.
     """
-    values = signed_distances(
-        asset.gaussians, asset.gamma, cells=preset.cells, views=preset.views, pixels=preset.pixels
-    )
+    with progress.task("fusing depth maps"):
+        values = signed_distances(
+            asset.gaussians, asset.gamma, cells=preset.cells, views=preset.views, pixels=preset.pixels
+        )
     if values.min() >= 0:
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
-    return mesh.simplify(
-        mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)),
-        preset.triangles,
-    )
+    with progress.task("extracting the mesh"):
+        return mesh.simplify(
+            mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)),
+            preset.triangles,
+        )
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
     """Unwrap the mesh, bake its textures, write the GLB, and beside it the confidence texture over the same UVs."""
-    flat = mesh.unwrap(shape, preset.texture, CHART_PADDING)
-    textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
+    with progress.task("texture coordinates"):
+        flat = mesh.unwrap(shape, preset.texture, CHART_PADDING)
+    with progress.task("baking textures"):
+        textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
     assert asset.material is not None, "the asset has no material"
-    score = confidence.confidence_of(asset, asset.camera).score
-    files.write_png(
-        path.parent / CONFIDENCE_FILE, bake.nearest_gaussian_texture(score, asset, flat, resolution=512)[..., None]
-    )
+    with progress.task("confidence of the material"):
+        score = confidence.confidence_of(asset, asset.camera).score
+        texture = bake.nearest_gaussian_texture(score, asset, flat, resolution=512)
+    files.write_png(path.parent / CONFIDENCE_FILE, texture[..., None])
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 

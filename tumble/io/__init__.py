@@ -1,10 +1,10 @@
 """Images, videos, JSON documents and trees of tensors on disk, network weights, the rules for
-outputs, and loading plugins by file name.
+outputs, progress, and loading plugins by file name.
 
 Every file is written atomically. Every reader raises `BadFile` with the rule that the file breaks and the fix.
 """
 
-from tumble.io import files, outputs, tree, video, weights
+from tumble.io import files, outputs, progress, tree, video, weights
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
 
@@ -14,6 +14,7 @@ __all__ = [
     "load_plugin",
     "outputs",
     "plugin_names",
+    "progress",
     "tree",
     "video",
     "weights",

@@ -14,10 +14,8 @@ from pathlib import Path
 import safetensors
 import safetensors.torch
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tumble.io import BadFile, files, load_plugin
+from tumble.io import BadFile, files, load_plugin, progress
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
@@ -40,7 +38,7 @@ def match_pairs(
     device: torch.device | str = "cpu",
     cache: Path | None = None,
 ) -> list[Match]:
-    """Matches of pairs of views, in the order of the pairs, with a progress bar.
+    """Matches of pairs of views, in the order of the pairs.
 
     Args:
         views: Frames.
@@ -59,16 +57,14 @@ def match_pairs(
     key = settings(matcher)
     digests = [_window.digest(view) for view in views]
     matches = []
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        for i, j in bar.track(pairs, description=f"matching ({matcher})"):
-            path = _cache_path(cache, matcher, key, digests[i], digests[j])
-            if path is not None and path.exists():
-                matches.append(_read(path, views[i].number, views[j].number))
-                continue
-            matches.append(load(device)(views[i], views[j]))
-            if path is not None:
-                _write(path, matches[-1])
+    for i, j in progress.track(pairs, f"matching ({matcher})", len(pairs)):
+        path = _cache_path(cache, matcher, key, digests[i], digests[j])
+        if path is not None and path.exists():
+            matches.append(_read(path, views[i].number, views[j].number))
+            continue
+        matches.append(load(device)(views[i], views[j]))
+        if path is not None:
+            _write(path, matches[-1])
     return matches
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from tumble.io import outputs, video
+from tumble.io import outputs, progress, video
 from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, video_to_capture
 from tumble.preprocess.box_picker import pick_box
 from tumble.preprocess.options import FootageOptions
@@ -82,7 +82,8 @@ def check_footage(
     options = pick_box(path, options, out / "capture") if pick else options
     if input_kind(path) == "posed images":
         return _check_posed(colmap_to_capture.collect_silhouettes(path, options), out, options)
-    survey = survey_footage(path, options)
+    with progress.task(f"surveying {path.name}"):
+        survey = survey_footage(path, options)
     selected = keyframes.select_keyframes(survey.rotation, survey.blurs, survey.usable, options.frames)
     kept = [int(i) for i in np.nonzero(survey.usable)[0]] if survey.footage.images else selected
     video_to_capture.write_preview(survey, out / video_to_capture.PREVIEW, kept)

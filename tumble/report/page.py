@@ -28,7 +28,7 @@ from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
-from tumble.io import BadFile, files
+from tumble.io import BadFile, files, progress
 from tumble.maths import fibonacci_sphere
 from tumble.poses import PoseQuality, PoseResult
 from tumble.report import figures, health_card, preset_lights, svg, training_views
@@ -142,7 +142,7 @@ def build(
         quality: Quality of the poses, if they were estimated.
     """
     scene = training_views.prepare(asset)
-    frames = list(training_views.frames(scene, capture))
+    frames = list(progress.track(training_views.frames(scene, capture), "report: training views", len(capture)))
     selected = figures.select_diverse(asset, frames, N_COMPARISONS)
     views = selected[:N_VIEWS]
     confidence = confidence_of(asset, figures.small_camera(asset.camera))

@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import Progress
 
 from tumble import __version__
 from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
-from tumble.io import BadFile, files, outputs, video
+from tumble.io import BadFile, files, outputs, progress, video
 from tumble.maths import SE3, SO3, to_srgb8
 from tumble.scene import BACKGROUND, OBJECT, Camera, Environment, Light, env_from_obj, opengl_from_opencv
 from tumble.synthetic import pathtracer
@@ -96,11 +95,8 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
     resuming = _prepare_folder(out, manifest)
     frames = list(_frames(options))
     lights = _expose_lights(context, unexposed, frames, resuming)
-    with Progress(transient=True) as progress:
-        task = progress.add_task(f"rendering {out.name}", total=len(frames))
-        for number, frame in enumerate(frames):
-            _render_frame(context, frame, number)
-            progress.advance(task)
+    for number, frame in enumerate(progress.track(frames, f"rendering {out.name}", len(frames))):
+        _render_frame(context, frame, number)
     pathtracer.write_model(model, context.model, out / "truth" / "mesh.glb")
     _write_documents(context, frames, lights)
     if options.video:
