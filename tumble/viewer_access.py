@@ -65,7 +65,7 @@ def guarded(listening: socket.socket, host: str, token: str) -> Iterator[None]:
         token: First part of the path of every request.
 
     Raises:
-        RuntimeError: viser started its server in another way, and so without the check.
+        ModuleNotFoundError: This version of viser started its server in another way, and so without the check.
     """
     library: Any = importlib.import_module("websockets.asyncio.server")
     original, started = library.serve, []
@@ -90,7 +90,7 @@ def guarded(listening: socket.socket, host: str, token: str) -> Iterator[None]:
         if not started:
             listening.close()
     if not started:
-        raise RuntimeError("this version of viser starts its server in another way; install viser 1.1")
+        raise ModuleNotFoundError("this version of viser starts its server in another way: pip install 'viser~=1.1'")
 
 
 def refusal(path: str, headers: Any, host: str, token: str) -> str:
