@@ -182,6 +182,7 @@ def run_capture(
     options: FootageOptions,
     *,
     poses: Literal["given", "estimate"] = "given",
+    up: str = "auto",
     pick: bool = False,
     device: str = "cpu",
 ) -> Path:
@@ -190,17 +191,18 @@ def run_capture(
     Args:
         path: A video, a folder of images, or a capture.
         options: How footage is converted to a capture.
+        up: See `pipeline.reconstruct`.
         pick: Let the user draw a box around the object in the browser.
 
     Raises:
-        ValueError: There is no such matcher or device.
+        ValueError: There is no such matcher, device or up direction.
         BadFile: See `pipeline.capture_of` and `pipeline.reconstruct`.
     """
     place = usable_device(device)
     load_plugin("matching", recipe.matcher)  # fail before the video is converted
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
     capture = pipeline.capture_of(path, out, options)
-    pipeline.reconstruct(capture, out, recipe, poses=poses, device=place)
+    pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, device=place)
     return write_report(out, capture=capture)
 
 

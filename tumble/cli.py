@@ -100,6 +100,7 @@ def run(
     out: Folder,
     quality: Literal["draft", "standard", "paper"] = "draft",
     poses: Literal["given", "estimate"] = "given",
+    up: Annotated[str, arg(metavar="{auto,[-]x,[-]y,[-]z,FRAME}")] = "auto",
     matcher: str = "mixed",
     pick: bool = False,
     device: Literal["cpu", "cuda"] = "cpu",
@@ -116,6 +117,9 @@ def run(
         quality: draft: minutes on two CPU cores. standard: meant for a GPU.
             paper: the paper's numbers of steps, which take days; never run to the end.
         poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
+        up: Direction of the object that points up in the results; a finished run is only turned, in seconds.
+            auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.
+            FRAME: up in this frame, such as 0012.png.
         matcher: Finds corresponding pixels in two frames, for estimated poses.
             mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
             xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
@@ -130,7 +134,7 @@ def run(
     from tumble.recipes import QUALITIES
 
     recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
-    print(run_capture(capture, out, recipe, options, poses=poses, pick=pick, device=device))
+    print(run_capture(capture, out, recipe, options, poses=poses, up=up, pick=pick, device=device))
 
 
 def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) -> None:

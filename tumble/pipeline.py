@@ -21,12 +21,21 @@ from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
 from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, footage_fingerprint, input_kind, to_capture
 from tumble.recipes import DRAFT, Recipe
-from tumble.scene import Asset, Capture, Trajectory, content_key
+from tumble.scene import Asset, Capture, Trajectory, content_key, opengl_from_opencv
 
 MIN_FRAMES = 8
 """Minimum number of frames with a pose; fewer show too little of the object."""
 IN_MEMORY = Path("capture")
 """Name, in error messages, of a capture that was not read from disk."""
+ROTATIONS_TO_UP = {
+    "x": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "-x": ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "y": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "-y": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "z": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    "-z": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+}
+"""Rotations of the object frame, row by row, that take each axis to +y."""
 
 
 def read_capture(path: Path | str) -> Capture:
@@ -104,6 +113,7 @@ def reconstruct(
     recipe: Recipe = DRAFT,
     *,
     poses: Literal["given", "estimate"] | Trajectory | PoseResult = "given",
+    up: str = "auto",
     device: torch.device | str = "cpu",
     progress: Callable[[Progress], None] | None = None,
 ) -> Asset:
@@ -119,6 +129,9 @@ def reconstruct(
         poses: "given": the capture's poses, unchanged; estimated if it has none. "estimate": always estimated. A
             trajectory with one pose per frame: used unchanged. A `PoseResult`: the starting poses of stage 2, which
             refines them.
+        up: Up direction of the object, which becomes +y of the asset's frame. "auto": that of the poses, which for
+            estimated ones is up in the first frame. Or one of `ROTATIONS_TO_UP`, an axis of the frame of "auto"; or
+            the name of a frame in which the object is upright. No stage depends on it.
         device: Where stages 2 and 3 run.
         progress: Called every few seconds.
 
@@ -127,6 +140,7 @@ def reconstruct(
 
     Raises:
         BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
+        ValueError: There is no such direction or frame, or the capture's own poses define its frame.
         NotFinite: A NaN occurred in training; the message names the tensor, the step and the saved state.
     """
     where = IN_MEMORY if isinstance(capture, Capture) else Path(capture)
@@ -136,12 +150,14 @@ def reconstruct(
     elif isinstance(poses, Trajectory):
         capture = replace(capture, trajectory=poses)
     found = poses if isinstance(poses, PoseResult) else None
+    _check_up(up, capture, where)
     if out is None:
-        return _reconstruct(run.Run(None, recipe, progress), capture, where, found, device)[0]
+        return _upright(*_reconstruct(run.Run(None, recipe, progress), capture, where, found, device), up)
     out = Path(out)
     with run.exclusive_access(out):
         opened = run.open(out, where, recipe, content=content_key(capture), report=progress)
         asset, names = _reconstruct(opened, capture, where, found, device)
+        asset = _upright(asset, names, up)
         _keep(asset, names, out)
     return asset
 
@@ -217,6 +233,36 @@ def _check_quality(opened: run.Run, capture: Capture, where: Path, tracked: Pose
         raise BadFile(where, rule, "record an object with more texture or shape, and turn it more slowly")
     if quality.rating == "bad":
         warnings.warn(quality.sentence, stacklevel=2)
+
+
+def _check_up(up: str, capture: Capture, where: Path) -> None:
+    """Raise `ValueError` unless `up` is a direction or a frame, and the frame of the capture may be changed.
+
+    The poses of a capture with ground truth share its frame; those of estimated poses and of COLMAP have their own.
+    """
+    if up == "auto":
+        return
+    if up not in ROTATIONS_TO_UP and up not in capture.names:
+        choices = ", ".join(["auto", *ROTATIONS_TO_UP])
+        raise ValueError(f"--up {up} is neither a direction nor a frame; choose {choices}, or a frame's file name")
+    if capture.trajectory is not None and not (where / PROVENANCE).is_file():
+        raise ValueError("--up is for estimated poses: the poses of this capture define its frame, in which +y is up")
+
+
+def _upright(asset: Asset, names: tuple[str, ...], up: str) -> Asset:
+    """The asset with the direction `up` rotated to +y; for a frame, to up in its image.
+
+    Raises:
+        ValueError: The frame has no pose.
+    """
+    if up == "auto":
+        return asset
+    if up in ROTATIONS_TO_UP:
+        return asset.rotated(torch.tensor(ROTATIONS_TO_UP[up]))
+    if up not in names:
+        raise ValueError(f"the pose of frame {up} was not found; choose another frame for --up")
+    T_cam_obj = asset.trajectory.T_cam_obj[names.index(up)]
+    return asset.rotated(opengl_from_opencv(T_cam_obj.xyz) @ T_cam_obj.rotation.matrix())
 
 
 def _keep(asset: Asset, names: tuple[str, ...], out: Path) -> None:
