@@ -226,14 +226,26 @@ def test_only_what_dead_processes_left_half_written_is_swept(tmp_path: Path) -> 
 # What is damaged, full or closed --------------------------------------------------------------------------------------
 
 
+def halve(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size // 2)
+
+
+def flip_a_byte(path: Path) -> None:
+    """In the middle of the tensors, where each value is as good as another for the format of the file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [halve, flip_a_byte])
 @pytest.mark.parametrize("name", ["2-refine/out.safetensors", "3-decompose/out.safetensors", "asset.safetensors"])
 def test_a_damaged_output_is_named_with_the_fix_and_the_fix_works(
-    capture: Path, whole: Path, tmp_path: Path, name: str
+    capture: Path, whole: Path, tmp_path: Path, name: str, damage: Callable[[Path], None]
 ) -> None:
     out = tmp_path / "run"
     shutil.copytree(whole, out)
-    with (out / name).open("r+b") as file:
-        file.truncate((out / name).stat().st_size // 2)
+    damage(out / name)
     read = (lambda: actions.finished(out)) if name == run.ASSET else None
     with pytest.raises(BadFile, match=rf"{name}: is damaged: .*\(remove it and run the command that made it again\)"):
         read() if read else pipeline.reconstruct(capture, out, RECIPE)

@@ -337,14 +337,31 @@ def test_a_folder_without_write_permission_is_an_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
 
 
-def test_errors_name_files_that_are_not_checkpoints(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", ["flipped byte", "not tensors", "other tensors"])
+def test_a_damaged_checkpoint_restarts_the_stage_with_a_warning(tmp_path: Path, damage: str) -> None:
+    """A checkpoint of step 20 with one flipped bit is not the last valid state; the result is that of a whole run."""
+    whole = drive(THIS, Config(), Inputs(), seed=3)
     path = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        drive(THIS, Config(), Inputs(at={20: press_ctrl_c}), seed=3, checkpoint=path)
+    if damage == "flipped byte":
+        content = bytearray(path.read_bytes())
+        content[-3] ^= 1
+        path.write_bytes(content)
+        reason = "is damaged: its content does not match its checksum"
+    elif damage == "not tensors":
+        path.write_bytes(b"junk" * 20)
+        reason = "is damaged: "
+    else:
+        tree.save(Params(*torch.zeros(4, 1)), path)
+        reason = "is not a checkpoint"
+    said = rf"state: {reason}.* \(the stage starts again from its first step\)"
+    with pytest.warns(UserWarning, match=said):
+        again = drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    assert bits(again) == bits(whole)
     path.write_bytes(b"junk" * 20)
-    with pytest.raises(BadFile, match="state: is not a checkpoint"):
-        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
-    tree.save(Params(*torch.zeros(4, 1)), path)
-    with pytest.raises(BadFile, match="state: is not a checkpoint"):
-        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    with pytest.raises(BadFile, match="state: is damaged"):
+        loop.peek(path)
 
 
 def test_a_checkpoint_of_another_structure_is_rejected(tmp_path: Path) -> None:

@@ -14,13 +14,12 @@ import json
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import safetensors
-import safetensors.torch
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
@@ -28,12 +27,14 @@ from torch import Tensor
 from tumble import __version__
 from tumble.engine import optim
 from tumble.engine.optim import NotFinite
-from tumble.io import BadFile, files, progress, tree
+from tumble.io import BadFile, files, progress, read_tensors, tree, write_tensors
 
 REPORT_SECONDS = 5.0
 """Minimum time between two reports [s]."""
 PREVIEW = "preview.png"
 """Name of the preview image in the folder of the checkpoint."""
+RESTART = "the stage starts again from its first step"
+"""What happens with a damaged checkpoint, for the message."""
 
 
 @dataclass
@@ -135,7 +136,7 @@ def drive(
 
     Raises:
         NotFinite: A tensor became NaN or infinite; the last valid checkpoint is kept.
-        BadFile: The file is not a checkpoint, or does not match the stage.
+        BadFile: The checkpoint does not match the stage.
         OSError: The checkpoint cannot be written; the previous one is kept.
         KeyboardInterrupt: Training was stopped by Ctrl-C or SIGTERM; the message holds the checkpoint.
     """
@@ -241,17 +242,22 @@ def _save(state: State, path: Path, key: str, seconds: float) -> None:
     """Write a checkpoint atomically."""
     tensors = {f"{part}/{name}": x for part, named in _parts(state).items() for name, x in named.items()}
     tensors["rng"] = state.rng.get_state()
-    owned = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
     about = {"key": key, "step": state.step, "seconds": seconds}
-    data = safetensors.torch.save(owned, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
-    files.write_atomically(path, lambda partial: partial.write_bytes(data))
+    write_tensors(path, tensors, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
 
 
 def _restore(state: State, path: Path, key: str) -> float:
-    """Restore a checkpoint with this key into an initial state; returns its training time [s], or 0 without one."""
+    """Restore a checkpoint with this key into an initial state; returns its training time [s], or 0 without one.
+
+    A damaged checkpoint gives a warning, and the stage starts again: every later state would contain the damage.
+    """
     if not path.exists():
         return 0.0
-    about, tensors = _read(path)
+    try:
+        about, tensors = _read(path)
+    except BadFile as error:
+        warnings.warn(str(error), stacklevel=4)
+        return 0.0
     if about["key"] != key:
         return 0.0
     parts: dict[str, dict[str, Tensor]] = {"params": {}, "optimizer": {}, "memory": {}}
@@ -277,11 +283,10 @@ def _restore(state: State, path: Path, key: str) -> float:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {})["state"])
-            return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (safetensors.SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
-        raise BadFile(path, f"is not a checkpoint: {error}", "remove it to restart the stage") from None
+        tensors, header = read_tensors(path, RESTART)
+        return json.loads(header["state"]), tensors
+    except (OSError, KeyError) as error:
+        raise BadFile(path, f"is not a checkpoint: {error}", RESTART) from None
 
 
 # Interrupts and progress ----------------------------------------------------------------------------------------------

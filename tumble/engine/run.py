@@ -5,6 +5,7 @@
 
 The *key* of a result is a hash of everything that determines it: the stage and its version, its settings, the seed, and
 the keys of its inputs. A stage whose output is stored under its key is not run again. Ground truth never enters a key.
+Outputs, checkpoints and the asset hold a checksum: a damaged output is an error, a damaged checkpoint restarts a stage.
 """
 
 import contextlib
@@ -30,8 +31,9 @@ from tumble.io import BadFile, files, tree
 
 T = TypeVar("T")
 
-FORMAT = 2
-"""Version of the layout of run directories; incremented when older ones can no longer be read."""
+FORMAT = 3
+"""Version of the layout of run directories; incremented when older ones can no longer be read. Runs of format 2 have no
+checksums, and with estimated poses their objects are upside down."""
 RECIPE = "recipe.json"
 """Settings of the run and the path of its capture."""
 LOG = "log.jsonl"

@@ -5,6 +5,7 @@ Every file is written atomically. Every reader raises `BadFile` with the rule th
 """
 
 from tumble.io import files, outputs, progress, tree, video, weights
+from tumble.io.checked_tensors import read_tensors, write_tensors
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
 
@@ -15,7 +16,9 @@ __all__ = [
     "outputs",
     "plugin_names",
     "progress",
+    "read_tensors",
     "tree",
     "video",
     "weights",
+    "write_tensors",
 ]

@@ -3,7 +3,7 @@
 A *tree* is a frozen dataclass whose fields are tensors, other trees, dicts of tensors, or *plain values* (numbers,
 strings, tuples of those, None). The *name* of a tensor is its path of field names joined by dots, such as
 `trajectory.T_cam_obj.wxyz`. On disk a tree is one safetensors file: tensors by name, and plain values as JSON in the
-header under the key "facts". Nothing is pickled.
+header under the key "facts", with the checksum of `checked_tensors`. Nothing is pickled.
 """
 
 import dataclasses
@@ -14,13 +14,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import safetensors
-import safetensors.torch
 import torch
 from torch import Tensor
 
 from tumble import __version__
-from tumble.io import files
+from tumble.io.checked_tensors import read_tensors, write_tensors
 from tumble.io.files import BadFile
 
 T = TypeVar("T")
@@ -56,28 +54,21 @@ def detach(tree: T) -> T:
 
 def save(tree: object, path: Path) -> None:
     """Write a tree atomically as one safetensors file."""
-    # Tensors may share storage (views of one parameter); safetensors requires each to own its bytes.
-    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in named_tensors(tree).items()}
     header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_plain_values(tree))}
-    files.write_atomically(path, lambda partial: safetensors.torch.save_file(tensors, partial, metadata=header))
+    write_tensors(path, named_tensors(tree), header)
 
 
 def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
     """The tree of class `cls` stored in a file.
 
     Raises:
-        BadFile: The file is damaged, holds another class, or lacks a field.
+        BadFile: The file does not match its checksum, holds another class, or lacks a field.
     """
+    tensors, header = read_tensors(path, FIX)
+    if header.get("type") != cls.__name__:
+        raise BadFile(path, f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}", FIX)
     try:
-        with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
-            header = file.metadata() or {}
-            if header.get("type") != cls.__name__:
-                rule = f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}"
-                raise BadFile(path, rule, FIX)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        return _build(cls, tensors, json.loads(header["facts"]), "")
-    except safetensors.SafetensorError as error:
-        raise BadFile(path, f"is damaged: {error}", FIX) from None
+        return to(_build(cls, tensors, json.loads(header["facts"]), ""), device)
     except KeyError as missing:
         rule = f"lacks {missing}, a field of {cls.__name__}; written by another version?"
         raise BadFile(path, rule, FIX) from None

@@ -11,11 +11,9 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import safetensors
-import safetensors.torch
 import torch
 
-from tumble.io import BadFile, files, load_plugin, progress
+from tumble.io import BadFile, load_plugin, progress, read_tensors, write_tensors
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
@@ -97,14 +95,12 @@ def _cache_path(cache: Path | None, matcher: str, settings: str, *digests: str) 
 
 def _write(path: Path, match: Match) -> None:
     """Write a match without the frames' indices, which depend on the rest of the capture."""
-    tensors = {name: getattr(match, name).contiguous() for name in ("uv_i", "uv_j", "confidence")}
-    files.write_atomically(path, lambda partial: safetensors.torch.save_file(tensors, partial))
+    write_tensors(path, {name: getattr(match, name) for name in ("uv_i", "uv_j", "confidence")}, {"type": "Match"})
 
 
 def _read(path: Path, i: int, j: int) -> Match:
     """Match of a file in the cache, between frames `i` and `j`."""
-    try:
-        tensors = safetensors.torch.load_file(path)
-        return Match(i, j, tensors["uv_i"], tensors["uv_j"], tensors["confidence"])
-    except (safetensors.SafetensorError, KeyError) as error:
-        raise BadFile(path, f"is not a match: {error}", "delete it, it is computed again") from None
+    tensors, header = read_tensors(path, "delete it, it is computed again")
+    if header.get("type") != "Match":
+        raise BadFile(path, "is not a match", "delete it, it is computed again")
+    return Match(i, j, tensors["uv_i"], tensors["uv_j"], tensors["confidence"])
