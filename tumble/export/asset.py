@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import Literal
 
 from tumble import __version__
-from tumble.export import bake, confidence, gltf, mesh, ply
+from tumble.export import atlas, bake, confidence, gltf, mesh, ply
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
 from tumble.io import files, progress
 from tumble.scene import Asset
-
-CHART_PADDING = 8
-"""Minimum gap between charts of the texture atlas [texels]."""
 
 
 @dataclass(frozen=True)
@@ -96,16 +93,14 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
     if values.min() >= 0:
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
     with progress.task("extracting the mesh"):
-        return mesh.simplify(
-            mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)),
-            preset.triangles,
-        )
+        whole = mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells))
+        return mesh.simplify(mesh.smooth(whole), preset.triangles)
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
     """Unwrap the mesh, bake its textures, write the GLB, and beside it the confidence texture over the same UVs."""
     with progress.task("texture coordinates"):
-        flat = mesh.unwrap(shape, preset.texture, CHART_PADDING)
+        flat = atlas.unwrap(shape, preset.texture)
     with progress.task("baking textures"):
         textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
     assert asset.material is not None, "the asset has no material"
