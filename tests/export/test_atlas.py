@@ -88,6 +88,20 @@ def test_long_charts_are_cut_where_the_texture_is_filled_better() -> None:
     assert np.abs(p * s - q * r).sum() / 2 > 0.6
 
 
+def test_a_surface_of_crumbs_is_packed_by_xatlas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise of a cell: hundreds of charts, which would take minutes."""
+
+    def never(*_: object) -> None:
+        raise AssertionError("packed here")
+
+    monkeypatch.setattr(atlas, "pack", never)
+    noise = np.random.default_rng(0).normal(scale=0.05, size=grid().shape[:3])
+    flat = atlas.unwrap(mesh.simplify(marched(to_torus(grid()) + noise), 3000), 256)
+    assert len(chart_sizes(len(flat.vertices), flat.faces)) > atlas.MAX_CHARTS
+    assert flat.uv.min() >= 0
+    assert flat.uv.max() <= 1
+
+
 def test_pieces_without_number_are_an_error_with_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atlas, "_place", lambda charts, n: None)
     with pytest.raises(ValueError, match="has 1 pieces, too many for a texture; use --preset splat"):

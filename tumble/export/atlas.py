@@ -28,12 +28,15 @@ ROTATIONS = 8
 """Number of rotations that are tried for each chart; they are never mirrored, which some viewers handle wrongly."""
 LARGE_CHARTS = 64
 """Number of charts that are rotated; more of them are crumbs, which fit anywhere."""
+MAX_CHARTS = 128
+"""Number of charts above which xatlas packs them, because packing them here would take minutes: the surface is so rough
+that no texture of it can be painted."""
 PROXIMITY = 1 / 32
 """Distance over which the benefit of being close to other charts and to the border decreases by a factor e [side of the
 texture]."""
 ATTEMPTS = (
-    *((longest, filled) for longest in (math.inf, 0.6, 0.35, 0.28) for filled in (0.78, 0.77, 0.76, 0.75)),
-    *((0.35, filled) for filled in (0.74, 0.72, 0.7, 0.66, 0.6, 0.5, 0.35, 0.2, 0.05)),
+    *((longest, filled) for longest in (math.inf, 0.6, 0.35, 0.28) for filled in (0.77, 0.76, 0.75)),
+    *((0.35, filled) for filled in (0.73, 0.7, 0.66, 0.6, 0.5, 0.35, 0.2, 0.05)),
 )
 """Maximum length of a chart [side of the texture at 75 %], and fraction of the texture that the charts cover, in the
 order in which they are tried."""
@@ -75,13 +78,17 @@ def unwrap(mesh: Mesh, resolution: int) -> UnwrappedMesh:
     atlas.add_mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), normals.astype(np.float32))
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_cost, charts.max_iterations, charts.fix_winding = MAX_COST, ITERATIONS, True
+    packing.resolution, packing.padding, packing.bilinear = resolution, GAP * CELL, True
     packing.rotate_charts = False
     atlas.generate(charts, packing)
     origin, faces, uv = atlas[0]
     # The v of xatlas points up (its charts are counterclockwise), that of glTF down.
     faces = faces.astype(np.int64).reshape(-1, 3)
-    uv, faces, source = pack(uv.astype(np.float64) * [atlas.width, -atlas.height], faces, resolution)
-    vertices, normals = mesh.vertices[origin[source]], normals[origin[source]]
+    uv = np.stack([uv[:, 0], 1 - uv[:, 1]], 1).astype(np.float64)
+    if atlas.chart_count <= MAX_CHARTS:
+        uv, faces, source = pack(uv * [atlas.width, atlas.height], faces, resolution)
+        origin = origin[source]
+    vertices, normals = mesh.vertices[origin], normals[origin]
     return UnwrappedMesh(vertices, normals, _tangents(vertices, normals, uv, faces), uv, faces)
 
 
