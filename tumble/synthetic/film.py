@@ -44,9 +44,9 @@ def film_camera(camera: Camera) -> Camera:
     return Camera.from_fov(2 * math.atan(width / 2 / focal), height, width)
 
 
-def shutter_times(frame: int) -> list[float]:
-    """Moments while the shutter is open for a frame [frames]; their mean is the frame's own time."""
-    return [frame + SHUTTER * ((i + 0.5) / SUBFRAMES - 0.5) for i in range(SUBFRAMES)]
+def shutter_times(time: float) -> list[float]:
+    """Moments while the shutter is open for the frame of a time [frames], which is their mean."""
+    return [time + SHUTTER * ((i + 0.5) / SUBFRAMES - 0.5) for i in range(SUBFRAMES)]
 
 
 def pose_at(T_cam_obj: SE3, time: float) -> SE3:

@@ -22,9 +22,9 @@ SURFACE_SAMPLES = 20_000
 """Surface points from which signed distances are computed."""
 GRID, REACH = 64, 1.5
 """Signed distances: grid points per axis, and half the side of the grid's cube [object radius]."""
-PLACEMENTS = 240
+PLACEMENTS = 600
 """Random placements of the palm that are tried per object."""
-KEPT = 48
+KEPT = 96
 """Maximum number of grasps that are kept, the best ones."""
 STEPS = 9
 """Angles at which each joint is tried between open and closed; the contact is interpolated between two of them."""

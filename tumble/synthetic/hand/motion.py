@@ -5,8 +5,8 @@ right or left, takes over; the object stays on its path, as if the other hand he
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -15,7 +15,14 @@ from torch import Tensor
 
 from tumble.maths import SE3, angle_between
 from tumble.synthetic.hand.arm import forearm_curve, forearm_parts, hand_part
-from tumble.synthetic.hand.grasp import SURFACE_SAMPLES, Grasps, find_grasps, object_radius, signed_distance
+from tumble.synthetic.hand.grasp import (
+    SURFACE_SAMPLES,
+    Grasps,
+    SignedDistance,
+    find_grasps,
+    object_radius,
+    signed_distance,
+)
 from tumble.synthetic.hand.rig import Rig, read_rig, scaled
 from tumble.synthetic.pathtracer import ObjectModel, Part
 
@@ -25,10 +32,14 @@ CHANGE = 1.5
 """Time that the hand needs to open and leave, and again to come and close [frames]."""
 RETREAT = 1.2
 """Distance of the opened hand from its grip when another one takes over [object radius]."""
-ELBOW = (2.9, 2.3, 0.5)
-"""Distance of the elbow from the object across, below, and in depth [object radius]; outside of the image."""
+ELBOWS = ((2.9, 2.3, 0.5), (3.3, 0.7, 0.5), (1.2, 3.2, 0.5))
+"""Places of the elbow outside of the image: distance from the object across, below and in depth [object radius]."""
 MAX_BEND = math.radians(55)
 """Angle between hand and forearm above which a grip is uncomfortable [radians]."""
+HIDDEN = 0.35
+"""Fraction of the object's visible side that a grip should hide; few comfortable grips hide as much."""
+COMPARED = 20
+"""Most comfortable choices of a grip that are compared by what they hide."""
 PLAN_SAMPLES = 300
 """Surface points by which grips are compared: how much of the object they hide."""
 
@@ -82,6 +93,22 @@ class HandMotion:
         return {"hand": hand_part(self.rig, vertices, tone)} | arm
 
 
+@dataclass(frozen=True)
+class _Choices:
+    """Every grasp with every place of the elbow."""
+
+    grasps: Grasps
+    elbows: Float[Tensor, "c 3"]
+    """Positions in the camera frame [object radius]."""
+    wrist: Float[Tensor, "c 3"]
+    """Positions in the object frame [object radius]."""
+    back: Float[Tensor, "c 3"]
+    """Unit directions from the hand into the forearm, in the object frame."""
+
+    def __getitem__(self, index: Tensor | int) -> "_Choices":
+        return _Choices(**{name: values[index] for name, values in vars(self).items()})
+
+
 def plan(model: ObjectModel, T_cam_obj: SE3, *, facing: bool, seed: int) -> HandMotion:
     """Grips for a film of the object.
 
@@ -93,26 +120,60 @@ def plan(model: ObjectModel, T_cam_obj: SE3, *, facing: bool, seed: int) -> Hand
     """
     samples, normals = surface_samples(model)
     metre = 1 / object_radius(np.ptp(np.concatenate([part.vertices for part in model.parts]), axis=0))
-    rig, distance = scaled(read_rig(), metre), signed_distance(samples, normals)
-    hands = {left: find_grasps(rig, distance, left=left, seed=seed) for left in (False, True)}
+    rig, poses = scaled(read_rig(), metre), _double(T_cam_obj)
+    choices = _choices(rig, signed_distance(samples, normals), poses.xyz.mean(0), facing=facing, seed=seed)
     thinned = np.random.default_rng(0).choice(len(samples), PLAN_SAMPLES, replace=False)
     surface = torch.from_numpy(samples[thinned]), torch.from_numpy(normals[thinned])
-    poses = _double(T_cam_obj)
     seen = torch.zeros(PLAN_SAMPLES, dtype=torch.bool)
     grips = []
     for start, end in grip_times(poses):
         first, last = math.ceil(start), math.floor(end)
         moments = [poses[i] for i in (first, (first + last) // 2, last)]
-        rated = [
-            (score, shown, grasps[i], elbow)
-            for left, grasps in hands.items()
-            for elbow in [_elbow(poses, left=left, facing=facing)]
-            for i, (score, shown) in enumerate(_rated(rig, grasps, elbow, moments, surface, seen, metre))
-        ]
-        _, shown, grasp, elbow = max(rated, key=lambda each: each[0])
-        seen |= shown
-        grips.append(Grip(start, end, grasp, elbow))
+        comfort = _comfort(choices, moments)
+        score, number = comfort.topk(min(COMPARED, len(comfort)))
+        compared = choices[number]
+        hand = compared.grasps.vertices(rig, compared.grasps.flexion)[:, ::3]
+        shown = torch.zeros(len(score), PLAN_SAMPLES, dtype=torch.bool)
+        for pose in moments:
+            elbow_obj = pose.inverse() @ compared.elbows
+            arm = forearm_curve(compared.wrist, compared.back, elbow_obj, metre)[:, 4:]
+            visible, cosine = _visible(surface, pose.inverse().xyz, hand, arm, metre)
+            hidden = 1 - (cosine * visible).sum(-1) / cosine.sum()
+            score = score - 2 * (hidden - HIDDEN).abs()
+            shown |= visible
+        best = int((score + 2 * (shown & ~seen).double().mean(-1)).argmax())
+        seen |= shown[best]
+        grips.append(Grip(start, end, compared.grasps[best], compared.elbows[best]))
     return HandMotion(rig, metre, tuple(grips))
+
+
+def _choices(rig: Rig, distance: SignedDistance, centre: Float[Tensor, "3"], *, facing: bool, seed: int) -> _Choices:
+    """Grasps of both hands, each with every place of its elbow: at the side of the hand as the camera sees it, and
+    behind the object if the person faces the camera, else before it. `centre` is the object's mean position in the
+    camera frame."""
+    groups = []
+    for left in (False, True):
+        grasps = find_grasps(rig, distance, left=left, seed=seed)
+        signs = centre.new_tensor([1.0 if left == facing else -1.0, 1.0, 1.0 if facing else -1.0])
+        for place in ELBOWS:
+            elbow = (centre + signs * centre.new_tensor(place)).expand(len(grasps.score), 3)
+            wrist = (grasps.R_obj_hand @ rig.bind[0, :3, 3]) + grasps.t_obj_hand
+            groups.append(_Choices(grasps, elbow, wrist, grasps.R_obj_hand @ rig.bind[0, :3, 2]))
+    joined = {name: torch.cat([vars(g.grasps)[name] for g in groups]) for name in vars(groups[0].grasps)}
+    return _Choices(
+        Grasps(**joined), *(torch.cat([vars(g)[name] for g in groups]) for name in ("elbows", "wrist", "back"))
+    )
+
+
+def _comfort(choices: _Choices, moments: list[SE3]) -> Float[Tensor, " c"]:
+    """How well each choice holds the object, less what the wrist bends too far and the arm points to the camera."""
+    score = 0.25 * choices.grasps.score
+    for T_cam_obj in moments:
+        to_elbow = torch.nn.functional.normalize(T_cam_obj.inverse() @ choices.elbows - choices.wrist, dim=-1)
+        bend = torch.acos((to_elbow * choices.back).sum(-1).clamp(-1, 1))
+        to_camera = -(T_cam_obj.rotation @ choices.back)[..., 2]
+        score = score - 1.5 * (bend - MAX_BEND).clamp_min(0) - (to_camera - 0.4).clamp_min(0)
+    return score
 
 
 def surface_samples(model: ObjectModel) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
@@ -120,7 +181,7 @@ def surface_samples(model: ObjectModel) -> tuple[Float[np.ndarray, "n 3"], Float
     import trimesh
 
     meshes = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in model.parts]
-    mesh = trimesh.util.concatenate(meshes)
+    mesh = cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
     points, faces = trimesh.sample.sample_surface(mesh, SURFACE_SAMPLES, seed=0)[:2]
     return np.asarray(points), np.asarray(mesh.face_normals[faces])
 
@@ -136,59 +197,21 @@ def grip_times(T_cam_obj: SE3) -> list[tuple[float, float]]:
     return list(zip([-0.5, *ends], [*ends, len(turned) - 0.5], strict=True))
 
 
-def _elbow(poses: SE3, *, left: bool, facing: bool) -> Float[Tensor, "3"]:
-    """Position of the elbow in the camera frame: below the object, at the side of the hand as the camera sees it,
-    and behind the object if the person faces the camera."""
-    across, below, behind = ELBOW
-    side = 1.0 if left == facing else -1.0
-    return poses.xyz.mean(0) + torch.tensor([side * across, below, behind if facing else -behind], dtype=torch.float64)
-
-
-def _rated(
-    rig: Rig,
-    grasps: Grasps,
-    elbow: Float[Tensor, "3"],
-    moments: list[SE3],
-    surface: tuple[Tensor, Tensor],
-    seen: Tensor,
-    metre: float,
-) -> Iterable[tuple[float, Tensor]]:
-    """Score of each grasp for one grip, and the surface points that it leaves visible at some of the moments: a score
-    is low if the wrist bends far, the arm points to the camera or much of the object is hidden, above all parts that
-    have not been seen before."""
-    wrist = (grasps.R_obj_hand @ rig.bind[0, :3, 3]) + grasps.t_obj_hand
-    back = grasps.R_obj_hand @ rig.bind[0, :3, 2]
-    hand = grasps.vertices(rig, grasps.flexion)[:, ::5]
-    score = 0.25 * grasps.score
-    shown = torch.zeros(len(wrist), len(seen), dtype=torch.bool)
-    for T_cam_obj in moments:
-        elbow_obj = T_cam_obj.inverse() @ elbow
-        bend = torch.acos((torch.nn.functional.normalize(elbow_obj - wrist, dim=-1) * back).sum(-1).clamp(-1, 1))
-        to_camera = -(T_cam_obj.rotation @ back)[..., 2]
-        score -= 1.5 * (bend - MAX_BEND).clamp_min(0) + (to_camera - 0.4).clamp_min(0)
-        arm = forearm_curve(wrist, back, elbow_obj.expand_as(wrist), metre)[:, 4:]
-        visible, front = _visible(surface, T_cam_obj.inverse().xyz, hand, arm, metre)
-        score -= 1.2 * (front & ~visible).sum(-1) / front.sum()
-        shown |= visible
-    score += 2.0 * (shown & ~seen).double().mean(-1)
-    return zip(score.tolist(), shown, strict=True)
-
-
 def _visible(
     surface: tuple[Tensor, Tensor], camera_obj: Tensor, hand: Tensor, arm: Tensor, metre: float
 ) -> tuple[Tensor, Tensor]:
-    """Which surface points the camera sees past each hand and arm, and which face the camera; both are approximated by
-    balls around their points."""
+    """Which surface points the camera sees past each hand and arm, which are approximated by balls around their points;
+    and the cosine between each point's normal and the direction to the camera, 0 if it faces away."""
     points, normals = surface
     to_camera = torch.nn.functional.normalize(camera_obj - points, dim=-1)
-    front = (to_camera * normals).sum(-1) > 0.1
+    facing = (to_camera * normals).sum(-1).clamp_min(0)
     hidden = torch.zeros(len(hand), len(points), dtype=torch.bool)
-    for blockers, radius in ((hand, 0.007 * metre), (arm, 0.04 * metre)):
+    for blockers, radius in ((hand, 0.005 * metre), (arm, 0.035 * metre)):
         offset = blockers[:, None] - points[:, None]
         along = (offset * to_camera[:, None]).sum(-1)
         across = (offset**2).sum(-1) - along**2
         hidden |= ((along > 0.02) & (across < radius**2)).any(-1)
-    return front & ~hidden, front
+    return (facing > 0.1) & ~hidden, facing
 
 
 def _double(pose: SE3) -> SE3:
