@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.synthetic.hand.rig import DIGITS, Rig, read_rig
+from tumble.synthetic.hand.rig import DIGITS, WRIST_END, Rig, read_rig
 from tumble.synthetic.pathtracer import Part
 from tumble.synthetic.surfaces import noise, pattern, smooth_normals, tube
 
@@ -24,8 +24,10 @@ SKIN_ROUGHNESS = 0.5
 """Perceptual roughness of skin."""
 CLOTHS = ((0.05, 0.09, 0.22), (0.35, 0.06, 0.05), (0.10, 0.16, 0.09), (0.45, 0.42, 0.38), (0.03, 0.03, 0.035))
 """Albedos of sleeves, one of which is drawn [linear RGB]."""
-CUFF = 0.045
-"""Length of the bare forearm between the hand's mesh and the sleeve [metres]."""
+INSIDE = 0.014
+"""Depth inside the hand at which the forearm begins [metres]."""
+CUFF = 0.055
+"""Length of the forearm that the sleeve leaves bare [metres]."""
 ELBOW_RADIUS = 0.047
 """Radius of the forearm at the elbow [metres]."""
 BEND_LENGTH = 0.07
@@ -153,18 +155,17 @@ def forearm_parts(
     """
     axes = (T_obj_hand @ rig.bind[0])[:3]
     local = (rig.vertices - rig.bind[0, :3, 3]) @ rig.bind[0, :3, :3]
-    stub = float(local[:, 2].max())
-    end = local[local[:, 2] > 0.7 * stub]
+    end = local[(local[:, 2] - WRIST_END * metre).abs() < 0.005 * metre]
     half = (end.amax(0) - end.amin(0))[:2].numpy() / 2
-    middle = torch.cat([(end.amax(0) + end.amin(0))[:2] / 2, end.new_tensor([0.3 * stub])])
+    middle = torch.cat([(end.amax(0) + end.amin(0))[:2] / 2, end.new_tensor([-INSIDE * metre])])
     start = axes[:, 3] + axes[:, :3] @ middle
     curve = forearm_curve(start, axes[:, 2], elbow, metre).numpy()
     length = np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
-    fine = np.linspace(0, length[-1], 40)
+    fine = np.linspace(0, length[-1], 60)
     curve = np.stack([np.interp(fine, length, curve[:, i]) for i in range(3)], -1)
     share = (fine / (0.24 * metre)).clip(0, 1)[:, None] ** 0.7
     # The bare forearm grows out of the hand's mesh, so that the end of the mesh lies inside.
-    emerging = 0.85 + 0.2 * (fine / (0.7 * stub)).clip(0, 1)[:, None]
+    emerging = 0.78 + 0.3 * (fine / ((INSIDE + WRIST_END) * metre)).clip(0, 1)[:, None]
     radii = (1 - share) * half * emerging + share * ELBOW_RADIUS * metre
     bare = fine <= (CUFF + 0.03) * metre
     covered = fine >= CUFF * metre

@@ -25,6 +25,8 @@ BONES = ("metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-dist
 """Suffixes of the names of the joints along a digit; the thumb has no intermediate one."""
 FLEXED = 3
 """Joints that flex per digit, from the palm to the tip: all three of the thumb, the three phalanges of a finger."""
+WRIST_END = 0.006
+"""Distance behind the wrist at which the hand's mesh ends, inside of the forearm [metres]; the file's ends later."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ def read_rig() -> Rig:
     names = [document["nodes"][i]["name"] for i in skin["joints"]]
     # glTF stores matrices column by column.
     inverse_bind = _accessor(document, binary, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    bind = np.linalg.inv(inverse_bind.astype(np.float64))
+    behind_wrist = (attributes["POSITION"] - bind[0, :3, 3]) @ bind[0, :3, 2]
     weights = np.zeros((len(attributes["POSITION"]), len(names)))
     for joint, weight in zip(attributes["JOINTS_0"].T, attributes["WEIGHTS_0"].T, strict=True):
         np.add.at(weights, (np.arange(len(weights)), joint), weight)
@@ -69,10 +73,10 @@ def read_rig() -> Rig:
         chains.append(chain[-1 - FLEXED : -1])
     return Rig(
         torch.from_numpy(attributes["POSITION"].astype(np.float64)),
-        torch.from_numpy(faces[~_lid(attributes["TEXCOORD_0"], faces)]),
+        torch.from_numpy(faces[behind_wrist[faces].mean(1) < WRIST_END]),
         torch.from_numpy(attributes["TEXCOORD_0"].astype(np.float64)),
         torch.from_numpy(weights / weights.sum(1, keepdims=True)),
-        torch.from_numpy(np.linalg.inv(inverse_bind.astype(np.float64))),
+        torch.from_numpy(bind),
         tuple(parents),
         torch.tensor(chains),
     )
@@ -92,11 +96,6 @@ def _accessor(document: dict[str, Any], binary: bytes, number: int) -> np.ndarra
     width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     return np.frombuffer(binary, dtype, accessor["count"] * width, start).reshape(-1, width)
-
-
-def _lid(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which triangles close the mesh at the wrist, where the forearm begins: an island at the texture's top left."""
-    return (uv[faces].mean(1) < (0.35, 0.25)).all(1)
 
 
 def joint_transforms(
