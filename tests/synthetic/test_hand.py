@@ -127,7 +127,7 @@ def test_fingers_end_on_the_surface(box: Path, left: bool) -> None:
 
 
 def test_the_hand_turns_with_the_object_and_changes_its_place(box: Path) -> None:
-    poses = trajectories.handheld(24, trajectories.distance_for(math.radians(30)), seed=1)
+    poses = trajectories.turntable(24, trajectories.distance_for(math.radians(30)))
     plan = motion.plan(pathtracer.read_model(box), poses, facing=True, seed=0)
     assert len(plan.grips) >= 2
     assert [grip.end for grip in plan.grips[:-1]] == [grip.start for grip in plan.grips[1:]]
