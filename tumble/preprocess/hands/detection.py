@@ -21,7 +21,7 @@ from tumble.preprocess.hands import networks
 TURNS = (0.0, -math.pi / 3, math.pi / 3)
 """Rotations of the image in which palms are searched [rad]."""
 MIN_PALM_SCORE = 0.3
-"""Minimum score of a palm. MediaPipe's 0.5 finds fewer hands that hold an object; the landmark network rejects others."""
+"""Minimum score of a palm. MediaPipe's 0.5 finds fewer hands that hold an object; others have no presence."""
 MIN_PRESENCE = 0.5
 """Minimum probability that a crop shows a hand."""
 MAX_OVERLAP = 0.3

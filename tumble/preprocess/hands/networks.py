@@ -28,14 +28,14 @@ STRIDES = (2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1, 1, 1)
 
 @dataclass(frozen=True)
 class Layer:
-    """A convolution, depthwise if its weight has one input channel, or a linear layer; PReLU follows if it has slopes."""
+    """A convolution, depthwise if its weight has one input channel, or a linear layer."""
 
     weight: Tensor
     """[out, in, height, width], or [out, in] for a linear layer."""
     bias: Tensor
     """[out]"""
     slope: Tensor | None
-    """Factor of negative values, per channel."""
+    """Slopes of the PReLU that follows, for negative values, per channel."""
 
 
 @cache
