@@ -40,7 +40,7 @@ MIN_USABLE_FRACTION = 0.01
 N_BACKGROUND_SAMPLES = 30
 """Number of frames from which colours of the background are sampled."""
 SAMPLE_MARGIN = 4
-"""Distance from the object within which no colour is sampled [pixels]."""
+"""Distance from object and hand within which no colour is sampled [pixels]."""
 SAMPLE_DEVIATION = 6.0
 """Standard deviation of a pixel of the background over time, as compared with samples [code values]."""
 MIN_SAMPLES = 4
@@ -78,7 +78,7 @@ class Background:
 
 @dataclass(frozen=True)
 class BackgroundSamples:
-    """Colours of each pixel on some frames on which it shows no object (sample consensus, as in ViBe).
+    """Colours of each pixel on some frames on which nothing covers it (sample consensus, as in ViBe).
 
     They hold what `Background` cannot: a person behind the object who moves, and a wall that appears late.
     """
@@ -88,7 +88,7 @@ class BackgroundSamples:
     images: UInt8[np.ndarray, "k h w 3"]
     """sRGB code values, slightly blurred."""
     valid: Bool[np.ndarray, "k h w"]
-    """Pixels that show no object."""
+    """Pixels that show neither object nor hand."""
 
     def log_likelihood(self, image: UInt8[np.ndarray, "h w 3"], index: int) -> Float32[np.ndarray, "h w"]:
         """Log density of the colours of frame `index`, given the other frames; not a number where these are too few."""
@@ -105,15 +105,15 @@ class BackgroundSamples:
         return np.where(count >= MIN_SAMPLES, known, np.float32(np.nan))
 
 
-def sample_background(images: UInt8[np.ndarray, "t h w 3"], object: Bool[np.ndarray, "t h w"]) -> BackgroundSamples:
-    """Colours of every pixel where the object is not near, on evenly spaced frames.
+def sample_background(images: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"]) -> BackgroundSamples:
+    """Colours of every pixel where nothing covers it or its neighbourhood, on evenly spaced frames.
 
     Args:
-        object: Pixels of the object.
+        covered: Pixels of the object and of hands.
     """
     index = np.unique(np.linspace(0, len(images) - 1, N_BACKGROUND_SAMPLES).round().astype(int))
     margin = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * SAMPLE_MARGIN + 1,) * 2)
-    near = [cv2.dilate(object[i].astype(np.uint8), margin) > 0 for i in index]
+    near = [cv2.dilate(covered[i].astype(np.uint8), margin) > 0 for i in index]
     return BackgroundSamples(index, np.stack([cv2.GaussianBlur(images[i], (3, 3), 0) for i in index]), ~np.stack(near))
 
 

@@ -6,6 +6,7 @@ be compared. They are combined by Bayes' rule with a prior from the previous fra
 iterations of a Markov random field whose neighbours are coupled if their colours are similar.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,8 +29,12 @@ OBJECT_NOVELTY = 0.1
 """Probability that a pixel of the object has a colour not learnt yet, or one of a background known only by colour."""
 HAND_NOVELTY = 0.02
 """Probability that a pixel of the hand has a colour not learnt yet."""
+NO_HAND_LOG_LIKELIHOOD = math.log(HAND_NOVELTY * UNIFORM_DENSITY)
+"""Log likelihood, under hand, of a colour that hands do not have."""
 BACKGROUND_NOVELTY = 0.001
 """Probability that a pixel of the static background has another colour; it hardly changes."""
+UNKNOWN_BACKGROUND_NOVELTY = 0.5
+"""Probability that a pixel of a background that was never visible has a colour that others do not have."""
 SHADOW_PENALTY = 5.0
 """Penalty of the log likelihood for explaining a pixel by a shadow on the background."""
 MIN_SHADOW_RATIO = 0.55
@@ -152,15 +157,13 @@ def log_likelihoods(
         sampled: Log likelihood of the background from other frames (`BackgroundSamples`); not a number if unknown.
     """
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-    log_background = _log_density(colours.background, OBJECT_NOVELTY, lab) + np.float32(
-        np.log(UNKNOWN_BACKGROUND_PRIOR)
-    )
+    log_background = _log_density(colours.background, UNKNOWN_BACKGROUND_NOVELTY, lab)
     static = _background_log_density(image, background)
-    if sampled is None:
-        log_background = np.where(background.known, static, log_background)
-    else:
-        both = np.where(background.known, np.logaddexp(static, sampled) - np.float32(np.log(2)), sampled)
-        log_background = np.where(np.isnan(sampled), np.where(background.known, static, log_background), both)
+    log_background = np.where(background.known, static, log_background)
+    if sampled is not None:
+        known = np.nan_to_num(sampled)
+        both = np.where(background.known, np.logaddexp(static, known) - np.float32(np.log(2)), known)
+        log_background = np.where(np.isnan(sampled), log_background, both)
     log_object, log_hand = (
         _log_density(colours.object, OBJECT_NOVELTY, lab),
         _log_density(colours.hand, HAND_NOVELTY, lab),

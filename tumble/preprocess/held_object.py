@@ -22,6 +22,7 @@ from tumble.preprocess.background import Background, BackgroundSamples
 from tumble.preprocess.colour_model import (
     BACKGROUND_CLASS,
     HAND_CLASS,
+    NO_HAND_LOG_LIKELIHOOD,
     OBJECT_CLASS,
     SEED_WEIGHT,
     ColourModel,
@@ -39,8 +40,6 @@ MAX_OBJECT_LOG_RATIO = 1.5
 """Log likelihood ratio of object to hand above which a pixel at a landmark, which may be hidden, shows the object."""
 ARM_LOG_ODDS = 1.5
 """Log odds of a hand behind the wrist."""
-FAR_FROM_HAND_LOG_ODDS = -3.0
-"""Log odds of a hand within the expected object, away from all landmarks: the object's texture."""
 MAX_LOG_RATIO = 8.0
 """Limit of the log likelihood ratios of one pixel."""
 MIN_PROBABILITY = 0.01
@@ -228,16 +227,18 @@ def _segment_frame(
 
     Args:
         predicted: The object, as predicted.
-        expected: Where the object is expected; away from the landmarks, pixels in it show no hand.
+        expected: Where the object is expected; away from the landmarks, a colour in it does not tell a hand: it is the
+            object's print.
     """
     log_ratio = log_likelihoods(frame.image, background, colours, frame.sampled)
+    if frame.surroundings is not None:
+        far = expected & ~frame.surroundings
+        log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)
     log_ratio = np.maximum(log_ratio, log_ratio.max(0) - MAX_LOG_RATIO)
     hidden = log_ratio[OBJECT_CLASS] - log_ratio[HAND_CLASS] > MAX_OBJECT_LOG_RATIO
     log_ratio[HAND_CLASS, frame.strokes & ~hidden] += STROKE_LOG_ODDS
     inner = segmentation.eroded(predicted, segmentation.search_radius(predicted))
     log_ratio[HAND_CLASS, frame.arm & ~inner] += ARM_LOG_ODDS
-    if frame.surroundings is not None:
-        log_ratio[HAND_CLASS, expected & ~frame.surroundings] += FAR_FROM_HAND_LOG_ODDS
     probabilities = class_probabilities(log_ratio + np.log(prior), frame.image)
     inside = _connected(probabilities.argmax(0) == OBJECT_CLASS, predicted)
     return _State(np.where(inside, probabilities, _without_object(probabilities)), inside)
@@ -282,7 +283,7 @@ def _updated(
 
 
 def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
-    """Three-valued mask; near the object, a pixel of unknown background is unknown."""
+    """Three-valued mask. What moves is unknown, and so is a pixel of unknown background near the object."""
     near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
-    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | (near & ~background.known)
+    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & ~background.known)
     return segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)

@@ -29,7 +29,7 @@ from tumble.preprocess.background import (
     sample_background,
 )
 from tumble.preprocess.footage import Footage, FootageFrame, Lens, open_footage, read_frames, resolve_lens
-from tumble.preprocess.hands import Hand, hand_region, track_hands
+from tumble.preprocess.hands import Hand, hand_surroundings, track_hands
 from tumble.preprocess.options import MAX_SURVEY_FRAMES, MIN_SIDE, FootageOptions
 from tumble.preprocess.segmentation import Masks, Seed
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera
@@ -166,7 +166,8 @@ def _segment(
     images = _compensated(scan.images, gains)
     background = fill_unknown(estimate_background(images, covered), background)
     if options.segmenter == "grabcut":
-        samples = sample_background(images, masks.labels == OBJECT)
+        at_hands = np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
+        samples = sample_background(images, at_hands | (masks.labels == OBJECT)) if any(hands) else None
         masks = _masks(path, images, background, seed, hands, options, samples)
     return images, gains, background, seed, masks
 
@@ -174,7 +175,7 @@ def _segment(
 def _hand_or_skin(images: np.ndarray, hands: Sequence[Sequence[Hand]], background: Background) -> np.ndarray:
     """Pixels of every frame that may show hands: at their landmarks, or those of moving skin if none were detected."""
     if any(hands):
-        return np.stack([hand_region(found, images.shape[1:3]) for found in hands])
+        return np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
     return np.stack([segmentation.moving_skin(image, background) for image in images])
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from tumble.preprocess.hands.detection import Hand
+from tumble.preprocess.hands.detection import MIDDLE, RING, WRIST, Hand
 
 FINGERS = ((1, 2, 3, 4), (5, 6, 7, 8), (0, 9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
 """Landmarks of thumb, index, middle, ring and little finger, from the palm to the tip; the middle one from the wrist,
@@ -19,6 +19,13 @@ PALM_MARGIN = 0.05
 """Width of the rim of the palm that is not certain, as a fraction of the size of the palm."""
 REGION_MARGIN = 0.4
 """Distance from the landmarks up to which a hand may reach, as a fraction of the size of the palm."""
+
+FINGER_MARGIN = 0.25
+"""Distance from the strokes up to which pixels may show fingers, as a fraction of the size of the palm."""
+ARM_WIDTH = 0.8
+"""Width of an arm as a fraction of the size of the palm."""
+ARM_REACH = (0.3, 6.0)
+"""Distances from the wrist between which the arm is expected [size of the palm]."""
 
 
 def hand_strokes(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
@@ -53,6 +60,38 @@ def hand_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarra
         hull = cv2.convexHull(np.floor(hand.landmarks).astype(np.int32))
         cv2.fillConvexPoly(mask, hull, 1)
         cv2.polylines(mask, [hull], True, 1, _thickness(2 * REGION_MARGIN * palm_size(hand)))
+    return mask.astype(bool)
+
+
+def hand_surroundings(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the hands and close to them: the strokes, widened to fingers.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, np.uint8)
+    for hand in hands:
+        radius = _thickness(FINGER_MARGIN * palm_size(hand))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        mask |= cv2.dilate(hand_strokes([hand], shape).astype(np.uint8), disc)
+    return mask.astype(bool)
+
+
+def arm_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels behind the wrists, in the direction of the palms: an arm is there unless the wrist is bent.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, np.uint8)
+    for hand in hands:
+        wrist, knuckles = hand.landmarks[WRIST], (hand.landmarks[MIDDLE] + hand.landmarks[RING]) / 2
+        size, direction = palm_size(hand), wrist - knuckles
+        direction /= max(float(np.linalg.norm(direction)), 1e-3)
+        near, far = (np.floor(wrist + reach * size * direction).astype(int).tolist() for reach in ARM_REACH)
+        cv2.line(mask, near, far, 1, _thickness(ARM_WIDTH * size))
     return mask.astype(bool)
 
 

@@ -22,6 +22,8 @@ MIN_TRACKED_PRESENCE = 0.3
 """Minimum probability of a hand where the neighbouring frame shows one."""
 SEARCH_INTERVAL = 10
 """Number of frames after which palms are searched although a hand is tracked."""
+LOST_INTERVAL = 3
+"""Number of frames after which palms are searched while no hand is tracked."""
 
 
 def track_hands(images: Sequence[UInt8[np.ndarray, "h w 3"]] | UInt8[np.ndarray, "t h w 3"]) -> list[list[Hand]]:
@@ -30,7 +32,7 @@ def track_hands(images: Sequence[UInt8[np.ndarray, "h w 3"]] | UInt8[np.ndarray,
     hands: list[Hand] = []
     for i, image in enumerate(images):
         hands = follow(image, hands)
-        if not hands or i % SEARCH_INTERVAL == 0:
+        if i % (SEARCH_INTERVAL if hands else LOST_INTERVAL) == 0:
             hands = distinct(hands + detect_hands(image))
         found.append(hands)
     for i in range(len(images) - 2, -1, -1):
