@@ -16,7 +16,7 @@ from tumble.datasets import reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
-from tumble.poses import PoseResult, neighbours
+from tumble.poses import PoseResult, mask_refinement, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
 from tumble.preprocess import FOOTAGE, PROVENANCE, FootageOptions, footage_fingerprint, input_kind, to_capture
@@ -104,7 +104,7 @@ def estimate_poses(
         BadFile: The capture has too few frames, or too few of them could be tracked.
     """
     capture = replace(capture, trajectory=None)
-    return _track(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
+    return _poses_of(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
 
 
 def reconstruct(
@@ -168,7 +168,7 @@ def _reconstruct(
     """The asset on the CPU, and the names of its frames."""
     recipe, trajectory, key = opened.recipe, capture.trajectory, content_key(capture)
     if trajectory is None:
-        tracked, key = (found, "") if found else _track(opened, capture, where, key)
+        tracked, capture, key = (found, capture, "") if found else _poses_of(opened, capture, where, key)
         kept = torch.where(~tracked.quality.lost)[0].tolist()
         trajectory = tracked.trajectory.select(kept)
         capture = replace(capture.select(kept), camera=tracked.camera)
@@ -192,11 +192,26 @@ def stage_of(cfg: Any) -> Any:
     return stage
 
 
-def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tuple[PoseResult, str]:
-    """Stage 1: match frames, then estimate all poses; also returns the key of the result."""
+def _poses_of(opened: run.Run, capture: Capture, where: Path, content: str) -> tuple[PoseResult, Capture, str]:
+    """Stage 1, repeated with trimmed masks while that explains more: poses, capture with these masks, key."""
     if len(capture) < MIN_FRAMES:
         rule = f"has {len(capture)} frames, too few to estimate the motion"
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
+    tracked, key = _track(opened, capture, where, content, 1)
+    for number in range(2, mask_refinement.ROUNDS + 1):
+        if not mask_refinement.can_be_trimmed(capture, tracked):
+            break
+        trimmed = mask_refinement.trim_masks(capture, tracked)
+        new, new_key = _track(opened, trimmed, where, content_key(trimmed), number)
+        if not mask_refinement.explains_more(new, tracked):
+            break
+        tracked, capture, key = new, trimmed, new_key
+    _check_quality(opened, capture, where, tracked)
+    return tracked, capture, key
+
+
+def _track(opened: run.Run, capture: Capture, where: Path, content: str, number: int) -> tuple[PoseResult, str]:
+    """One round of stage 1: match frames, then estimate all poses; also returns the key of the result."""
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
@@ -210,9 +225,7 @@ def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tupl
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]
-    tracked, key = run.stage(opened, run.TRACK, route, recipe.track, inputs, keys)
-    _check_quality(opened, capture, where, tracked)
-    return tracked, key
+    return run.stage(opened, mask_refinement.folder(number), route, recipe.track, inputs, keys)
 
 
 def _check_quality(opened: run.Run, capture: Capture, where: Path, tracked: PoseResult) -> None:

@@ -26,7 +26,7 @@ from tumble.engine import loop, run
 from tumble.inverse_rendering import Refined, decompose
 from tumble.io import BadFile, tree
 from tumble.maths import SO3, resize_area, srgb_from_linear, texel_directions
-from tumble.poses import PoseResult
+from tumble.poses import PoseResult, mask_refinement
 from tumble.rendering import relight
 from tumble.report import panorama
 from tumble.scene import Asset, Capture, Environment, Gaussians, Material, Trajectory, opacity
@@ -80,7 +80,7 @@ def read_snapshot(out: Path, capture: Capture | None) -> Snapshot:
         BadFile: A file of the run is damaged.
     """
     source = next((name for name in SOURCES if (out / name).is_file()), "")
-    tracked = run.output(out, run.TRACK, PoseResult)
+    tracked = mask_refinement.stored_result(out, capture)[0] if capture else run.output(out, run.TRACK, PoseResult)
     trajectory, names = _frames(tracked, capture)
     if source == run.ASSET:
         asset = run.asset(out, Asset)
@@ -200,9 +200,9 @@ class ViewerWindow:
             self.capture = _load_capture(self.out)
         if (timestamps, self.capture is None) != self.timestamps:
             self.timestamps = timestamps, self.capture is None
-            tracked = run.output(self.out, run.TRACK, PoseResult)
-            if self.capture is not None and tracked is not None:
-                self.capture = replace(self.capture, camera=tracked.camera)
+            if self.capture is not None:
+                tracked, _ = mask_refinement.stored_result(self.out, self.capture)
+                self.capture = replace(self.capture, camera=tracked.camera) if tracked else self.capture
             self.snapshot = read_snapshot(self.out, self.capture)
             self._show_cameras()
             self.map.options = tuple(self.snapshot.colours) or ("as captured",)

@@ -30,7 +30,7 @@ from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
 from tumble.io import BadFile, files, progress
 from tumble.maths import fibonacci_sphere
-from tumble.poses import PoseQuality, PoseResult
+from tumble.poses import PoseQuality, mask_refinement
 from tumble.report import figures, health_card, preset_lights, svg, training_views
 from tumble.report.training_views import RenderedFrame
 from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
@@ -90,8 +90,8 @@ def write_report(out: Path, *, capture: Path | None = None) -> Path:
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
     full_capture = reader_for(path).load(path)
+    tracked, full_capture = mask_refinement.stored_result(out, full_capture)
     run_capture = frames_of_run(full_capture, asset, list(files.read_json(out / run.POSES)), path)
-    tracked = run.output(out, run.TRACK, PoseResult)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
     assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
