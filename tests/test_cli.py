@@ -1,12 +1,16 @@
 """The command line: help is there, errors are one line with exit code 1, nothing needs a display."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
+from tests.test_interrupt import capture, whole  # noqa: F401 (fixtures)
 from tumble import cli
+from tumble.scene.environment import Environment
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -72,6 +76,44 @@ def test_an_unknown_command_ends_with_code_2(
 ) -> None:
     assert run(monkeypatch, "juggle") == 2
     assert "juggle" in capsys.readouterr().err
+
+
+def test_progress_goes_to_standard_error_and_the_result_to_standard_output(
+    whole: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One line per task where there is no terminal; the next command does not print it twice."""
+    Environment.from_radiance(torch.rand(8, 16, 3)).write(tmp_path / "sun.hdr")
+    for out in ("a", "b"):
+        words = ["relight", str(whole), "--env", str(tmp_path / "sun.hdr"), "--fast", "-o", str(tmp_path / out)]
+        assert run(monkeypatch, *words) == 0
+        printed = capsys.readouterr()
+        assert printed.err == "tumble: relighting under sun (8 steps)\n"
+        assert printed.out.strip() == str(tmp_path / out)
+
+
+def test_sigterm_ends_a_command_like_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def doctor() -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(cli, "COMMANDS", (doctor, cli.demo))
+    found = signal.getsignal(signal.SIGTERM)
+    try:
+        assert run(monkeypatch, "doctor") == 130
+    finally:
+        signal.signal(signal.SIGTERM, found)
+    assert "interrupted; finished work is kept" in capsys.readouterr().err
+
+
+def test_the_help_names_the_option_for_the_version(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "--help") == 0
+    assert "--version" in capsys.readouterr().out
 
 
 def test_the_installed_command_answers() -> None:

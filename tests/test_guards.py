@@ -41,7 +41,11 @@ MAY_IMPORT = {
     "report": {"io", "maths", "scene", "rendering", "engine", "datasets", "poses", "evaluation", "export"},
 }
 """Rooms that each room may import, besides itself; the files beside them may import all."""
-INNER_ROOMS = {"poses.sfm": "poses.progressive", "poses.progressive": "poses.sfm"}
+INNER_ROOMS = {
+    "poses.sfm": "poses.progressive",
+    "poses.progressive": "poses.sfm",
+    "preprocess.hands": "preprocess",
+}
 """Rooms within a room, with the one that they do not know."""
 PLUGINS = ("backends", "matching")
 """Rooms of plugins: their `__init__` is the contract, and files of them are found by name."""

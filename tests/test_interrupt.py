@@ -226,14 +226,26 @@ def test_only_what_dead_processes_left_half_written_is_swept(tmp_path: Path) -> 
 # What is damaged, full or closed --------------------------------------------------------------------------------------
 
 
+def halve(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size // 2)
+
+
+def flip_a_byte(path: Path) -> None:
+    """In the middle of the tensors, where each value is as good as another for the format of the file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [halve, flip_a_byte])
 @pytest.mark.parametrize("name", ["2-refine/out.safetensors", "3-decompose/out.safetensors", "asset.safetensors"])
 def test_a_damaged_output_is_named_with_the_fix_and_the_fix_works(
-    capture: Path, whole: Path, tmp_path: Path, name: str
+    capture: Path, whole: Path, tmp_path: Path, name: str, damage: Callable[[Path], None]
 ) -> None:
     out = tmp_path / "run"
     shutil.copytree(whole, out)
-    with (out / name).open("r+b") as file:
-        file.truncate((out / name).stat().st_size // 2)
+    damage(out / name)
     read = (lambda: actions.finished(out)) if name == run.ASSET else None
     with pytest.raises(BadFile, match=rf"{name}: is damaged: .*\(remove it and run the command that made it again\)"):
         read() if read else pipeline.reconstruct(capture, out, RECIPE)
@@ -258,15 +270,15 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
     light = tmp_path / "sun.hdr"
     Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
     before = finished_run(whole)
-    with full_disk(100), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
+    with full_disk(300), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
         actions.relight_run(whole, light, tmp_path / "pictures", fast=True)
-    assert list((tmp_path / "pictures").iterdir()) == []
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == [actions.LIGHT_FILE]
     with full_disk(3000), pytest.raises(OSError, match=r"asset\.ply: cannot be written"):
         actions.export_run(whole, tmp_path / "export", "splat", None)
+    assert [path.name for path in (tmp_path / "export").iterdir()] == ["export.json"]
     for name, write in (("x.exr", files.write_exr), ("x.hdr", files.write_hdr)):
         with full_disk(100), pytest.raises(OSError, match=rf"{name}: cannot be written: .*(too large|full)"):
             write(tmp_path / name, torch.rand(8, 16, 3).numpy())
-    assert list((tmp_path / "export").iterdir()) == []
     assert finished_run(whole) == before
 
     def refuse(*_: object, **__: object) -> None:

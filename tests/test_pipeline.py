@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from tests.lopsided import truth, tumbling
+from tests.lopsided import Tumble, truth, tumbling
 from tests.poses.sfm.test_stage import QUICK, matches
 from tests.scene.test_visual_hull import silhouettes
 from tumble import actions, matching, pipeline, recipes
 from tumble.datasets import _capture_folder, folder
 from tumble.engine import loop
 from tumble.engine import run as runs
+from tumble.export import asset as export
+from tumble.export.asset import Preset
 from tumble.inverse_rendering import decompose, mean_colour_baseline, refine, specular_fit
 from tumble.io import files, tree, video
 from tumble.io.files import BadFile
@@ -153,8 +155,14 @@ def test_finished_stages_are_not_run_again(
     assert_same(pipeline.reconstruct(capture, finished[0], RECIPE), finished[1])
 
 
-def test_a_run_is_scored_with_known_poses_as_they_are(finished: tuple[Path, Asset], capture: Path) -> None:
+def test_a_run_is_scored_with_known_poses_as_they_are(
+    finished: tuple[Path, Asset], capture: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "tumble")
     report = actions.evaluate_run(finished[0], capture)
+    told = [message.partition(" (")[0] for message in caplog.messages]
+    assert told[:2] == ["rendering maps of the evaluation views", "rendering views under the estimated light"]
+    assert told[-1] == "scoring views"
     assert set(report["regions"]) == {"shared", "sphere"}
     shared = report["regions"]["shared"]
     for key in ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_full_srgb", "normal.mean_fg_degrees"):
@@ -214,6 +222,7 @@ def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monke
     begun = float(guess.camera.fx_fy_cx_cy[0])
     assert said == [f"focal length {focal:.0f} pixels (estimated; {begun:.0f} was assumed)"]
     assert_same(pipeline.reconstruct(tmp_path / "guess", run, recipe, poses="estimate"), asset)
+    _check_up(scene, run, recipe, asset, monkeypatch)
     # Scored through the true camera: a folder, a film, a window of a film, a film whose lens is known.
     ratio = float(true.fx_fy_cx_cy[0]) / focal
     report = actions.evaluate_run(run, tmp_path / "true", run)
@@ -227,6 +236,39 @@ def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monke
     assert actions._focal_ratio(run, window, scene.capture) == pytest.approx(ratio)
     files.write_json(run / "capture" / "ingest.json", note | {"focal_source": "given"})
     assert actions._focal_ratio(run, asset, scene.capture) == 1
+
+
+def _check_up(scene: Tumble, run: Path, recipe: recipes.Recipe, asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exported mesh stands as the object in the first image, or as `up` says, which the scores do not depend on."""
+    trimesh = pytest.importorskip("trimesh")
+    small = Preset(triangles=800, texture=64, cells=32, views=12, pixels=64)
+    monkeypatch.setitem(export.PRESETS, "web", small)
+
+    def row_of_top(asset: Asset, frame: int, vertices: torch.Tensor) -> float:
+        """Row of the highest vertex in the image of a frame, from 0 at the object's top to 1 at its bottom."""
+        row = asset.camera.project((asset.trajectory.T_cam_obj[frame] @ vertices[vertices[:, 1].argmax()])[None])[0, 1]
+        rows = (scene.capture.masks[frame] == OBJECT).any(1).nonzero()[:, 0]
+        return float((row - rows[0]) / (rows[-1] - rows[0]))
+
+    def turned(up: str) -> Asset:
+        return pipeline.reconstruct(run.parent / "guess", run, recipe, poses="estimate", up=up)
+
+    glb = trimesh.load_scene(actions.export_run(run, None, "web", None) / "asset.glb")
+    vertices = torch.tensor(np.concatenate([shape.vertices for shape in glb.geometry.values()])).float()
+    # The few steps blur the ends by a tenth.
+    assert abs(row_of_top(asset, 0, vertices)) < 0.15
+    error = actions.evaluate_run(run, run.parent / "true", run)["poses"]["poses.rotation_mean_degrees"]
+    upright_in_frame_9 = turned("9.png")
+    assert abs(row_of_top(upright_in_frame_9, 9, upright_in_frame_9.gaussians.means)) < 0.15
+    over = turned("-y")
+    assert abs(row_of_top(over, 0, over.gaussians.means) - 1) < 0.15
+    again = actions.evaluate_run(run, run.parent / "true", run)["poses"]
+    assert again["poses.rotation_mean_degrees"] == pytest.approx(error, abs=1e-3)
+    with pytest.raises(ValueError, match="neither a direction nor a frame; choose auto, x, -x"):
+        turned("up")
+    with pytest.raises(ValueError, match="the poses of this capture define its frame"):
+        pipeline.reconstruct(dataclasses.replace(scene.capture, trajectory=truth(scene)), up="z")
+    assert_same(turned("auto"), asset)
 
 
 def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Path, tmp_path: Path) -> None:
@@ -269,7 +311,7 @@ def test_a_run_can_be_put_under_another_light(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, fast: bool
 ) -> None:
     actions.relight_run(finished[0], capture / "truth" / "lights" / "sun.hdr", tmp_path, fast=fast)
-    pictures = [files.read_image(path) for path in sorted(tmp_path.iterdir())]
+    pictures = [files.read_image(path) for path in sorted(tmp_path.glob("*.png"))]
     assert len(pictures) == 8
     assert all(0 < picture.mean() < 255 for picture in pictures)
 

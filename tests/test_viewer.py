@@ -2,6 +2,8 @@
 
 import socket
 import sys
+import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +13,7 @@ import pytest
 import torch
 
 from tests.test_interrupt import RECIPE, capture, whole  # noqa: F401 (fixtures)
-from tumble import pipeline, viewer
+from tumble import pipeline, viewer, viewer_access
 from tumble.datasets import folder
 from tumble.engine import run
 from tumble.inverse_rendering import decompose, refine
@@ -118,8 +120,134 @@ def test_the_page_is_served_and_its_scene_holds_the_run(window: viewer.ViewerWin
         assert node(name) is not None, name
     camera = asset.trajectory.T_cam_obj[3].inverse()
     np.testing.assert_allclose(node("/cameras/3.png").position, camera.xyz.numpy(), atol=1e-6)
-    assert "finished" in window.status.content
+    assert "finished" in window.status.value
     assert window.map.options == ("as captured", "albedo", "roughness", "normals")
+
+
+# Access ---------------------------------------------------------------------------------------------------------------
+
+
+def received(window: viewer.ViewerWindow, *, token: str, seconds: float = 3, **headers: str) -> int:
+    """Bytes that a websocket client with these headers receives; raises the library's error if it is refused."""
+    import viser
+    import websockets.sync.client as library
+    import websockets.typing
+
+    port = window.server.get_port()
+    with library.connect(
+        f"ws://{headers.pop('host', '127.0.0.1')}:{port}/{token}",
+        sock=socket.create_connection(("127.0.0.1", port)),
+        origin=websockets.typing.Origin(headers["origin"]) if "origin" in headers else None,
+        subprotocols=[websockets.typing.Subprotocol(f"viser-v{viser.__version__}")],
+        max_size=None,
+    ) as client:
+        n, end = 0, time.monotonic() + seconds
+        while n < 1000 and time.monotonic() < end:
+            n += len(client.recv(timeout=seconds))
+        return n
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_only_the_page_with_the_token_receives_the_run(window: viewer.ViewerWindow) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    port, token = window.server.get_port(), window.token
+    assert received(window, token=token) > 1000
+    assert received(window, token=token, origin=f"http://127.0.0.1:{port}") > 1000
+    assert received(window, token=token, host="localhost", origin=f"http://localhost:{port}") > 1000
+    for case in (
+        {"token": ""},
+        {"token": token[:-1]},
+        {"token": f"x/{token}"},
+        {"token": token, "origin": "https://example.com"},
+        {"token": token, "origin": "null"},
+        {"token": token, "origin": f"http://127.0.0.1:{port + 1}"},
+        {"token": token, "host": "example.com"},
+        {"token": token, "host": "example.com", "origin": f"http://example.com:{port}"},
+        {"token": token, "host": "127.0.0.1.example.com"},
+    ):
+        with pytest.raises(InvalidStatus, match="HTTP 403"):
+            received(window, **case)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_page_itself_needs_the_token_and_tells_it_nobody(window: viewer.ViewerWindow) -> None:
+    with urllib.request.urlopen(window.address) as page:
+        assert page.headers["Referrer-Policy"] == "no-referrer"
+    for wrong in (f"http://127.0.0.1:{window.server.get_port()}/", window.address.replace(window.token, "x")):
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(wrong)
+    assert window.server._websock_server._host == "127.0.0.1"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_no_client_can_make_the_page_public(window: viewer.ViewerWindow, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the token a client may send any message; the one that asks viser for a public address has no effect."""
+    import msgspec
+    import viser
+    import viser._viser
+    import websockets.sync.client as library
+
+    opened = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *arguments: opened.append(arguments))
+    asked = []
+    share = window.server.request_share_url
+    monkeypatch.setattr(window.server, "request_share_url", lambda: asked.append(1) or share())
+    address = f"ws://127.0.0.1:{window.server.get_port()}/{window.token}"
+    with library.connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as client:
+        client.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+        end = time.monotonic() + 5
+        while not asked and time.monotonic() < end:
+            time.sleep(0.01)
+    assert asked
+    assert not opened
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_log_is_shown_as_plain_text(window: viewer.ViewerWindow) -> None:
+    """A name in the log of a run from elsewhere may be markup, which viser's other text fields would draw."""
+    import viser
+
+    assert isinstance(window.status, viser.GuiTextHandle)
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "message"),
+    [
+        ("127.0.0.1", 99999, "--port is out of range: 99999"),
+        ("127.0.0.1", -1, "--port is out of range: -1"),
+        ("no-such-host.invalid", 8080, "--host no-such-host.invalid is unknown"),
+        ("203.0.113.1", 8080, "cannot listen on port 8080 of 203.0.113.1"),
+    ],
+)
+def test_an_address_that_cannot_be_served_is_an_error_of_one_line(
+    whole: Path,  # noqa: F811
+    host: str,
+    port: int,
+    message: str,
+) -> None:
+    pytest.importorskip("viser", reason="needs the extra `view`")
+    with pytest.raises((ValueError, OSError), match=message) as caught:
+        viewer.serve(whole, host, port)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_busy_port_is_passed_over() -> None:
+    with viewer_access.bind("127.0.0.1", free_port()) as first:
+        number = first.getsockname()[1]
+        with viewer_access.bind("127.0.0.1", number) as second:
+            assert number < second.getsockname()[1] < number + viewer_access.N_PORTS
+
+
+def test_a_server_that_starts_without_the_check_is_an_error() -> None:
+    pytest.importorskip("viser", reason="needs the extra `view`")
+    listening = viewer_access.bind("127.0.0.1", 0)
+    with (
+        pytest.raises(ModuleNotFoundError, match="pip install 'viser"),
+        viewer_access.guarded(listening, "127.0.0.1", "x"),
+    ):
+        pass
+    assert listening.fileno() == -1
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -27,7 +27,8 @@ Used by all of these:
     maths, io           rotations, directions, spherical harmonics, images; files, video, safetensors, weights
 
 Files beside the rooms: `pipeline` (the stages in order), `recipes` (their settings), `actions` (relight, export,
-evaluate), `cli`, `demo`, `doctor`, `viewer`. `tests/test_guards.py` lists which room may import which.
+evaluate), `cli`, `demo`, `doctor`, `viewer` with `viewer_access`. `tests/test_guards.py` lists which room may import
+which.
 """
 
 from typing import TYPE_CHECKING

@@ -14,14 +14,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from tumble import pipeline
 from tumble.engine import run
-from tumble.evaluation import CaptureWithTruth, Prediction, Report, align_views, predict_views, read_with_truth, score
-from tumble.export import PresetName, write_asset
-from tumble.io import BadFile, files, load_plugin, video
+from tumble.evaluation import (
+    SHEET,
+    CaptureWithTruth,
+    Prediction,
+    Report,
+    align_views,
+    predict_views,
+    read_with_truth,
+    score,
+)
+from tumble.export import EXPORT_FILE, PresetName, write_asset
+from tumble.io import BadFile, files, load_plugin, outputs, progress, video
 from tumble.maths import SE3, to_srgb8
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
@@ -30,8 +38,8 @@ from tumble.rendering import relight as relighting
 from tumble.report import write_report
 from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
-LIGHT_FILE = "light.json"
-"""File in a folder of relit images that records the environment map."""
+LIGHT_FILE = "relight.json"
+"""File in a folder of relit images that records the environment map, and by which the folder is recognised."""
 MAX_RAYS = 1 << 16
 """Maximum number of rays per pixel."""
 MAX_EXPOSURE = 32
@@ -89,6 +97,7 @@ def export_asset(
     *,
     names: list[str] | None = None,
     scale_mm: float | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Export an asset for other programs (docs/export.md): textured GLB, Gaussian PLYs, environment map, poses.
 
@@ -98,7 +107,12 @@ def export_asset(
         names: File names of the training frames. Default: their numbers.
         scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
             metres.
+        overwrite: Write into the folder even if it holds something else than an earlier export.
+
+    Raises:
+        BadFile: The folder holds something else.
     """
+    outputs.claim_folder(Path(folder), EXPORT_FILE, overwrite=overwrite)
     names = names or [f"{number:04}.png" for number in range(len(asset.trajectory))]
     write_asset(asset, names, Path(folder), preset, scale_mm)
     return Path(folder)
@@ -111,6 +125,7 @@ def evaluate(
     names: tuple[str, ...] | None = None,
     poses_given: bool = True,
     out: Path | str | None = None,
+    overwrite: bool = False,
     cfg: relighting.Config | None = None,
 ) -> Report:
     """Score an asset against the ground truth of a capture (docs/metrics.md).
@@ -120,8 +135,14 @@ def evaluate(
         names: File names of the asset's training frames, in order. Default: all of the capture's.
         poses_given: Whether the asset's poses are those of the capture; otherwise the two are aligned first.
         out: Folder for the prediction, `report.json` and `sheet.png`. None saves nothing.
+        overwrite: Write into the folder even if it holds something else than an earlier evaluation.
         cfg: Numbers of rays of relit images.
+
+    Raises:
+        BadFile: The capture has no ground truth, or the folder holds something else.
     """
+    if out is not None:
+        outputs.claim_folder(Path(out), SHEET, overwrite=overwrite)
     known = read_with_truth(Path(capture))
     names = names or known.capture.names
     aligned = align_views(asset.trajectory, names, known.capture, known.truth, known_poses=poses_given)
@@ -165,6 +186,7 @@ def run_capture(
     options: FootageOptions,
     *,
     poses: Literal["given", "estimate"] = "given",
+    up: str = "auto",
     pick: bool = False,
     device: str = "cpu",
 ) -> Path:
@@ -173,26 +195,36 @@ def run_capture(
     Args:
         path: A video, a folder of images, or a capture.
         options: How footage is converted to a capture.
+        up: See `pipeline.reconstruct`.
         pick: Let the user draw a box around the object in the browser.
 
     Raises:
-        ValueError: There is no such matcher or device.
+        ValueError: There is no such matcher, device or up direction.
         BadFile: See `pipeline.capture_of` and `pipeline.reconstruct`.
     """
     place = usable_device(device)
     load_plugin("matching", recipe.matcher)  # fail before the video is converted
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
     capture = pipeline.capture_of(path, out, options)
-    pipeline.reconstruct(capture, out, recipe, poses=poses, device=place)
+    pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, device=place)
     return write_report(out, capture=capture)
 
 
-def evaluate_folder(prediction: Path, capture: Path | None = None, out: Path | None = None) -> Report:
+def evaluate_folder(
+    prediction: Path, capture: Path | None = None, out: Path | None = None, *, overwrite: bool = False
+) -> Report:
     """Score a prediction folder, or a run, whose prediction is rendered first.
+
+    Args:
+        out: Folder for `report.json` and `sheet.png`. Default: `prediction`.
+        overwrite: Write into `out` even if it holds something else than an earlier evaluation.
 
     Raises:
         ValueError: A prediction folder is given without its capture.
+        BadFile: `out` holds something else.
     """
+    if out is not None and out.resolve() != prediction.resolve():
+        outputs.claim_folder(out, SHEET, overwrite=overwrite)
     if (prediction / run.ASSET).is_file():
         return evaluate_run(prediction, capture, out)
     if capture is None:
@@ -246,7 +278,15 @@ def source_names(out: Path, capture: Capture) -> tuple[str, ...]:
     return tuple(capture.names[i] if (i := numbers.get(name)) in known and i is not None else name for name in names)
 
 
-def relight_run(out: Path, env: Path, images: Path | None = None, *, fast: bool, exposure: float = 0.0) -> Path:
+def relight_run(
+    out: Path,
+    env: Path,
+    images: Path | None = None,
+    *,
+    fast: bool,
+    exposure: float = 0.0,
+    overwrite: bool = False,
+) -> Path:
     """Render a run's object under another light, one image per training frame; returns the folder of the images.
 
     The light is fixed to the object.
@@ -255,46 +295,54 @@ def relight_run(out: Path, env: Path, images: Path | None = None, *, fast: bool,
         images: Folder for `0000.png`, ... Default: `RUN/relit/<name of the map>`, numbered if another map has
             that name.
         exposure: Exposure of the images relative to the environment map [stops].
+        overwrite: Write into `images` even if the folder holds something else than relit images.
 
     Raises:
-        BadFile: There is no finished run in `out`, or the light cannot be read.
+        BadFile: There is no finished run in `out`, the light cannot be read, or `images` holds something else.
         ValueError: The exposure is out of range.
     """
     gain = _gain(exposure)
-    asset = finished(out)
-    views = relight(asset, env, cfg=_relighting(out), fast=fast)
-    images = images or _relit_folder(out, env)
+    asset, light = finished(out), Environment.read(env)
+    note = {"light": str(env.resolve()), "sha256": hashlib.sha256(env.read_bytes()).hexdigest()}
+    images = images or _relit_folder(out, env.stem, note["sha256"])
+    outputs.claim_folder(images, LIGHT_FILE, overwrite=overwrite)
+    files.write_json(images / LIGHT_FILE, note)
+    views = relight(asset, light, cfg=_relighting(out), fast=fast)
     n = len(asset.trajectory)
-    for number, linear in enumerate(track(views, f"relighting under {env.stem}", n, transient=True)):
+    for number, linear in enumerate(progress.track(views, f"relighting under {env.stem}", n)):
         files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).numpy())
     return images
 
 
-def _relit_folder(out: Path, env: Path) -> Path:
-    content = hashlib.sha256(env.read_bytes()).hexdigest()
+def _relit_folder(out: Path, name: str, sha256: str) -> Path:
+    """The folder of a run for images under a light: that of the same light, or the next one that does not exist."""
     for number in itertools.count(1):
-        folder = out / run.RELIT / (env.stem if number == 1 else f"{env.stem}-{number}")
+        folder = out / run.RELIT / (name if number == 1 else f"{name}-{number}")
         note = folder / LIGHT_FILE
-        if not note.is_file() or files.read_json(note, dict[str, Any]).get("sha256") == content:
-            files.write_json(note, {"light": str(env.resolve()), "sha256": content})
+        if not folder.exists() or (note.is_file() and files.read_json(note, dict[str, Any]).get("sha256") == sha256):
             return folder
     raise AssertionError("unreachable")
 
 
-def relight_turntable(out: Path, env: Path, clip: Path, *, fast: bool, exposure: float = 0.0) -> Path:
+def relight_turntable(
+    out: Path, env: Path, clip: Path, *, fast: bool, exposure: float = 0.0, overwrite: bool = False
+) -> Path:
     """Render a turntable video of a run's object under another light; returns its path.
 
     The object makes one revolution about its +y axis; light and camera are fixed. In the first frame the light's frame
     is the object's.
 
     Args:
+        clip: File to write; its extension tells the format.
         exposure: Exposure of the frames relative to the environment map [stops].
+        overwrite: Replace the file if it exists.
 
     Raises:
-        BadFile: There is no finished run in `out`, or the light cannot be read.
+        BadFile: There is no finished run in `out`, the light cannot be read, or `clip` exists or is no video file.
         ValueError: The exposure is out of range.
     """
     gain = _gain(exposure)
+    outputs.claim_file(clip, video.CLIP_FORMATS, overwrite=overwrite)
     asset, light, cfg = finished(out), Environment.read(env), _relighting(out)
     # A quarter of the rays is enough: in a video the noise averages out over frames.
     cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
@@ -304,7 +352,7 @@ def relight_turntable(out: Path, env: Path, clip: Path, *, fast: bool, exposure:
     scale = TURNTABLE_SIDE / max(camera.height, camera.width)
     camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     views = relight(asset, light.rotated(R_gl_obj), turning, camera, cfg=cfg, fast=fast)
-    frames = track(views, f"turning under {env.stem}", TURNTABLE_FRAMES, transient=True)
+    frames = progress.track(views, f"turning under {env.stem}", TURNTABLE_FRAMES)
     video.write_clip(clip, (to_srgb8(gain * linear).cpu().numpy() for linear in frames))
     return clip
 
@@ -316,18 +364,20 @@ def _gain(exposure: float) -> float:
     return 2.0**exposure
 
 
-def export_run(out: Path, folder: Path | None, preset: PresetName, scale_mm: float | None) -> Path:
+def export_run(
+    out: Path, folder: Path | None, preset: PresetName, scale_mm: float | None, *, overwrite: bool = False
+) -> Path:
     """Export a run's object for other programs; returns the folder, by default `RUN/export/PRESET`.
 
     Raises:
-        BadFile: There is no finished run in `out`.
+        BadFile: There is no finished run in `out`, or `folder` holds something else than an export.
     """
     if scale_mm is not None and not 0 < scale_mm < 1e6:
         raise ValueError(f"--scale-mm is out of range: {scale_mm:g}; give millimetres above 0")
     folder = folder or out / run.EXPORT / preset
     asset = finished(out)
     names = run.frame_names(out, len(asset.trajectory))
-    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm)
+    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, overwrite=overwrite)
 
 
 def _relighting(out: Path) -> relighting.Config:

@@ -3,13 +3,17 @@
 Torch and OpenCV are imported only when a command runs, so that `--help` answers at once.
 """
 
+import contextlib
+import logging
 import os
+import signal
 import sys
 import warnings
 
 # Idle OpenMP threads of torch otherwise spin on the cores that the kernels need. Torch reads this on import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,6 +28,9 @@ if TYPE_CHECKING:
 
 Folder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
 OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR", help_behavior_hint="")]
+Overwrite = Annotated[
+    bool, arg(help="Write even if the folder holds other files; those with the same names are replaced.")
+]
 OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 
@@ -63,6 +70,7 @@ def check(
     options: Annotated[FootageOptions, arg(name="")],
     out: OptionalFolder = None,
     pick: bool = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Check whether a video is suitable for reconstruction, and what to record again; exit code 1 if it is not.
 
@@ -75,7 +83,7 @@ def check(
     from tumble.preprocess import PREVIEW, check_footage, passes
 
     folder = out or Path("runs/check") / footage.stem
-    findings = check_footage(footage, folder, options, pick=pick)
+    findings = check_footage(footage, folder, options, pick=pick, overwrite=overwrite)
     for finding in findings:
         mark = {"good": "+", "warn": "!", "stop": "x"}[finding.rating]
         _print_finding(mark, finding.subject, finding.state, finding.advice, width=10)
@@ -92,6 +100,7 @@ def run(
     out: Folder,
     quality: Literal["draft", "standard", "paper"] = "draft",
     poses: Literal["given", "estimate"] = "given",
+    up: Annotated[str, arg(metavar="{auto,[-]x,[-]y,[-]z,FRAME}")] = "auto",
     matcher: str = "mixed",
     pick: bool = False,
     device: Literal["cpu", "cuda"] = "cpu",
@@ -108,6 +117,9 @@ def run(
         quality: draft: minutes on two CPU cores. standard: meant for a GPU.
             paper: the paper's numbers of steps, which take days; never run to the end.
         poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
+        up: Direction of the object that points up in the results; a finished run is only turned, in seconds.
+            auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.
+            FRAME: up in this frame, such as 0012.png.
         matcher: Finds corresponding pixels in two frames, for estimated poses.
             mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
             xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
@@ -122,7 +134,7 @@ def run(
     from tumble.recipes import QUALITIES
 
     recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
-    print(run_capture(capture, out, recipe, options, poses=poses, pick=pick, device=device))
+    print(run_capture(capture, out, recipe, options, poses=poses, up=up, pick=pick, device=device))
 
 
 def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -130,7 +142,8 @@ def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) ->
 
     Args:
         run: Run directory.
-        host: Address to listen on; 0.0.0.0 admits other machines.
+        host: Address to listen on. 0.0.0.0 admits other machines, to whoever has the printed address with its token;
+            nothing is encrypted.
         port: First port to try.
     """
     from tumble.viewer import serve
@@ -146,6 +159,7 @@ def relight(
     turntable: OptionalFile = None,
     fast: bool = False,
     exposure: float = 0.0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render a reconstructed object under another light, in the poses of its training frames or as a turntable video.
 
@@ -153,16 +167,16 @@ def relight(
         run: Run directory.
         env: Environment map, an equirectangular .hdr or .exr file, +y up in the object's frame.
         out: Folder for the images. Default: RUN/relit/<name of the map>, numbered if another map has that name.
-        turntable: Write this video (.mp4) instead: one revolution about the object's +y axis.
+        turntable: Write this video (.mp4, .mov or .mkv) instead: one revolution about the object's +y axis.
         fast: Use prefiltered light without shadows instead of ray tracing.
         exposure: Exposure of the images, relative to the environment map [stops].
     """
     from tumble.actions import relight_run, relight_turntable
 
     if turntable is not None:
-        print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure))
+        print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure, overwrite=overwrite))
     else:
-        print(relight_run(run, env, out, fast=fast, exposure=exposure))
+        print(relight_run(run, env, out, fast=fast, exposure=exposure, overwrite=overwrite))
 
 
 def export(
@@ -171,6 +185,7 @@ def export(
     preset: Literal["web", "game", "film", "splat"] = "web",
     scale_mm: Annotated[float | None, arg(metavar="MM", help_behavior_hint="")] = None,
     out: OptionalFolder = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Export a reconstructed object: textured GLB, Gaussian PLYs, environment map, poses (docs/export.md).
 
@@ -182,7 +197,7 @@ def export(
     """
     from tumble.actions import export_run
 
-    print(export_run(run, out, preset, scale_mm))
+    print(export_run(run, out, preset, scale_mm, overwrite=overwrite))
 
 
 def report(run: Positional[Path], /, capture: OptionalCapture = None) -> None:
@@ -202,6 +217,7 @@ def evaluate(
     capture: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="")] = None,
     /,
     out: OptionalFolder = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Score a run, or a prediction folder of any other method, against the ground truth of a capture.
 
@@ -212,7 +228,7 @@ def evaluate(
     """
     from tumble.actions import evaluate_folder
 
-    _print_scores(evaluate_folder(prediction, capture, out))
+    _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite))
     print((out or prediction) / "report.json")
 
 
@@ -246,21 +262,25 @@ def demo(out: Folder = Path("runs/demo")) -> None:
     print(page)
 
 
+VERSION_HELP = "tumble --version prints the version."
+"""End of the help text, about an option that is not one of a command."""
 COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, demo, weights)
 
 
 def main() -> None:
-    """Entry point of the `tumble` command: errors print one line and exit with code 1, Ctrl-C exits with 130."""
+    """Entry point of the `tumble` command: errors print one line and exit with code 1, Ctrl-C and SIGTERM with 130."""
     from tumble import __version__
 
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
         return
     warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}
-        tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=about)
+        with _progress_lines():
+            tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=f"{about}\n\n{VERSION_HELP}")
     except KeyboardInterrupt:
         print("tumble: interrupted; finished work is kept, repeat the command to resume", file=sys.stderr)
         raise SystemExit(130) from None
@@ -272,6 +292,21 @@ def main() -> None:
 
 
 # Printing -------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _progress_lines() -> Iterator[None]:
+    """Context in which the log of tasks is printed to standard error; terminals show bars instead (`io.progress`)."""
+    log, handler = logging.getLogger("tumble"), logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("tumble: %(message)s"))
+    before = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
 
 
 def _print_finding(mark: str, subject: str, state: str, advice: str, *, width: int) -> None:

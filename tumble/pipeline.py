@@ -15,18 +15,35 @@ from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import decompose, refine
-from tumble.io import BadFile, files, tree
-from tumble.poses import PoseResult, neighbours
+from tumble.io import BadFile, files, outputs, progress, tree
+from tumble.poses import PoseResult, mask_refinement, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
-from tumble.preprocess import FOOTAGE, FootageOptions, footage_fingerprint, input_kind, read_provenance, to_capture
+from tumble.preprocess import (
+    FOOTAGE,
+    PROVENANCE,
+    FootageOptions,
+    footage_fingerprint,
+    input_kind,
+    read_provenance,
+    to_capture,
+)
 from tumble.recipes import DRAFT, Recipe
-from tumble.scene import Asset, Capture, Trajectory, content_key
+from tumble.scene import Asset, Capture, Trajectory, content_key, opengl_from_opencv
 
 MIN_FRAMES = 8
 """Minimum number of frames with a pose; fewer show too little of the object."""
 IN_MEMORY = Path("capture")
 """Name, in error messages, of a capture that was not read from disk."""
+ROTATIONS_TO_UP = {
+    "x": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "-x": ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "y": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "-y": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "z": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    "-z": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+}
+"""Rotations of the object frame, row by row, that take each axis to +y."""
 
 
 def read_capture(path: Path | str) -> Capture:
@@ -62,14 +79,17 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
         out: The run directory; a capture converted earlier from the same footage is reused.
 
     Raises:
-        BadFile: The footage cannot be converted, or `out` holds a capture of other footage or other options.
+        BadFile: The footage cannot be converted, or `out` lies in it or holds a capture of other footage or other
+            options.
     """
     if input_kind(path) not in FOOTAGE:
         return path
+    outputs.require_outside(out, path)
     made = out / run.CAPTURE
     with run.exclusive_access(out):
         if not made.exists():
-            return to_capture(path, made, options)
+            with progress.task(f"converting {path.name} to a capture"):
+                return to_capture(path, made, options)
     found, wanted = read_provenance(made), footage_fingerprint(path, options)
     different = [line for name in wanted for line in run.differences(getattr(found, name, None), wanted[name], name)]
     if different:
@@ -92,7 +112,7 @@ def estimate_poses(
     """
     capture = replace(capture, trajectory=None)
     check_plausible(capture, IN_MEMORY)
-    return _track(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
+    return _poses_of(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
 
 
 def reconstruct(
@@ -101,6 +121,7 @@ def reconstruct(
     recipe: Recipe = DRAFT,
     *,
     poses: Literal["given", "estimate"] | Trajectory | PoseResult = "given",
+    up: str = "auto",
     device: torch.device | str = "cpu",
     progress: Callable[[Progress], None] | None = None,
 ) -> Asset:
@@ -116,6 +137,9 @@ def reconstruct(
         poses: "given": the capture's poses, unchanged; estimated if it has none. "estimate": always estimated. A
             trajectory with one pose per frame: used unchanged. A `PoseResult`: the starting poses of stage 2, which
             refines them.
+        up: Up direction of the object, which becomes +y of the asset's frame. "auto": that of the poses, which for
+            estimated ones is up in the first frame. Or one of `ROTATIONS_TO_UP`, an axis of the frame of "auto"; or
+            the name of a frame in which the object is upright. No stage depends on it.
         device: Where stages 2 and 3 run.
         progress: Called every few seconds.
 
@@ -124,6 +148,7 @@ def reconstruct(
 
     Raises:
         BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
+        ValueError: There is no such direction or frame, or the capture's own poses define its frame.
         NotFinite: A NaN occurred in training; the message names the tensor, the step and the saved state.
     """
     where = IN_MEMORY if isinstance(capture, Capture) else Path(capture)
@@ -134,12 +159,14 @@ def reconstruct(
         capture = replace(capture, trajectory=poses)
     check_plausible(capture, where)
     found = poses if isinstance(poses, PoseResult) else None
+    _check_up(up, capture, where)
     if out is None:
-        return _reconstruct(run.Run(None, recipe, progress), capture, where, found, device)[0]
+        return _upright(*_reconstruct(run.Run(None, recipe, progress), capture, where, found, device), up)
     out = Path(out)
     with run.exclusive_access(out):
         opened = run.open(out, where, recipe, content=content_key(capture), report=progress)
         asset, names = _reconstruct(opened, capture, where, found, device)
+        asset = _upright(asset, names, up)
         _keep(asset, names, out)
     return asset
 
@@ -150,7 +177,7 @@ def _reconstruct(
     """The asset on the CPU, and the names of its frames."""
     recipe, trajectory, key = opened.recipe, capture.trajectory, content_key(capture)
     if trajectory is None:
-        tracked, key = (found, "") if found else _track(opened, capture, where, key)
+        tracked, capture, key = (found, capture, "") if found else _poses_of(opened, capture, where, key)
         kept = torch.where(~tracked.quality.lost)[0].tolist()
         trajectory = tracked.trajectory.select(kept)
         capture = replace(capture.select(kept), camera=tracked.camera)
@@ -174,26 +201,40 @@ def stage_of(cfg: Any) -> Any:
     return stage
 
 
-def _track(opened: run.Run, capture: Capture, where: Path, content: str) -> tuple[PoseResult, str]:
-    """Stage 1: match frames, then estimate all poses; also returns the key of the result."""
+def _poses_of(opened: run.Run, capture: Capture, where: Path, content: str) -> tuple[PoseResult, Capture, str]:
+    """Stage 1, repeated with trimmed masks while that explains more: poses, capture with these masks, key."""
     if len(capture) < MIN_FRAMES:
         rule = f"has {len(capture)} frames, too few to estimate the motion"
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
+    tracked, key = _track(opened, capture, where, content, 1)
+    for number in range(2, mask_refinement.ROUNDS + 1):
+        if not mask_refinement.can_be_trimmed(capture, tracked):
+            break
+        trimmed = mask_refinement.trim_masks(capture, tracked)
+        new, new_key = _track(opened, trimmed, where, content_key(trimmed), number)
+        if not mask_refinement.explains_more(new, tracked):
+            break
+        tracked, capture, key = new, trimmed, new_key
+    _check_quality(opened, capture, where, tracked)
+    return tracked, capture, key
+
+
+def _track(opened: run.Run, capture: Capture, where: Path, content: str, number: int) -> tuple[PoseResult, str]:
+    """One round of stage 1: match frames, then estimate all poses; also returns the key of the result."""
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
     matches = matching.match_pairs(matching.views_of(capture), near, recipe.matcher, cache=cache)
     route = stage_of(recipe.track)
     try:
-        inputs: Any = sfm.gather(capture, matches, recipe.matcher)
-        if route is progressive:
-            inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
+        with progress.task("observations in all frames"):
+            inputs: Any = sfm.gather(capture, matches, recipe.matcher)
+            if route is progressive:
+                inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]
-    tracked, key = run.stage(opened, run.TRACK, route, recipe.track, inputs, keys)
-    _check_quality(opened, capture, where, tracked)
-    return tracked, key
+    return run.stage(opened, mask_refinement.folder(number), route, recipe.track, inputs, keys)
 
 
 def _check_quality(opened: run.Run, capture: Capture, where: Path, tracked: PoseResult) -> None:
@@ -214,6 +255,36 @@ def _check_quality(opened: run.Run, capture: Capture, where: Path, tracked: Pose
         raise BadFile(where, rule, "record an object with more texture or shape, and turn it more slowly")
     if quality.rating == "bad":
         warnings.warn(quality.sentence, stacklevel=2)
+
+
+def _check_up(up: str, capture: Capture, where: Path) -> None:
+    """Raise `ValueError` unless `up` is a direction or a frame, and the frame of the capture may be changed.
+
+    The poses of a capture with ground truth share its frame; those of estimated poses and of COLMAP have their own.
+    """
+    if up == "auto":
+        return
+    if up not in ROTATIONS_TO_UP and up not in capture.names:
+        choices = ", ".join(["auto", *ROTATIONS_TO_UP])
+        raise ValueError(f"--up {up} is neither a direction nor a frame; choose {choices}, or a frame's file name")
+    if capture.trajectory is not None and not (where / PROVENANCE).is_file():
+        raise ValueError("--up is for estimated poses: the poses of this capture define its frame, in which +y is up")
+
+
+def _upright(asset: Asset, names: tuple[str, ...], up: str) -> Asset:
+    """The asset with the direction `up` rotated to +y; for a frame, to up in its image.
+
+    Raises:
+        ValueError: The frame has no pose.
+    """
+    if up == "auto":
+        return asset
+    if up in ROTATIONS_TO_UP:
+        return asset.rotated(torch.tensor(ROTATIONS_TO_UP[up]))
+    if up not in names:
+        raise ValueError(f"the pose of frame {up} was not found; choose another frame for --up")
+    T_cam_obj = asset.trajectory.T_cam_obj[names.index(up)]
+    return asset.rotated(opengl_from_opencv(T_cam_obj.xyz) @ T_cam_obj.rotation.matrix())
 
 
 def _keep(asset: Asset, names: tuple[str, ...], out: Path) -> None:

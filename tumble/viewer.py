@@ -3,10 +3,14 @@
 The world frame is the object frame, +y up. Nodes of viser's scene: `/object` (Gaussians, or the points of stage 1),
 `/cameras/NAME`, `/path` (the camera centres), `/light` (the environment map on a large sphere, in its orientation at
 the selected frame).
+
+The page shows photos of the user's room, so `viewer_access` decides which requests it answers.
 """
 
 import contextlib
+import io
 import math
+import socket
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,10 +26,11 @@ from tumble.engine import loop, run
 from tumble.inverse_rendering import Refined, decompose
 from tumble.io import BadFile, tree
 from tumble.maths import SO3, resize_area, srgb_from_linear, texel_directions
-from tumble.poses import PoseResult
+from tumble.poses import PoseResult, mask_refinement
 from tumble.rendering import relight
 from tumble.report import panorama
 from tumble.scene import Asset, Capture, Environment, Gaussians, Material, Trajectory, opacity
+from tumble.viewer_access import bind, guarded, new_token
 
 POLL_SECONDS = 2.0
 """Interval at which the run directory is read again [s]."""
@@ -75,7 +80,7 @@ def read_snapshot(out: Path, capture: Capture | None) -> Snapshot:
         BadFile: A file of the run is damaged.
     """
     source = next((name for name in SOURCES if (out / name).is_file()), "")
-    tracked = run.output(out, run.TRACK, PoseResult)
+    tracked = mask_refinement.stored_result(out, capture)[0] if capture else run.output(out, run.TRACK, PoseResult)
     trajectory, names = _frames(tracked, capture)
     if source == run.ASSET:
         asset = run.asset(out, Asset)
@@ -141,9 +146,9 @@ def progress(out: Path) -> str:
     last = records[-1]
     if "step" not in last:
         events = {"start": "started", "done": f"finished after {last.get('seconds', 0):.0f} s"}
-        return f"{last['name']} {events.get(last.get('event', ''), 'finished')}"
-    metrics = ", ".join(f"{key} {value:.3g}" for key, value in last["metrics"].items() if value is not None)
-    return f"{last['name']}: step {last['step']} of {last['of']}, {last['eta']:.0f} s to go; {metrics}"
+        return f"{last['name']} {events.get(str(last.get('event')), 'finished')}"
+    metrics = ", ".join(f"{key} {value:.3g}" for key, value in last.get("metrics", {}).items() if value is not None)
+    return f"{last['name']}: step {last['step']} of {last.get('of')}, {last.get('eta', 0):.0f} s to go; {metrics}"
 
 
 # The browser ----------------------------------------------------------------------------------------------------------
@@ -158,12 +163,20 @@ class ViewerWindow:
             raise BadFile(out, "is not a run directory", "give the output folder of a finished or running `tumble run`")
         self.out, self.timestamps, self.snapshot = out, (), Snapshot("no result yet")
         self.capture: Capture | None = None
-        self.server = viser.ViserServer(host=host, port=port, label=f"tumble {out.name}", verbose=False)
+        self.host, self.token, listening = host, new_token(), bind(host, port)
+        port = listening.getsockname()[1]
+        # viser prints addresses without the token.
+        with guarded(listening, host, self.token), contextlib.redirect_stdout(io.StringIO()):
+            self.server = viser.ViserServer(host=host, port=port, label=f"tumble {out.name}", verbose=False)
+        # Any page of viser can ask for a public address of the server on the internet; viser calls this function then.
+        self.server.request_share_url = lambda verbose=True: None
+        self.server.gui.configure_theme(show_share_button=False)
         self.server.scene.set_up_direction("+y")
         self.server.scene.configure_fog(1.0, 2.0, enabled=False)
         self.server.initial_camera.position = (0.9, 0.9, 2.4)
         gui = self.server.gui
-        self.status = gui.add_markdown("")
+        # Plain text: names in the log of a run from elsewhere could be markup.
+        self.status = gui.add_text("Status", "", multiline=True, disabled=True)
         self.map = gui.add_dropdown("Colour", ("as captured",))
         self.frame = gui.add_slider("Frame", 0, 1, 1, 0)
         self.image = gui.add_image(np.zeros((8, 8, 3), np.uint8), label="Image")
@@ -176,8 +189,9 @@ class ViewerWindow:
 
     @property
     def address(self) -> str:
-        """URL of the page."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        """URL of the page, with the token that admits to it."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}/{self.token}/"
 
     def refresh(self) -> None:
         """Update the page if files of the run have changed."""
@@ -186,16 +200,16 @@ class ViewerWindow:
             self.capture = _load_capture(self.out)
         if (timestamps, self.capture is None) != self.timestamps:
             self.timestamps = timestamps, self.capture is None
-            tracked = run.output(self.out, run.TRACK, PoseResult)
-            if self.capture is not None and tracked is not None:
-                self.capture = replace(self.capture, camera=tracked.camera)
+            if self.capture is not None:
+                tracked, _ = mask_refinement.stored_result(self.out, self.capture)
+                self.capture = replace(self.capture, camera=tracked.camera) if tracked else self.capture
             self.snapshot = read_snapshot(self.out, self.capture)
             self._show_cameras()
             self.map.options = tuple(self.snapshot.colours) or ("as captured",)
             self._show_object()
             self._show_light()
             self._show_frame()
-        self.status.content = f"**{self.snapshot.stage}**\n\n{progress(self.out)}"
+        self.status.value = f"{self.snapshot.stage}\n{progress(self.out)}"
 
     def _show_object(self) -> None:
         """Draw the Gaussians or points in the colours of the selected map."""
@@ -265,8 +279,10 @@ def serve(out: Path, host: str, port: int) -> None:
     Raises:
         ModuleNotFoundError: viser is not installed; the message contains the command that installs it.
         BadFile: `out` is not a run directory, or one of its files is damaged.
+        ValueError, OSError: The server cannot listen on this host and port.
     """
     window = ViewerWindow(out, host, port)
+    port = window.server.get_port()
     print(f"{window.address}   (Ctrl-C stops it; from another machine: ssh -L {port}:localhost:{port} THIS_MACHINE)")
     try:
         with contextlib.suppress(KeyboardInterrupt):

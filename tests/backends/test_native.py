@@ -2,10 +2,12 @@
 
 import ctypes
 import os
+import shutil
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import torch
 
 from tests.backends import cases
 from tumble import backends
-from tumble.backends import _native, reference
+from tumble.backends import _cache, _native, reference
 
 CPU = torch.device("cpu")
 
@@ -121,6 +123,79 @@ def test_concurrent_processes_write_one_complete_library(tmp_path: Path) -> None
     assert [path.suffix for path in (tmp_path / "tumble").iterdir()] == [".so"]
 
 
+def _foreign(path: Path) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only root can give files away")
+    os.chown(path, 65534, 65534)
+
+
+SPOILERS = {
+    "a folder that all can write": lambda folder, library: folder.chmod(0o777),
+    "a folder that the group can write": lambda folder, library: folder.chmod(0o770),
+    "a folder of another user": lambda folder, library: _foreign(folder),
+    "a link to a folder": lambda folder, library: folder.symlink_to(folder.rename(folder.with_name("elsewhere"))),
+    "a library that all can write": lambda folder, library: library.chmod(0o777),
+    "a library of another user": lambda folder, library: _foreign(library),
+    "a link to a library": lambda folder, library: library.symlink_to(library.rename(library.with_suffix(".old"))),
+    "the shared temporary folder": lambda folder, library: folder.rename(
+        folder.parents[1] / "tmp" / f"tumble-{os.getuid()}"
+    ),
+}
+"""Ways in which a cache can be that of somebody else, as functions of its folder and the library in it."""
+
+
+@pytest.mark.filterwarnings("ignore:.*compiled kernels cannot be kept:RuntimeWarning")
+@pytest.mark.parametrize("spoil", SPOILERS.values(), ids=SPOILERS.keys())
+def test_a_library_that_others_could_have_written_is_never_loaded(
+    spoil: Callable[[Path, Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The planted library tells by a file when it is loaded; the compiler is replaced by a copy of the real one."""
+    library, ran, folder = compiled(), tmp_path / "ran", tmp_path / "cache" / "tumble"
+    source = f'#include <stdio.h>\n__attribute__((constructor)) void f() {{ fclose(fopen("{ran}", "w")); }}\n'
+    (tmp_path / "planted.c").write_text(source)
+    (tmp_path / "tmp").mkdir()
+    folder.mkdir(parents=True, mode=0o700)
+    to_output = 'while [ "$1" != -o ]; do [ "$1" = --version ] && exit; shift; done'
+    compiler = _script(tmp_path / "copy", f'{to_output}; cp {library._name} "$2"')
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setenv("CXX", compiler)
+    _cache._process_folder.cache_clear()
+    planted = folder / f"kernels-{_native._build_hash(compiler)}.so"
+    subprocess.run([_real_compiler(), "-x", "c", tmp_path / "planted.c", "-shared", "-fPIC", "-o", planted], check=True)
+    planted.chmod(0o700)
+    spoil(folder, planted)
+    assert _native._by_compiler().lanes() == library.lanes()
+    assert not ran.exists()
+
+
+def test_a_library_of_this_user_is_loaded_again_without_a_compiler_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = compiled()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    counted = f'echo x >> {tmp_path / "runs"}; umask 0; cp {library._name} "$2"'
+    to_output = 'while [ "$1" != -o ]; do [ "$1" = --version ] && exit; shift; done'
+    monkeypatch.setenv("CXX", _script(tmp_path / "copy", f"{to_output}; {counted}"))
+    for _ in range(2):
+        assert _native._by_compiler().lanes() == library.lanes()
+    assert (tmp_path / "runs").read_text() == "x\n"
+    assert all(stat.S_IMODE(p.stat().st_mode) == 0o700 for p in (tmp_path / "tumble", *(tmp_path / "tumble").iterdir()))
+
+
+def test_without_a_cache_that_can_be_trusted_the_folder_belongs_to_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tumble").mkdir(mode=0o700)
+    (tmp_path / "tumble").chmod(0o777)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _cache._process_folder.cache_clear()
+    with pytest.warns(RuntimeWarning, match=r"tumble: compiled kernels cannot be kept: .* \(fix: chmod 700"):
+        folder = _cache.writable()
+    assert folder.parent == Path(tempfile.gettempdir())
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
 def test_python_threads_can_render_concurrently() -> None:
     """One thread uses the pool, the others render without it; the images are equal."""
     cpu, scene = backends.load("cpu"), cases.hard()
@@ -154,6 +229,11 @@ def test_every_vector_width_matches_the_reference(lanes: str, tmp_path: Path, mo
     _native.library.cache_clear()
     assert _native.library().lanes() == int(lanes)
     exercise()
+
+
+def _real_compiler() -> str:
+    compilers = [path for name in _native.COMPILERS if (path := shutil.which(name))]
+    return compilers[0]
 
 
 def compiled() -> ctypes.CDLL:

@@ -20,7 +20,7 @@ from torch import Tensor
 from tumble.engine import loop, optim
 from tumble.engine.loop import Progress, Stage, State, drive, fingerprint
 from tumble.engine.optim import NotFinite
-from tumble.io import files, tree
+from tumble.io import files, progress, tree
 from tumble.io.files import BadFile
 
 # A stage: points that move to a target with densification and pruning, and a light on a growing grid ------------------
@@ -201,18 +201,39 @@ def test_a_checkpoint_of_other_settings_is_ignored(tmp_path: Path, other: dict[s
     assert bits(drive(THIS, inputs=Inputs(), checkpoint=tmp_path / "state", **changed)) == bits(fresh)
 
 
-def test_a_second_ctrl_c_stops_immediately_and_the_handler_is_restored(tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_stops_immediately_and_the_handler_is_restored(
+    tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = signal.getsignal(number)
 
-    def press_twice(state: State) -> None:
-        press_ctrl_c(state)
-        press_ctrl_c(state)
+    def twice(state: State) -> None:
+        signal.raise_signal(number)
+        signal.raise_signal(number)
 
     path = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
-        drive(THIS, Config(), Inputs(at={10: press_twice}), seed=3, checkpoint=path, every=8)
-    assert signal.getsignal(signal.SIGINT) is before
+        drive(THIS, Config(), Inputs(at={10: twice}), seed=3, checkpoint=path, every=8)
+    assert signal.getsignal(number) is before
+    signal.signal(signal.SIGTERM, found)
     assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=8)) == uninterrupted()
+
+
+def test_sigterm_saves_a_checkpoint_and_ends_the_stage_like_ctrl_c(tmp_path: Path) -> None:
+    found, path = signal.signal(signal.SIGTERM, signal.SIG_DFL), tmp_path / "state"
+    terminate = lambda state: signal.raise_signal(signal.SIGTERM)  # noqa: E731
+    with pytest.raises(KeyboardInterrupt, match=r"stopped at step 11 of 30; .*continue from .*state"):
+        drive(THIS, Config(), Inputs(at={10: terminate}), seed=3, checkpoint=path, every=100)
+    assert loop.peek(path)[0] == 11
+    assert signal.signal(signal.SIGTERM, found) == signal.SIG_DFL
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=100)) == uninterrupted()
+
+
+def test_every_stage_is_a_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "tumble")
+    drive(THIS, Config(), Inputs(), seed=3, name="refine")
+    assert caplog.messages == ["refine (30 steps)"]
 
 
 def test_without_a_checkpoint_the_message_of_ctrl_c_is_that_nothing_was_saved() -> None:
@@ -316,14 +337,31 @@ def test_a_folder_without_write_permission_is_an_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
 
 
-def test_errors_name_files_that_are_not_checkpoints(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", ["flipped byte", "not tensors", "other tensors"])
+def test_a_damaged_checkpoint_restarts_the_stage_with_a_warning(tmp_path: Path, damage: str) -> None:
+    """A checkpoint of step 20 with one flipped bit is not the last valid state; the result is that of a whole run."""
+    whole = drive(THIS, Config(), Inputs(), seed=3)
     path = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        drive(THIS, Config(), Inputs(at={20: press_ctrl_c}), seed=3, checkpoint=path)
+    if damage == "flipped byte":
+        content = bytearray(path.read_bytes())
+        content[-3] ^= 1
+        path.write_bytes(content)
+        reason = "is damaged: its content does not match its checksum"
+    elif damage == "not tensors":
+        path.write_bytes(b"junk" * 20)
+        reason = "is damaged: "
+    else:
+        tree.save(Params(*torch.zeros(4, 1)), path)
+        reason = "is not a checkpoint"
+    said = rf"state: {reason}.* \(the stage starts again from its first step\)"
+    with pytest.warns(UserWarning, match=said):
+        again = drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    assert bits(again) == bits(whole)
     path.write_bytes(b"junk" * 20)
-    with pytest.raises(BadFile, match="state: is not a checkpoint"):
-        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
-    tree.save(Params(*torch.zeros(4, 1)), path)
-    with pytest.raises(BadFile, match="state: is not a checkpoint"):
-        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    with pytest.raises(BadFile, match="state: is damaged"):
+        loop.peek(path)
 
 
 def test_a_checkpoint_of_another_structure_is_rejected(tmp_path: Path) -> None:
@@ -367,8 +405,8 @@ def test_reports_are_rate_limited_and_complete(tmp_path: Path, monkeypatch: pyte
 
 def test_a_terminal_shows_the_stage_its_metric_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
-    monkeypatch.setattr(loop, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120))
-    monkeypatch.setattr(loop, "BAR_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120))
+    monkeypatch.setattr(progress, "BAR_SECONDS", 0.0)
     drive(THIS, Config(), Inputs(), seed=3, name="toy")
     text = screen.getvalue()
     assert all(word in text for word in ("toy", "30/30", "loss", "0:00:0"))

@@ -347,3 +347,21 @@ def test_the_key_of_a_capture_does_not_depend_on_ground_truth(tmp_path: Path) ->
     assert content_key(datasets_folder.load(tmp_path)) == before, "evaluation views belong to the ground truth"
     files.write_png(tmp_path / "images" / "0.png", 255 - pixels)
     assert content_key(datasets_folder.load(tmp_path)) != before
+
+
+def test_records_of_the_log_with_values_of_the_wrong_type_are_left_out(tmp_path: Path) -> None:
+    """A run may come from somebody else, and readers of the log compute with its numbers."""
+    good = [
+        {"name": "refine", "event": "start"},
+        {"name": "refine", "step": 1, "of": 2, "seconds": 1.5, "eta": 1, "metrics": {"render": 0.5, "psnr": None}},
+    ]
+    bad = [
+        *({"name": wrong} for wrong in (1, None, ["refine"])),
+        *({"name": "refine", key: "x"} for key in ("seconds", "step", "of", "eta", "metrics")),
+        {"name": "refine", "metrics": {"render": "<script>"}},
+        {"name": "refine", "event": 3},
+        ["refine"],
+    ]
+    lines = [json.dumps(record) for record in [*bad, *good, *bad]]
+    (tmp_path / run.LOG).write_text("\n".join([*lines, "[" * 100_000, f'{{"step": {"9" * 5000}}}']))
+    assert run.log_records(tmp_path) == good

@@ -91,6 +91,8 @@ def test_the_glb_follows_the_gltf_layout(folder: Path) -> None:
     assert 900 < indices["count"] / 3 <= SMALL.triangles
     starts = [document["bufferViews"][image["bufferView"]]["byteOffset"] for image in document["images"]]
     assert all(binary[start : start + 8] == b"\x89PNG\r\n\x1a\n" for start in starts)
+    # The header of the compressed data (RFC 1950) tells the level: 2 for 6, 3 for the slow ones.
+    assert all(binary[binary.index(b"IDAT", start) + 5] >> 6 == 2 for start in starts)
     assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
@@ -208,6 +210,16 @@ def test_the_light_file_documents_its_orientation(folder: Path, asset: Asset) ->
     forward_obj = asset.trajectory.T_cam_obj[0].rotation.matrix().T @ torch.tensor([0.0, 0, 1])
     R = torch.tensor(facts["R_light_object_of_first_frame"])
     assert torch.allclose(R @ forward_obj, torch.tensor([0.0, 0, -1]), atol=1e-5)
+
+
+def test_every_part_of_an_export_that_takes_long_is_a_line_of_the_log(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(export.PRESETS, "web", Preset(triangles=100, texture=32, cells=12, views=4, pixels=32))
+    caplog.set_level("INFO", "tumble")
+    export.write_asset(asset, NAMES, tmp_path, "web")
+    first = ["fusing depth maps", "extracting the mesh", "texture coordinates", "baking textures"]
+    assert caplog.messages == [*first, "confidence of the material"]
 
 
 def test_splats_alone_need_no_mesh(asset: Asset, tmp_path: Path) -> None:

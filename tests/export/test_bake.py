@@ -8,9 +8,9 @@ import torch
 from torch.nn.functional import normalize
 
 from tests.surfaces import GAMMA, sphere
-from tumble.export import bake, depth_fusion, mesh
+from tumble.export import atlas, bake, depth_fusion, mesh
+from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Textures
-from tumble.export.mesh import UnwrappedMesh
 from tumble.maths.images import linear_from_srgb
 from tumble.maths.se3 import SE3
 from tumble.scene.asset import Asset
@@ -61,7 +61,7 @@ def sphere_mesh() -> UnwrappedMesh:
     simplified = mesh.simplify(
         mesh.marching_tetrahedra(values, -depth_fusion.HALF_SIDE, 2 * depth_fusion.HALF_SIDE / 32), 1500
     )
-    return mesh.unwrap(simplified, 192, 8)
+    return atlas.unwrap(simplified, 192)
 
 
 def baked(asset: Asset, sphere_mesh: UnwrappedMesh) -> Textures:

@@ -183,27 +183,24 @@ def test_the_surrounding_cameras_see_the_whole_unit_sphere() -> None:
         assert uv.max() > 58, "the sphere should fill the image"
 
 
-def test_an_atlas_has_no_overlaps_and_tangents_follow_u() -> None:
-    shape = mesh.simplify(marched(to_torus(grid())), 2000)
-    flat_mesh = mesh.unwrap(shape, 256, 4)
-    assert flat_mesh.uv.min() >= 0
-    assert flat_mesh.uv.max() <= 1
-    corners = flat_mesh.uv[flat_mesh.faces]
-    (u1, v1), (u2, v2) = ((corners[:, i] - corners[:, 0]).T for i in (1, 2))
-    # Counterclockwise from outside is counterclockwise in the texture, whose v points down: no chart is mirrored.
-    assert (u1 * v2 - u2 * v1 < 1e-12).all()
-    assert (flat_mesh.tangents[:, 3] == 1).all()
-    # Random points: each lies in at most one triangle.
-    for x, y in np.random.default_rng(0).random((300, 2)):
-        a, b, c = ((x, y) - corners[:, i] for i in range(3))
-        turns = [p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((a, b), (b, c), (c, a))]
-        assert (np.max(turns, 0) < -1e-9).sum() <= 1
-    # Along an edge the position moves along the tangent when u grows.
-    corner, other = flat_mesh.faces[:, 0], flat_mesh.faces[:, 1]
-    step = flat_mesh.vertices[other] - flat_mesh.vertices[corner]
-    du, dv = (flat_mesh.uv[other] - flat_mesh.uv[corner]).T
-    clear = np.abs(du) > 4 * np.abs(dv)
-    assert ((step * flat_mesh.tangents[corner, :3]).sum(1) * du)[clear].min() > 0
+def test_smoothing_removes_noise_and_slivers_and_keeps_the_volume() -> None:
+    """Noise of an eighth of a cell on a torus."""
+    noise = np.random.default_rng(0).normal(scale=CELL / 8, size=(CELLS + 1,) * 3)
+    rough = marched(to_torus(grid()) + noise)
+    smooth = mesh.smooth(rough)
+    assert (smooth.faces == rough.faces).all()
+    assert volume(smooth) == pytest.approx(2 * math.pi**2 * MAJOR * MINOR**2, rel=0.01)
+    before, after = (np.abs(to_torus(shape.vertices)).mean() for shape in (rough, smooth))
+    assert after < 0.8 * before
+
+    def thinnest(shape: Mesh) -> float:
+        """First percentile of 4 sqrt(3) area / sum of squared edges: 1 for equilateral triangles, 0 for slivers."""
+        a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
+        squared_edges = sum(((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a)))
+        return float(np.percentile(2 * 3**0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / squared_edges, 1))
+
+    assert thinnest(rough) < 0.05
+    assert thinnest(smooth) > 0.15
 
 
 def test_a_sphere_of_gaussians_keeps_its_radius() -> None:

@@ -148,5 +148,9 @@ def test_paths_outside_the_folder_are_rejected(tmp_path: Path, name: str) -> Non
 def test_links_outside_the_folder_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "link").symlink_to(tmp_path)
-    with pytest.raises(BadFile, match="leaves the folder"):
+    with pytest.raises(
+        BadFile, match=rf"in/link: is a link to {tmp_path}, outside of .*in \(copy the files there; links"
+    ):
         files.path_inside(tmp_path / "in", "link/x.png")
+    with pytest.raises(BadFile, match="leaves the folder"):
+        files.path_inside(tmp_path / "in", "link/../../x.png")

@@ -8,11 +8,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 
 from tumble import matching
-from tumble.io import weights
+from tumble.io import weights, write_tensors
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
 from tumble.matching import _aliked, _gmflow, _lightglue, _window, match_pairs, xfeat
@@ -247,10 +246,15 @@ def test_the_error_of_a_damaged_cache_names_the_fix(tmp_path) -> None:
     views = list(pair())
     match_pairs(views, [(0, 1)], "dis", cache=tmp_path)
     (path,) = tmp_path.iterdir()
-    path.write_bytes(b"no tensors")
-    with pytest.raises(BadFile, match="remove it"):
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(BadFile, match=r"does not match its checksum \(delete it, it is computed again\)"):
         match_pairs(views, [(0, 1)], "dis", cache=tmp_path)
-    safetensors.torch.save_file({"uv_i": torch.zeros(1, 2)}, path)
+    path.write_bytes(b"no tensors")
+    with pytest.raises(BadFile, match="delete it"):
+        match_pairs(views, [(0, 1)], "dis", cache=tmp_path)
+    write_tensors(path, {"uv_i": torch.zeros(1, 2)}, {})
     with pytest.raises(BadFile, match="is not a match"):
         match_pairs(views, [(0, 1)], "dis", cache=tmp_path)
 

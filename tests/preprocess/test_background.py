@@ -11,6 +11,7 @@ from tumble.preprocess.background import (
     estimate_background,
     estimate_gains,
     fill_unknown,
+    sample_background,
 )
 
 RNG = np.random.default_rng(3)
@@ -92,3 +93,15 @@ def test_one_frame_is_its_own_background() -> None:
     assert background.known.all()
     assert np.array_equal(background.image, WALL)
     assert module.channel_max(np.array([[1, 5, 2]])).tolist() == [5]
+
+
+def test_samples_know_a_wall_that_appears_late_and_colours_that_alternate() -> None:
+    """The left half shows two walls in turn, the right half is always covered; the colour of neither is unlikely."""
+    images = np.stack([WALL if i % 2 else 255 - WALL for i in range(20)])
+    covered = np.zeros(images.shape[:3], bool)
+    covered[:, :, 12:] = True
+    samples = sample_background(images, covered)
+    likely = [samples.log_likelihood(images[i], i)[:, :7] for i in (4, 5)]
+    strange = samples.log_likelihood(np.roll(images[4], 1, -1), 4)[:, :7]
+    assert np.mean([np.median(each) for each in likely]) > np.median(strange) + 5
+    assert np.isnan(samples.log_likelihood(images[4], 4)[:, 12:]).all()

@@ -70,13 +70,13 @@ def test_a_wall_in_the_learnt_hand_colours_is_not_a_hand() -> None:
     """Where a silhouette moves past a plain wall, the changing pixels are wall; an arm is a hand."""
     expected = np.zeros((60, 80), bool)
     expected[20:40, 30:50] = True
-    rim = segmentation._dilated(expected, 4) & ~expected
+    rim = segmentation.dilated(expected, 4) & ~expected
     wall = np.where(expected, np.float32(-3), np.float32(3))
     background = Background(np.zeros((60, 80, 3), np.uint8), np.ones((60, 80), np.float32), np.ones((60, 80), bool))
     assert not segmentation._hand_mask(wall, expected, rim, background).any()
     arm = ~expected & (np.arange(60) > 30)[:, None] & (np.arange(80) > 35)
     hand = segmentation._hand_mask(np.where(arm, wall, np.float32(-3)), expected, rim, background)
-    assert (hand == segmentation._opened(arm, 1)).all()
+    assert (hand == segmentation.opened(arm, 1)).all()
 
 
 def test_a_seed_in_the_middle_is_propagated_both_ways() -> None:

@@ -2,11 +2,13 @@
 
 import base64
 import dataclasses
+import hashlib
 import html
 import json
 import math
 import re
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -43,8 +45,14 @@ RECORDS = [
     {"name": "decompose", "event": "done", "seconds": 201.0},
 ]
 RECIPE = {"refine": {"steps": 200, "weights": {"mask": 0.125}}, "decompose": {"bounce": "none"}, "seed": 7}
+HOSTILE = """--><!--</script></style></title><script>alert(1)</script><img src=x onerror=alert(2)>"' onload='alert(3)"""
+RECORDS += [
+    {"name": HOSTILE, "step": 1, "of": HOSTILE, "seconds": 0.0, "metrics": {"render": 1.0, HOSTILE: 1.0}},
+    {"name": HOSTILE, "event": "done", "seconds": 0.0},
+]
+RECIPE |= {HOSTILE: {HOSTILE: HOSTILE, "list": [HOSTILE], "inner": {HOSTILE: HOSTILE}}, "text": HOSTILE}
 FOCAL = float(Camera.from_fov(math.radians(30), SIDE, SIDE).fx_fy_cx_cy[0])
-SUMMARY = report.RunSummary("a <mug> & more", RECORDS, RECIPE, FOCAL)
+SUMMARY = report.RunSummary(f"a <mug> & more {HOSTILE}", RECORDS, RECIPE, FOCAL)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +86,12 @@ def capture(asset: Asset) -> Capture:
 def page(asset: Asset, capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     export.write_textured_mesh(asset, export.extract_mesh(asset, SMALL), SMALL, 1.0, folder / "asset.glb")
-    report.build(asset, capture, folder / "asset.glb", SUMMARY, None, folder / "report.html")
+    masks = capture.masks.clone()
+    masks[N - 1] = masks[N - 1].roll(SIDE // 4, 0)  # the health card names this frame
+    names = tuple(f"{name} {HOSTILE}" for name in capture.names)
+    run_capture = dataclasses.replace(capture, names=names, masks=masks)
+    rows = report.build(asset, run_capture, folder / "asset.glb", SUMMARY, None, folder / "report.html")
+    assert any(HOSTILE in row.sentence for row in rows)
     return folder / "report.html"
 
 
@@ -111,9 +124,9 @@ def test_an_assumed_focal_length_is_marked_as_such(page: Path, asset: Asset, cap
     """Half the width over the tangent of half the field of view."""
     focal = f"{0.5 * SIDE / math.tan(math.radians(15)):.0f} pixels"
     assert f"{focal}, assumed" in text(page)
-    assert f"{focal}<" in report._facts(asset, capture, dataclasses.replace(SUMMARY, assumed_focal=None))
+    assert report._facts(asset, capture, dataclasses.replace(SUMMARY, assumed_focal=None))["Focal length"] == focal
     better = report._facts(asset, capture, dataclasses.replace(SUMMARY, assumed_focal=60.0))
-    assert f"{focal} (estimated; 60 was assumed at the start)<" in better
+    assert better["Focal length"] == f"{focal} (estimated; 60 was assumed at the start)"
 
 
 def test_every_embedded_part_decodes(page: Path, asset: Asset) -> None:
@@ -155,6 +168,53 @@ def test_without_xatlas_there_is_a_page_without_a_mesh(
 def test_a_name_is_escaped(page: Path) -> None:
     assert "a <mug> & more" in text(page)
     assert "<mug>" not in page.read_text("utf-8")
+
+
+class Elements(HTMLParser):
+    """All elements of a page, the text of its scripts, and the attributes that a browser would execute."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags, self.attributes, self.scripts, self.handlers, self.data = [], [], [], [], []
+        self.inside = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes.append(attrs)
+        self.inside = tag
+        self.handlers += [name for name, value in attrs if name.startswith("on") or "javascript:" in (value or "")]
+
+    def handle_data(self, data: str) -> None:
+        (self.scripts if self.inside == "script" else self.data).append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = ""
+
+
+def test_nothing_that_a_run_says_becomes_markup(page: Path) -> None:
+    """Names of frames, capture, stages in the log and settings, values of settings, and advice of the health card."""
+    elements = Elements()
+    elements.feed(page.read_text("utf-8"))
+    assert elements.handlers == []
+    # Settings and four lights and the mesh of the live view as data, and two scripts of the package.
+    assert elements.tags.count("script") == 8
+    assert not any("alert" in script for script in elements.scripts)
+    assert all(dict(attrs).get("src", "data:").startswith("data:") for attrs in elements.attributes)
+    shown = "".join(elements.data)
+    # In title, heading, photos, health card, timings, and as names of settings.
+    assert shown.count(HOSTILE) >= 10
+    assert '"--><!--</script></style></title><script>' in shown  # the value of a setting is shown as JSON
+
+
+def test_the_scripts_of_the_page_are_those_of_the_package(page: Path) -> None:
+    """Its content security policy allows no others, whatever else might get into the page."""
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page.read_text("utf-8"))
+    assert policy is not None
+    source = html.unescape(policy[1])
+    scripts = re.findall(r"<script>(.*?)</script>", page.read_text("utf-8"), flags=re.S)
+    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    assert len(hashes) == 2
+    assert f"script-src 'sha256-{hashes[0]}' 'sha256-{hashes[1]}';" in source
 
 
 def test_the_live_view_starts_at_the_pose_of_a_frame(page: Path, asset: Asset) -> None:

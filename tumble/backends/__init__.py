@@ -50,6 +50,7 @@ __all__ = [
     "choose",
     "load",
     "names",
+    "origin_of_kernels",
     "threads",
     "threads_for_kernels",
     "usable_device",
@@ -122,6 +123,16 @@ def vector_bits() -> int:
     from tumble.backends import _native
 
     return 32 * _native.library().lanes()
+
+
+def origin_of_kernels() -> tuple[str, str]:
+    """Where the CPU kernels come from; or what replaces them, and why."""
+    from tumble.backends import _native
+
+    try:
+        return _native.origin(), ""
+    except _native.CannotCompile as reason:
+        return "plain torch, hundreds of times slower than compiled kernels", str(reason)
 
 
 class Rendering(NamedTuple):

@@ -1,4 +1,4 @@
-"""Compile the CPU kernels of `native/` on first use, cache them, and load them.
+"""Load the CPU kernels of `native/`: those of the wheel, or else compile them on first use and cache them.
 
 They are compiled by the system's C++ compiler or, if none works, by the Clang inside NVIDIA Warp if that is installed
 (`_jit`). A *build* is one shared library, named by a hash of everything that determines its machine code: sources,
@@ -18,18 +18,13 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
-from tumble.backends._cache import SOURCES, NoCache, folders, writable
+from tumble.backends._cache import SOURCES, NoCache, is_private, user_folder, writable
+from tumble.backends._prebuilt import COMPILERS, FLAGS, choose, processor_features
+from tumble.backends._prebuilt import FOLDER as PREBUILT
 from tumble.backends._structs import STRUCTURES
 
-FLAGS = (
-    *("-std=c++17", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-Wno-psabi"),
-    *("-fno-exceptions", "-fno-rtti", "-fno-math-errno", "-fno-trapping-math", "-pthread"),
-)
-"""Compiler flags. -ffast-math must not be added: it would remove the rounding trick in the kernels' exp."""
 VARIANTS = (("-march=native",), ("-mcpu=native",), ())
 """Flags for the processor of this machine, tried in this order because compilers differ in what they accept."""
-COMPILERS = ("c++", "g++", "clang++")
-"""Compilers, tried in this order."""
 
 
 class CannotCompile(RuntimeError):
@@ -38,13 +33,13 @@ class CannotCompile(RuntimeError):
 
 @cache
 def library() -> ctypes.CDLL | SimpleNamespace:
-    """The kernels compiled for this machine.
+    """The kernels: those of the wheel, else compiled for this machine.
 
     Raises:
-        CannotCompile: Neither a C++ compiler nor Warp can compile the kernels.
+        CannotCompile: The wheel has none, and neither a C++ compiler nor Warp can compile the kernels.
     """
     try:
-        kernels = _by_compiler()
+        kernels = _of_wheel() or _by_compiler()
     except CannotCompile as reason:
         kernels = _by_warp(reason)
     assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), (
@@ -53,11 +48,32 @@ def library() -> ctypes.CDLL | SimpleNamespace:
     return kernels
 
 
+def origin() -> str:
+    """Where the kernels come from, for the user.
+
+    Raises:
+        CannotCompile: See `library`.
+    """
+    kernels = library()
+    if not isinstance(kernels, ctypes.CDLL):
+        return "compiled by the Clang of Warp"
+    wheel = Path(kernels._name).parent == PREBUILT
+    return f"{Path(kernels._name).stem} of the wheel" if wheel else f"compiled by {find_compiler()}"
+
+
+def _of_wheel() -> ctypes.CDLL | None:
+    path = choose(platform.machine(), processor_features())
+    # A system older than that of the build may lack functions of the C library.
+    with contextlib.suppress(OSError):
+        return ctypes.CDLL(str(path)) if path else None
+    return None
+
+
 def _by_compiler() -> ctypes.CDLL:
     compiler = find_compiler()
     name = f"kernels-{_build_hash(compiler)}.so"
-    path = next((folder / name for folder in folders() if (folder / name).is_file()), None)
-    if path is None:
+    path = user_folder() / name
+    if not (is_private(path.parent) and is_private(path)):
         path = _place(name)
         compile_to(path, compiler)
     return ctypes.CDLL(str(path))
@@ -117,6 +133,7 @@ def compile_to(path: Path, compiler: str) -> None:
             command = [compiler, *FLAGS, *variant, str(SOURCES / "kernels.cpp"), "-o", partial]
             run = subprocess.run(command, capture_output=True, text=True, check=False)
             if run.returncode == 0:
+                Path(partial).chmod(0o700)  # linkers create the file anew, with the mode of the umask
                 Path(partial).replace(path)
                 return
             output = run.stderr

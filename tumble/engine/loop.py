@@ -14,31 +14,28 @@ import json
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import msgspec
-import safetensors.torch
 import torch
 from jaxtyping import UInt8
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
 from torch import Tensor
 
 from tumble import __version__
 from tumble.engine import optim
 from tumble.engine.optim import NotFinite
-from tumble.io import BadFile, files, tree
+from tumble.io import BadFile, files, progress, read_tensors, tree, write_tensors
 
-BAR_SECONDS = 0.5
-"""Minimum time between two updates of the progress bar [s]; reading a metric waits for the device."""
 REPORT_SECONDS = 5.0
 """Minimum time between two reports [s]."""
 PREVIEW = "preview.png"
 """Name of the preview image in the folder of the checkpoint."""
+RESTART = "the stage starts again from its first step"
+"""What happens with a damaged checkpoint, for the message."""
 
 
 @dataclass
@@ -124,8 +121,8 @@ def drive(
 ) -> Any:
     """Train a stage from its start or its checkpoint to the end, and return its output.
 
-    On a terminal a progress bar shows the remaining time and the latest scalars. Ctrl-C stops after the current step
-    and saves a checkpoint; a second Ctrl-C stops immediately.
+    On a terminal a progress bar shows the remaining time and the latest scalars (`io.progress`). Ctrl-C or SIGTERM
+    stops after the current step and saves a checkpoint; a second one stops immediately.
 
     Args:
         stage: The stage module.
@@ -140,32 +137,34 @@ def drive(
 
     Raises:
         NotFinite: A tensor became NaN or infinite; the last valid checkpoint is kept.
-        BadFile: The file is not a checkpoint, or does not match the stage.
+        BadFile: The checkpoint does not match the stage.
         OSError: The checkpoint cannot be written; the previous one is kept.
-        KeyboardInterrupt: Training was stopped by Ctrl-C; the message holds the checkpoint.
+        KeyboardInterrupt: Training was stopped by Ctrl-C or SIGTERM; the message holds the checkpoint.
     """
     started = time.perf_counter()
     key = fingerprint(key, stage.VERSION, cfg, seed)
     total = stage.length(cfg, inputs)
-    state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
-    seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
+    with progress.task(name or "training", total) as update:
+        state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
+        seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
 
-    def save() -> None:
-        _check(state, checkpoint)
-        if checkpoint:
-            _save(state, checkpoint, key, seconds + time.perf_counter() - started)
-            _write_preview(stage, cfg, inputs, state, checkpoint.with_name(PREVIEW))
+        def save() -> None:
+            _check(state, checkpoint)
+            if checkpoint:
+                _save(state, checkpoint, key, seconds + time.perf_counter() - started)
+                _write_preview(stage, cfg, inputs, state, checkpoint.with_name(PREVIEW))
 
-    with _progress_display(name, total, state.step, started - seconds, report) as show, _interrupts() as interrupted:
-        while state.step < total:
-            scalars = _step(stage, cfg, inputs, state, checkpoint)
-            state.step += 1
-            show(state.step, scalars)
-            if state.step % every == 0 or state.step == total or interrupted():
-                save()
-            if interrupted():
-                raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
-    return stage.finish(cfg, inputs, state)
+        show = _step_reports(name, total, state.step, started - seconds, update, report)
+        with _interrupts() as interrupted:
+            while state.step < total:
+                scalars = _step(stage, cfg, inputs, state, checkpoint)
+                state.step += 1
+                show(state.step, scalars)
+                if state.step % every == 0 or state.step == total or interrupted():
+                    save()
+                if interrupted():
+                    raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
+        return stage.finish(cfg, inputs, state)
 
 
 def peek(path: Path) -> tuple[int, dict[str, Tensor]]:
@@ -252,17 +251,22 @@ def _save(state: State, path: Path, key: str, seconds: float) -> None:
     """Write a checkpoint atomically."""
     tensors = {f"{part}/{name}": x for part, named in _parts(state).items() for name, x in named.items()}
     tensors["rng"] = state.rng.get_state()
-    owned = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
     about = {"key": key, "step": state.step, "seconds": seconds}  # a `_SavedState`
-    data = safetensors.torch.save(owned, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
-    files.write_atomically(path, lambda partial: partial.write_bytes(data))
+    write_tensors(path, tensors, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
 
 
 def _restore(state: State, path: Path, key: str) -> float:
-    """Restore a checkpoint with this key into an initial state; returns its training time [s], or 0 without one."""
+    """Restore a checkpoint with this key into an initial state; returns its training time [s], or 0 without one.
+
+    A damaged checkpoint gives a warning, and the stage starts again: every later state would contain the damage.
+    """
     if not path.exists():
         return 0.0
-    about, tensors = _read(path)
+    try:
+        about, tensors = _read(path)
+    except BadFile as error:
+        warnings.warn(str(error), stacklevel=4)
+        return 0.0
     if about.key != key:
         return 0.0
     parts: dict[str, dict[str, Tensor]] = {"params": {}, "optimizer": {}, "memory": {}}
@@ -288,10 +292,13 @@ def _restore(state: State, path: Path, key: str) -> float:
 
 def _read(path: Path) -> tuple[_SavedState, dict[str, Tensor]]:
     try:
-        header, tensors = tree.read_tensors(path)
+        tensors, header = read_tensors(path, RESTART)
+    except OSError as error:
+        raise BadFile(path, f"is not a checkpoint: {error}", RESTART) from None
+    try:
         return files.parse_json(path, header.get("state", ""), _SavedState), tensors
     except BadFile as error:
-        raise BadFile(path, f"is not a checkpoint: {error.rule}", "remove it to restart the stage") from None
+        raise BadFile(path, f"is not a checkpoint: {error.rule}", RESTART) from None
 
 
 # Interrupts and progress ----------------------------------------------------------------------------------------------
@@ -299,62 +306,54 @@ def _read(path: Path) -> tuple[_SavedState, dict[str, Tensor]]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[Callable[[], bool]]:
-    """A function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts immediately.
+    """A function that returns whether Ctrl-C was pressed or SIGTERM received; a second one has its usual effect.
 
-    In other threads than the main one, where Python cannot handle signals, the function always returns False.
+    In other threads than the main one, where Python cannot handle signals, the function always returns False. Signals
+    that the process ignores, as in a background job of a shell, stay ignored.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
     received: list[int] = []
 
     def handle(number: int, frame: Any) -> None:
         received.append(number)
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before[signal.Signals(number)])
 
-    signal.signal(signal.SIGINT, handle)
+    for number in before:
+        signal.signal(number, handle)
     try:
         yield lambda: bool(received)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-@contextlib.contextmanager
-def _progress_display(
-    name: str, total: int, first: int, started: float, report: Callable[[Progress], None] | None
-) -> Iterator[Callable[[int, Mapping[str, Tensor | float]], None]]:
-    """A function that shows a step in the progress bar and passes it to `report`, at limited rates."""
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[metrics]}"),
-    )
-    # Without auto_refresh, which would run a thread of its own beside training.
-    bar = ProgressBar(*columns, console=console, auto_refresh=False, transient=True, disable=not console.is_terminal)
-    task = bar.add_task(name or "training", total=total, completed=first, metrics="")
+def _step_reports(
+    name: str,
+    total: int,
+    first: int,
+    started: float,
+    update: progress.Update,
+    report: Callable[[Progress], None] | None,
+) -> Callable[[int, Mapping[str, Tensor | float]], None]:
+    """A function that passes a step to the progress display and to `report`, at limited rates."""
     start = time.perf_counter()
-    drawn = reported = -float("inf")
+    reported = -float("inf")
 
     def show(step: int, scalars: Mapping[str, Tensor | float]) -> None:
-        nonlocal drawn, reported
+        nonlocal reported
+
+        def metrics() -> dict[str, float]:
+            return {key: float(torch.as_tensor(value).detach()) for key, value in scalars.items()}
+
+        update(step, lambda: "  ".join(f"{key} {value:.4g}" for key, value in metrics().items()))
         now = time.perf_counter()
-        draws = not bar.disable and now - drawn >= BAR_SECONDS
-        reports = report is not None and (now - reported >= REPORT_SECONDS or step == total)
-        if not (draws or reports):
-            return
-        metrics = {key: float(torch.as_tensor(value).detach()) for key, value in scalars.items()}
-        if draws:
-            drawn = now
-            text = "  ".join(f"{key} {value:.4g}" for key, value in metrics.items())
-            bar.update(task, completed=step, metrics=text, refresh=True)
-        if report is not None and reports:
+        if report is not None and (now - reported >= REPORT_SECONDS or step == total):
             reported = now
             eta = (now - start) / (step - first) * (total - step)
-            report(Progress(name, step, total, round(now - started, 3), round(eta, 1), metrics))
+            report(Progress(name, step, total, round(now - started, 3), round(eta, 1), metrics()))
 
-    with bar:
-        yield show
+    return show

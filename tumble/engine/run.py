@@ -5,6 +5,7 @@
 
 The *key* of a result is a hash of everything that determines it: the stage and its version, its settings, the seed, and
 the keys of its inputs. A stage whose output is stored under its key is not run again. Ground truth never enters a key.
+Outputs, checkpoints and the asset hold a checksum: a damaged output is an error, a damaged checkpoint restarts a stage.
 """
 
 import contextlib
@@ -31,8 +32,9 @@ from tumble.io import BadFile, files, tree
 
 T = TypeVar("T")
 
-FORMAT = 2
-"""Version of the layout of run directories; incremented when older ones can no longer be read."""
+FORMAT = 3
+"""Version of the layout of run directories; incremented when older ones can no longer be read. Runs of format 2 have no
+checksums, and with estimated poses their objects are upside down."""
 RECIPE = "recipe.json"
 """Settings of the run and the path of its capture."""
 LOG = "log.jsonl"
@@ -422,9 +424,10 @@ def log(run: Run, record: dict[str, Any]) -> None:
 
 
 def log_records(path: Path) -> list[dict[str, Any]]:
-    """The records in the log of a run directory, without damaged and incomplete lines.
+    """The records in the log of a run directory.
 
-    A record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
+    Lines that a killed process left incomplete are left out, and so are records whose values are of the wrong type. A
+    record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
     """
     lines = (path / LOG).read_text("utf-8", errors="replace").splitlines() if (path / LOG).is_file() else []
     records = []

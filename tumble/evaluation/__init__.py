@@ -1,7 +1,7 @@
 """Evaluation against ground truth: metrics, rendering of an asset's prediction folder, scores and a contact sheet."""
 
 from tumble.evaluation import metrics
-from tumble.evaluation.evaluate import CaptureWithTruth, Report, read_with_truth, score
+from tumble.evaluation.evaluate import SHEET, CaptureWithTruth, Report, read_with_truth, score
 from tumble.evaluation.prediction import Prediction
 from tumble.evaluation.render_prediction import align_views, predict_views
 
@@ -9,6 +9,7 @@ __all__ = [
     "CaptureWithTruth",
     "Prediction",
     "Report",
+    "SHEET",
     "align_views",
     "metrics",
     "predict_views",

@@ -18,7 +18,7 @@ from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.evaluation import lpips, metrics, score_sheet
 from tumble.evaluation.prediction import Prediction
-from tumble.io import BadFile, files
+from tumble.io import BadFile, files, progress
 from tumble.scene import REGIONS, UNKNOWN, Capture, Truth
 
 MIN_SIDE = 11
@@ -34,6 +34,8 @@ IDENTITY_TOLERANCE = 1e-3
 camera distances]."""
 
 _VIEWS = "per view; a region's score is the mean over its views"
+SHEET = "sheet.png"
+"""Contact sheet of an evaluation, by which its folder is recognised; written first."""
 PROTOCOLS = {
     "psnr_fg_linear": f"PSNR [dB], peak 1, foreground pixels only, linear values clipped to [0, 1], {_VIEWS}",
     "psnr_full_linear": f"PSNR [dB], peak 1, all pixels over black, linear values clipped to [0, 1], {_VIEWS}",
@@ -154,7 +156,7 @@ def score(
         **scores,
     }
     sheet = score_sheet.draw(report, predicted, target.truth)
-    files.write_png(out / "sheet.png", sheet)
+    files.write_png(out / SHEET, sheet)
     files.write_json(out / "report.json", report)
     return cast(Report, report)
 
@@ -168,7 +170,8 @@ def compare(predicted: Prediction, capture: Capture, truth: Truth, networks: Seq
     """
     notes = _missing_parts(predicted, truth)
     scale = _albedo_scale(predicted, truth, notes)
-    rows = [_view_scores(i, predicted, truth, scale, networks) for i in range(len(truth))]
+    indices = progress.track(range(len(truth)), "scoring views", len(truth))
+    rows = [_view_scores(i, predicted, truth, scale, networks) for i in indices]
     light: dict[str, Any] = {}
     if predicted.light is not None and truth.light is not None:
         light = metrics.light_scores(predicted.light, truth.light, torch.ones(3) if scale is None else scale)

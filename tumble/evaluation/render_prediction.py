@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from tumble.evaluation import metrics
 from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
+from tumble.io import progress
 from tumble.maths import SO3, to_srgb8
 from tumble.rendering import antialiased_gbuffer, relight
 from tumble.scene import Asset, Capture, Environment, Trajectory, Truth
@@ -48,7 +49,8 @@ def predict_views(
     if alignment is None or truth.trajectory is None or not len(truth):
         return prediction
     views = alignment.to_prediction(truth.trajectory)
-    buffers = [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in range(len(views))]
+    indices = progress.track(range(len(views)), "rendering maps of the evaluation views", len(views))
+    buffers = [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in indices]
     coverage = torch.stack([view.alpha for view in buffers])
     # Maps extend beyond the silhouette to all pixels with a usable value; `masks` holds the silhouette.
     known = coverage >= cfg.alpha_min
@@ -60,7 +62,7 @@ def predict_views(
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
         masks=coverage >= MIN_OBJECT_COVERAGE,
-        images=_rendered_views(cfg, asset, estimated_light, views, capture),
+        images=_rendered_views(cfg, asset, estimated_light, views, capture, "the estimated light"),
         relit=_relit_views(cfg, asset, albedo, alignment, capture, truth),
     )
 
@@ -129,13 +131,14 @@ def _relit_views(
     views = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     return {
-        name: _rendered_views(cfg, scaled, light.rotated(R_pred_true), views, capture)
+        name: _rendered_views(cfg, scaled, light.rotated(R_pred_true), views, capture, name)
         for name, light in truth.lights.items()
     }
 
 
 def _rendered_views(
-    cfg: relight.Config, asset: Asset, light: Environment, views: Trajectory, capture: Capture
+    cfg: relight.Config, asset: Asset, light: Environment, views: Trajectory, capture: Capture, name: str
 ) -> UInt8[Tensor, "v h w 3"]:
-    linear = torch.stack(list(relight.relight(cfg, asset, light, views, capture.camera)))
-    return to_srgb8(linear)
+    """The views under a light with this name."""
+    linear = relight.relight(cfg, asset, light, views, capture.camera)
+    return to_srgb8(torch.stack(list(progress.track(linear, f"rendering views under {name}", len(views)))))

@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import Literal
 
 from tumble import __version__
-from tumble.export import bake, confidence, gltf, mesh, ply
+from tumble.export import atlas, bake, confidence, gltf, mesh, ply
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
-from tumble.io import files
+from tumble.io import files, progress
 from tumble.scene import Asset
-
-CHART_PADDING = 8
-"""Minimum gap between charts of the texture atlas [texels]."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +41,8 @@ PRESETS: dict[str, Preset | None] = {
     "splat": None,
 }
 """Settings by name. "web" stays below 10 MB; "splat" has no mesh."""
+EXPORT_FILE = "export.json"
+"""Unit and settings of an exported folder, by which it is recognised; written first."""
 CONFIDENCE_FILE = "confidence.png"
 """Confidence of the material as a texture, beside the GLB."""
 SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
@@ -63,12 +62,6 @@ def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, s
     settings = PRESETS[preset]
     shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
     metres = 1.0 if scale_mm is None or shape is None else scale_mm / 1000 / mesh.diameter(shape.vertices)
-    if settings and shape:
-        write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
-    ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
-    ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
-    _write_light(asset, out)
-    write_poses(asset, names, metres, out)
     facts = {
         "preset": preset,
         "metres_per_object_radius": metres,
@@ -78,7 +71,13 @@ def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, s
         "f0": float(asset.material.f0),
         "tumble": __version__,
     }
-    files.write_json(out / "export.json", facts)
+    files.write_json(out / EXPORT_FILE, facts)
+    if settings and shape:
+        write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
+    ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
+    ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
+    _write_light(asset, out)
+    write_poses(asset, names, metres, out)
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
@@ -87,26 +86,28 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
     Raises:
         ValueError: The Gaussians have no surface.
     """
-    values = signed_distances(
-        asset.gaussians, asset.gamma, cells=preset.cells, views=preset.views, pixels=preset.pixels
-    )
+    with progress.task("fusing depth maps"):
+        values = signed_distances(
+            asset.gaussians, asset.gamma, cells=preset.cells, views=preset.views, pixels=preset.pixels
+        )
     if values.min() >= 0:
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
-    return mesh.simplify(
-        mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)),
-        preset.triangles,
-    )
+    with progress.task("extracting the mesh"):
+        whole = mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells))
+        return mesh.simplify(mesh.smooth(whole), preset.triangles)
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
     """Unwrap the mesh, bake its textures, write the GLB, and beside it the confidence texture over the same UVs."""
-    flat = mesh.unwrap(shape, preset.texture, CHART_PADDING)
-    textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
+    with progress.task("texture coordinates"):
+        flat = atlas.unwrap(shape, preset.texture)
+    with progress.task("baking textures"):
+        textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
     assert asset.material is not None, "the asset has no material"
-    score = confidence.confidence_of(asset, asset.camera).score
-    files.write_png(
-        path.parent / CONFIDENCE_FILE, bake.nearest_gaussian_texture(score, asset, flat, resolution=512)[..., None]
-    )
+    with progress.task("confidence of the material"):
+        score = confidence.confidence_of(asset, asset.camera).score
+        texture = bake.nearest_gaussian_texture(score, asset, flat, resolution=512)
+    files.write_png(path.parent / CONFIDENCE_FILE, texture[..., None])
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 

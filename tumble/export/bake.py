@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from tumble.export.atlas import UnwrappedMesh
 from tumble.export.depth_fusion import surrounding_cameras
-from tumble.export.mesh import UnwrappedMesh
 from tumble.maths import SE3, nearest, srgb_from_linear
 from tumble.rendering import Buffers, render_gbuffer
 from tumble.scene import Asset, Camera

@@ -13,8 +13,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from tumble import __version__
+from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Textures
-from tumble.export.mesh import UnwrappedMesh
 from tumble.io import files
 from tumble.scene import DIELECTRIC
 
@@ -28,6 +28,8 @@ ARRAY_BUFFER = 34962
 """Target of buffer views with vertex attributes (glTF 2.0, section 5.11)."""
 ELEMENT_ARRAY_BUFFER = 34963
 """Target of buffer views with vertex indices."""
+PNG_LEVEL = 6
+"""Compression of textures; level 9 takes ten times as long for files that are 8 % smaller."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class _Buffer:
     def png(self, values: UInt8[np.ndarray, "h w *c"]) -> dict[str, Any]:
         """Append an image as PNG; returns its entry for `images`."""
         file = io.BytesIO()
-        Image.fromarray(values).save(file, "PNG", optimize=False, compress_level=9)
+        Image.fromarray(values).save(file, "PNG", optimize=False, compress_level=PNG_LEVEL)
         return {"bufferView": self.view(file.getvalue()), "mimeType": "image/png"}
 
 

@@ -1,4 +1,4 @@
-"""Triangle meshes: extraction from a signed distance grid, removal of floaters, simplification, and UV unwrapping.
+"""Triangle meshes: extraction from a signed distance grid, removal of floaters, smoothing and simplification.
 
 Object frame, object radius = 1, faces counterclockwise from outside. A *cell* is a cube of the grid; its corners hold
 the *values*: signed distances to the surface, positive outside, in any unit (`depth_fusion` computes them).
@@ -11,10 +11,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from tumble.maths import fibonacci_sphere, local_frame
+from tumble.maths import fibonacci_sphere
 
 MIN_COMPONENT_FRACTION = 0.02
 """Size below which a connected component is removed as a floater [fraction of the largest component's triangles]."""
+SMOOTHING_STEPS = 10
+"""Pairs of steps of Taubin smoothing, which remove the noise of the grid and the slivers of marching, at which charts
+of the atlas would break. They move vertices by about a fifth of a cell."""
+SHRINKING, GROWING = 0.5, -0.53
+"""Fractions by which the two steps of a pair move a vertex towards the mean of its neighbours (Taubin 1995); together
+they keep the volume."""
 
 
 @dataclass(frozen=True)
@@ -23,20 +29,6 @@ class Mesh:
 
     vertices: Float[np.ndarray, "v 3"]
     """[object radius]"""
-    faces: Int[np.ndarray, "f 3"]
-
-
-@dataclass(frozen=True)
-class UnwrappedMesh:
-    """A triangle mesh with texture coordinates; vertices on a seam of the atlas are duplicated."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    normals: Float[np.ndarray, "v 3"]
-    """Unit length, equal on both sides of a seam."""
-    tangents: Float[np.ndarray, "v 4"]
-    """Unit direction of increasing u, and the sign w in bitangent = w cross(normal, tangent), towards smaller v."""
-    uv: Float[np.ndarray, "v 2"]
-    """glTF texture coordinates: the origin is the top left corner of the texture."""
     faces: Int[np.ndarray, "f 3"]
 
 
@@ -102,12 +94,12 @@ def _is_even(order: tuple[int, ...]) -> bool:
 
 def remove_floaters(mesh: Mesh) -> Mesh:
     """The mesh without connected components that are smaller than `MIN_COMPONENT_FRACTION` of the largest."""
-    label = _components(len(mesh.vertices), mesh.faces)[mesh.faces[:, 0]]
+    label = components(len(mesh.vertices), mesh.faces)[mesh.faces[:, 0]]
     names, counts = np.unique(label, return_counts=True)
     return _compact(mesh.vertices, mesh.faces[np.isin(label, names[counts >= MIN_COMPONENT_FRACTION * counts.max()])])
 
 
-def _components(n: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " n"]:
+def components(n: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " n"]:
     """Label of the connected component of each vertex, by propagation of minimum labels with pointer jumping."""
     label = np.arange(n)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -125,6 +117,21 @@ def _compact(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) 
     """The mesh without unused vertices."""
     used, index = np.unique(faces, return_inverse=True)
     return Mesh(vertices[used], index.reshape(-1, 3))
+
+
+def smooth(mesh: Mesh) -> Mesh:
+    """The mesh without noise at the scale of its edges, of the same topology and volume (Taubin 1995).
+
+    Each edge must belong to two triangles that are oriented alike, as in meshes of `marching_tetrahedra`.
+    """
+    start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    n = len(mesh.vertices)
+    degree = np.bincount(start, minlength=n)[:, None].clip(1)
+    x = mesh.vertices
+    for fraction in (SHRINKING, GROWING) * SMOOTHING_STEPS:
+        mean = np.stack([np.bincount(start, x[end, axis], n) for axis in range(3)], 1) / degree
+        x = x + fraction * (mean - x)
+    return Mesh(x, mesh.faces)
 
 
 def simplify(mesh: Mesh, triangles: int) -> Mesh:
@@ -150,7 +157,7 @@ def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     total = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(total, mesh.faces[:, corner], face)
-    return _unit(total)
+    return unit_rows(total)
 
 
 def diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
@@ -161,59 +168,7 @@ def diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
     return float(torch.cdist(corners, corners).max())
 
 
-# The atlas ------------------------------------------------------------------------------------------------------------
-
-
-def unwrap(mesh: Mesh, resolution: int, padding: int) -> UnwrappedMesh:
-    """The mesh with one set of texture coordinates without overlaps, by xatlas.
-
-    Args:
-        resolution: Side of the texture [texels].
-        padding: Empty border around every chart [texels].
-    """
-    import xatlas
-
-    normals = vertex_normals(mesh)
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), normals.astype(np.float32))
-    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
-    charts.max_iterations = 1
-    packing.resolution, packing.padding, packing.bilinear = resolution, padding, True
-    # xatlas rotates charts by swapping u and v, which mirrors them; some viewers handle mirrored charts wrongly.
-    charts.fix_winding, packing.rotate_charts = True, False
-    atlas.generate(charts, packing)
-    origin, faces, uv = atlas[0]
-    # The v of xatlas points up (its charts are counterclockwise), that of glTF down.
-    faces, uv = faces.astype(np.int64).reshape(-1, 3), np.stack([uv[:, 0], 1 - uv[:, 1]], 1).astype(np.float64)
-    vertices, normals = mesh.vertices[origin], normals[origin]
-    return UnwrappedMesh(vertices, normals, _tangents(vertices, normals, uv, faces), uv, faces)
-
-
-def _tangents(
-    vertices: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
-    uv: Float[np.ndarray, "v 2"],
-    faces: Int[np.ndarray, "f 3"],
-) -> Float[np.ndarray, "v 4"]:
-    """Tangents of vertices: directions of increasing u, averaged over the adjacent faces, orthogonal to the normals."""
-    corners, corners_uv = vertices[faces], uv[faces]
-    (x1, x2), (p1, p2) = (
-        (values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]) for values in (corners, corners_uv)
-    )
-    # Twice the signed area in the texture: negative for charts that are not mirrored, because v points down.
-    area = (p1[:, 0] * p2[:, 1] - p1[:, 1] * p2[:, 0])[:, None]
-    along = (x1 * p2[:, 1:] - x2 * p1[:, 1:]) * np.sign(area)
-    total, sign = np.zeros_like(vertices), np.zeros(len(vertices))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], along)
-        np.add.at(sign, faces[:, corner], -area[:, 0])
-    total -= normals * (total * normals).sum(1, keepdims=True)
-    fallback = local_frame(torch.from_numpy(np.ascontiguousarray(normals, np.float64)))[..., 0].numpy()
-    total = np.where(np.linalg.norm(total, axis=1, keepdims=True) > 1e-12, total, fallback)
-    return np.concatenate([_unit(total), np.where(sign < 0, -1.0, 1.0)[:, None]], 1)
-
-
-def _unit(x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def unit_rows(x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Rows normalised to length 1; a row of zeros becomes +z."""
     length = np.linalg.norm(x, axis=1, keepdims=True)
     return np.where(length > 1e-20, x / length.clip(1e-20), np.array([0.0, 0.0, 1.0]))

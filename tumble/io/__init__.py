@@ -1,9 +1,11 @@
-"""Images, videos, JSON documents and trees of tensors on disk, network weights, and loading plugins by file name.
+"""Images, videos, JSON documents and trees of tensors on disk, network weights, the rules for
+outputs, progress, and loading plugins by file name.
 
 Every file is written atomically. Every reader raises `BadFile` with the rule that the file breaks and the fix.
 """
 
-from tumble.io import files, limits, tree, video, weights
+from tumble.io import files, limits, outputs, progress, tree, video, weights
+from tumble.io.checked_tensors import read_tensors, write_tensors
 from tumble.io.errors import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
 
@@ -12,8 +14,12 @@ __all__ = [
     "files",
     "limits",
     "load_plugin",
+    "outputs",
     "plugin_names",
+    "progress",
+    "read_tensors",
     "tree",
     "video",
     "weights",
+    "write_tensors",
 ]

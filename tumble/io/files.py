@@ -53,9 +53,16 @@ def path_inside(root: Path, name: str) -> Path:
         path.exists()
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a zero byte, a name that is too long
         raise BadFile(root, f"the path {name[:80]!r} cannot be opened: {_first_line(error)}") from None
-    if not inside:
+    if inside:
+        return path
+    parts = Path(name).parts
+    links = [root.joinpath(*parts[:n]) for n in range(1, len(parts) + 1) if root.joinpath(*parts[:n]).is_symlink()]
+    if Path(name).is_absolute() or ".." in parts or not links:
         raise BadFile(root, f"the path {name!r} leaves the folder", "use paths relative to the folder, without ..")
-    return path
+    reason = (
+        "links out of a folder are not followed, because in one from elsewhere they could lead to any file of yours"
+    )
+    raise BadFile(links[0], f"is a link to {links[0].resolve()}, outside of {root}", f"copy the files there; {reason}")
 
 
 @contextlib.contextmanager
@@ -74,6 +81,8 @@ def describe_write_errors(path: Path) -> Iterator[None]:
             errno.ENOSPC: "free some space",
             errno.EDQUOT: "free some space",
             errno.EROFS: "choose a folder that can be written",
+            errno.ENOTDIR: "a part of this path is a file: choose another folder",
+            errno.EEXIST: "a part of this path is a file: choose another folder",
             errno.EACCES: "choose a folder that you may write to",
             errno.EPERM: "choose a folder that you may write to",
         }

@@ -3,7 +3,7 @@
 A *tree* is a frozen dataclass whose fields are tensors, other trees, dicts of tensors, or *plain values* (numbers,
 strings, tuples of those, None). The *name* of a tensor is its path of field names joined by dots, such as
 `trajectory.T_cam_obj.wxyz`. On disk a tree is one safetensors file: tensors by name, and plain values as JSON in the
-header under the key "facts". Nothing is pickled.
+header under the key "facts", with the checksum of `checked_tensors`. Nothing is pickled.
 """
 
 import dataclasses
@@ -15,13 +15,12 @@ from typing import Any, TypeVar
 
 import jaxtyping
 import msgspec
-import safetensors
-import safetensors.torch
 import torch
 from torch import Tensor
 
 from tumble import __version__
 from tumble.io import files
+from tumble.io.checked_tensors import read_tensors, write_tensors
 from tumble.io.errors import BadFile
 
 T = TypeVar("T")
@@ -57,44 +56,29 @@ def detach(tree: T) -> T:
 
 def save(tree: object, path: Path) -> None:
     """Write a tree atomically as one safetensors file."""
-    # Tensors may share storage (views of one parameter); safetensors requires each to own its bytes.
-    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in named_tensors(tree).items()}
     header = {"type": type(tree).__name__, "tumble": __version__, "facts": json.dumps(_plain_values(tree))}
-    files.write_atomically(path, lambda partial: safetensors.torch.save_file(tensors, partial, metadata=header))
+    write_tensors(path, named_tensors(tree), header)
 
 
 def load(cls: type[T], path: Path, device: torch.device | str = "cpu") -> T:
     """The tree of class `cls` stored in a file; types and shapes of all fields are those of the class.
 
     Raises:
-        BadFile: The file is damaged, holds another class, lacks a field, or has one of another type or shape.
+        BadFile: The file does not match its checksum, holds another class, lacks a field, or has one of another type
+            or shape.
     """
-    header, tensors = read_tensors(path, device)
+    tensors, header = read_tensors(path, FIX)
     if header.get("type") != cls.__name__:
         raise BadFile(path, f"holds a {header.get('type', 'file of unknown type')}, not a {cls.__name__}", FIX)
     try:
         # Not the JSON of msgspec, because plain values may be infinite.
         tree = msgspec.convert(_nested(json.loads(header["facts"]), tensors, ""), cls, dec_hook=_tensor)
         _require_consistent(tree)
-        return tree
     except msgspec.ValidationError as error:
         raise BadFile(path, f"holds no valid {cls.__name__}: {files.violated_rule(error)}", FIX) from None
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError, AssertionError) as error:
         raise BadFile(path, f"is damaged: {type(error).__name__}: {str(error)[:200]}", FIX) from None
-
-
-def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a safetensors file.
-
-    Raises:
-        BadFile: The file is missing or damaged.
-    """
-    try:
-        with safetensors.safe_open(path, framework="pt", device=str(device)) as file:
-            # `file` is not a dict.
-            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, OSError, ValueError, TypeError, LookupError, RuntimeError) as error:
-        raise BadFile(path, f"is damaged: {error}", FIX) from None
+    return to(tree, device)
 
 
 def _fields(tree: object) -> dict[str, Any]:

@@ -46,6 +46,8 @@ CONTAINERS = "mov,mp4,matroska,webm,avi,mpegts,mpeg,mjpeg,flv,asf,ogg,h264,hevc,
 """Names of FFmpeg's readers that may open a file; others, such as playlists, refer to further files."""
 HD_HEIGHT = 720
 """Frame height [pixels] from which an unspecified colour matrix means BT.709, else BT.601, as in video players."""
+CLIP_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""FFmpeg's names of the containers that are written, by extension."""
 MIN_DECODED_FRACTION = 0.9
 """Minimum fraction of announced frames in a complete video; edit lists hide a few frames of complete videos."""
 
@@ -72,13 +74,13 @@ def write_clip(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], *, qual
     """Write sRGB code values as an H.264 video in the most compatible format (yuv420p, BT.709).
 
     Args:
-        path: File to write.
+        path: File to write, with an extension of `CLIP_FORMATS`.
         frames: Frames of even height and width.
         quality: Constant rate factor: 0 is lossless, 14 has no visible artefacts, 28 is a small preview.
     """
 
     def write(partial: Path) -> None:
-        with av.open(str(partial.absolute()), "w", format="mp4") as container:
+        with av.open(str(partial.absolute()), "w", format=CLIP_FORMATS[path.suffix.lower()]) as container:
             stream = None
             for values in frames:
                 if stream is None:

@@ -11,12 +11,9 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import safetensors.torch
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tumble.io import BadFile, files, load_plugin, tree
+from tumble.io import BadFile, load_plugin, progress, read_tensors, write_tensors
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
@@ -39,7 +36,7 @@ def match_pairs(
     device: torch.device | str = "cpu",
     cache: Path | None = None,
 ) -> list[Match]:
-    """Matches of pairs of views, in the order of the pairs, with a progress bar.
+    """Matches of pairs of views, in the order of the pairs.
 
     Args:
         views: Frames.
@@ -58,16 +55,14 @@ def match_pairs(
     key = settings(matcher)
     digests = [_window.digest(view) for view in views]
     matches = []
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        for i, j in bar.track(pairs, description=f"matching ({matcher})"):
-            path = _cache_path(cache, matcher, key, digests[i], digests[j])
-            if path is not None and path.exists():
-                matches.append(_read(path, views[i].number, views[j].number))
-                continue
-            matches.append(load(device)(views[i], views[j]))
-            if path is not None:
-                _write(path, matches[-1])
+    for i, j in progress.track(pairs, f"matching ({matcher})", len(pairs)):
+        path = _cache_path(cache, matcher, key, digests[i], digests[j])
+        if path is not None and path.exists():
+            matches.append(_read(path, views[i].number, views[j].number))
+            continue
+        matches.append(load(device)(views[i], views[j]))
+        if path is not None:
+            _write(path, matches[-1])
     return matches
 
 
@@ -100,14 +95,16 @@ def _cache_path(cache: Path | None, matcher: str, settings: str, *digests: str) 
 
 def _write(path: Path, match: Match) -> None:
     """Write a match without the frames' indices, which depend on the rest of the capture."""
-    tensors = {name: getattr(match, name).contiguous() for name in ("uv_i", "uv_j", "confidence")}
-    files.write_atomically(path, lambda partial: safetensors.torch.save_file(tensors, partial))
+    write_tensors(path, {name: getattr(match, name) for name in ("uv_i", "uv_j", "confidence")}, {"type": "Match"})
 
 
 def _read(path: Path, i: int, j: int) -> Match:
     """Match of a file in the cache, between frames `i` and `j`."""
-    tensors = tree.read_tensors(path)[1]
+    fix = "delete it, it is computed again"
+    tensors, header = read_tensors(path, fix)
+    if header.get("type") != "Match":
+        raise BadFile(path, "is not a match", fix)
     try:
         return Match(i, j, tensors["uv_i"], tensors["uv_j"], tensors["confidence"])
     except (KeyError, AssertionError, TypeError) as error:
-        raise BadFile(path, f"is not a match: {error}", "remove it, it is computed again") from None
+        raise BadFile(path, f"is not a match: {error}", fix) from None

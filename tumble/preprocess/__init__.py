@@ -10,8 +10,8 @@ from tumble._lazy import lazy_getattr
 if TYPE_CHECKING:
     from tumble.preprocess.box_picker import pick_box
     from tumble.preprocess.check import check_footage, passes
+    from tumble.preprocess.footage import PROVENANCE, read_provenance
     from tumble.preprocess.options import FootageOptions
-    from tumble.preprocess.provenance import PROVENANCE, read_provenance
     from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
     from tumble.preprocess.video_to_capture import PREVIEW, footage_fingerprint
 
@@ -36,7 +36,7 @@ __getattr__ = lazy_getattr(
         "check": ("check_footage", "passes"),
         "options": ("FootageOptions",),
         "source": ("FOOTAGE", "input_kind", "to_capture"),
-        "provenance": ("PROVENANCE", "read_provenance"),
+        "footage": ("PROVENANCE", "read_provenance"),
         "video_to_capture": ("PREVIEW", "footage_fingerprint"),
     },
 )

@@ -10,7 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Bool, Float32, Integer, Shaped, UInt8
 
 from tumble.maths import linear_from_srgb, to_srgb8
 
@@ -37,6 +37,19 @@ UNCLIPPED = (25, 235)
 MIN_USABLE_FRACTION = 0.01
 """Minimum fraction of usable pixels of an image; with fewer, the gain is not estimated."""
 
+N_BACKGROUND_SAMPLES = 30
+"""Number of frames from which colours of the background are sampled."""
+SAMPLE_MARGIN = 4
+"""Distance from object and hand within which no colour is sampled [pixels]."""
+SAMPLE_DEVIATION = 6.0
+"""Standard deviation of a pixel of the background over time, as compared with samples [code values]."""
+MIN_SAMPLES = 4
+"""Minimum number of samples of a pixel; with fewer, nothing is known."""
+MIN_AGREEING_SAMPLES = 1.2
+"""Minimum number of samples of a colour that count, weighted by similarity."""
+SAMPLE_NOVELTY = 0.02
+"""Probability that a pixel of the background has a colour of none of its samples."""
+
 
 @dataclass(frozen=True)
 class Background:
@@ -61,6 +74,47 @@ class Background:
         # A slight blur reduces the codec's noise.
         observed, expected = cv2.GaussianBlur(image, (3, 3), 0), cv2.GaussianBlur(self.image, (3, 3), 0)
         return channel_max(cv2.absdiff(observed, expected)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class BackgroundSamples:
+    """Colours of each pixel on some frames on which nothing covers it (sample consensus, as in ViBe).
+
+    They hold what `Background` cannot: a person behind the object who moves, and a wall that appears late.
+    """
+
+    index: Integer[np.ndarray, " k"]
+    """Indices of the sampled frames."""
+    images: UInt8[np.ndarray, "k h w 3"]
+    """sRGB code values, slightly blurred."""
+    valid: Bool[np.ndarray, "k h w"]
+    """Pixels that show neither object nor hand."""
+
+    def log_likelihood(self, image: UInt8[np.ndarray, "h w 3"], index: int) -> Float32[np.ndarray, "h w"]:
+        """Log density of the colours of frame `index`, given the other frames; not a number where these are too few."""
+        observed = cv2.GaussianBlur(image, (3, 3), 0)
+        total, count = np.zeros(image.shape[:2], np.float32), np.zeros(image.shape[:2], np.float32)
+        for sampled, valid in zip(self.images[self.index != index], self.valid[self.index != index], strict=True):
+            distance = channel_max(cv2.absdiff(observed, sampled)).astype(np.float32)
+            total += valid * np.exp(-0.5 * (distance / SAMPLE_DEVIATION) ** 2)
+            count += valid
+        # One agreeing sample may be a mask's error.
+        density = np.where(total > MIN_AGREEING_SAMPLES, total, 0) / np.maximum(count, 1)
+        density *= (SAMPLE_DEVIATION * np.sqrt(2 * np.pi)) ** -3
+        known = np.log(density + SAMPLE_NOVELTY * 256.0**-3).astype(np.float32)
+        return np.where(count >= MIN_SAMPLES, known, np.float32(np.nan))
+
+
+def sample_background(images: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"]) -> BackgroundSamples:
+    """Colours of every pixel where nothing covers it or its neighbourhood, on evenly spaced frames.
+
+    Args:
+        covered: Pixels of the object and of hands.
+    """
+    index = np.unique(np.linspace(0, len(images) - 1, N_BACKGROUND_SAMPLES).round().astype(int))
+    margin = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * SAMPLE_MARGIN + 1,) * 2)
+    near = [cv2.dilate(covered[i].astype(np.uint8), margin) > 0 for i in index]
+    return BackgroundSamples(index, np.stack([cv2.GaussianBlur(images[i], (3, 3), 0) for i in index]), ~np.stack(near))
 
 
 def estimate_background(

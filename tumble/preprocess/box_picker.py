@@ -20,9 +20,8 @@ import numpy as np
 
 from tumble.io import BadFile, files
 from tumble.preprocess import footage
-from tumble.preprocess.footage import FootageFrame
+from tumble.preprocess.footage import PROVENANCE, FootageFrame
 from tumble.preprocess.options import FootageOptions
-from tumble.preprocess.provenance import PROVENANCE
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import lens_of, undistort_frame
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from tumble.io import video
+from tumble.io import outputs, progress, video
 from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, video_to_capture
 from tumble.preprocess.box_picker import pick_box
 from tumble.preprocess.options import FootageOptions
@@ -64,20 +64,26 @@ class Finding:
     """How to improve it; empty if the rating is good."""
 
 
-def check_footage(path: Path, out: Path, options: FootageOptions | None = None, *, pick: bool = False) -> list[Finding]:
+def check_footage(
+    path: Path, out: Path, options: FootageOptions | None = None, *, pick: bool = False, overwrite: bool = False
+) -> list[Finding]:
     """Check a video or a folder of images, and write a preview of its masks into the folder `out`.
 
     Args:
         pick: Draw a box around the object in the browser.
+        overwrite: Write into `out` even if it holds something else than an earlier preview.
 
     Raises:
-        BadFile: The footage cannot be read, or no moving object is found in it.
+        BadFile: The footage cannot be read, no moving object is found in it, or `out` holds something else.
     """
+    outputs.require_outside(out, path)
+    outputs.claim_folder(out, video_to_capture.PREVIEW, overwrite=overwrite)
     options = options or FootageOptions()
     options = pick_box(path, options, out / "capture") if pick else options
     if input_kind(path) == "posed images":
         return _check_posed(colmap_to_capture.collect_silhouettes(path, options), out, options)
-    survey = survey_footage(path, options)
+    with progress.task(f"surveying {path.name}"):
+        survey = survey_footage(path, options)
     selected = keyframes.select_keyframes(survey.rotation, survey.blurs, survey.usable, options.frames)
     kept = [int(i) for i in np.nonzero(survey.usable)[0]] if survey.footage.images else selected
     video_to_capture.write_preview(survey, out / video_to_capture.PREVIEW, kept)

@@ -22,9 +22,8 @@ from tumble.io import BadFile, files
 from tumble.maths import SE3, smallest_enclosing_sphere
 from tumble.preprocess import colmap, video_to_capture
 from tumble.preprocess.colmap import PosedImage, SparseModel
-from tumble.preprocess.footage import find_mask, read_mask
+from tumble.preprocess.footage import PROVENANCE, find_mask, read_mask
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
-from tumble.preprocess.provenance import PROVENANCE
 from tumble.preprocess.survey import downsample_mask
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Trajectory, mask_from_alpha, undistortion
 

@@ -6,6 +6,8 @@ be compared. They are combined by Bayes' rule with a prior from the previous fra
 iterations of a Markov random field whose neighbours are coupled if their colours are similar.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
 from tumble.preprocess.background import Background, channel_max
+from tumble.preprocess.hands import Hand, arm_region, hand_region, hand_strokes, hand_surroundings
 
+OBJECT_CLASS, HAND_CLASS, BACKGROUND_CLASS = 0, 1, 2
+"""Indices of the classes in arrays of probabilities."""
 BINS = (8, 32, 32)
 """Number of bins for L, a and b; fewer for lightness, because shading changes it most."""
 BIN_VOLUME = 256.0**3 / (8 * 32 * 32)
@@ -24,8 +29,12 @@ OBJECT_NOVELTY = 0.1
 """Probability that a pixel of the object has a colour not learnt yet, or one of a background known only by colour."""
 HAND_NOVELTY = 0.02
 """Probability that a pixel of the hand has a colour not learnt yet."""
+NO_HAND_LOG_LIKELIHOOD = math.log(HAND_NOVELTY * UNIFORM_DENSITY)
+"""Log likelihood, under hand, of a colour that hands do not have."""
 BACKGROUND_NOVELTY = 0.001
 """Probability that a pixel of the static background has another colour; it hardly changes."""
+UNKNOWN_BACKGROUND_NOVELTY = 0.5
+"""Probability that a pixel of a background that was never visible has a colour that others do not have."""
 SHADOW_PENALTY = 5.0
 """Penalty of the log likelihood for explaining a pixel by a shadow on the background."""
 MIN_SHADOW_RATIO = 0.55
@@ -124,10 +133,7 @@ def mean_field_probability(
     odds: Float32[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
     """Probability of the object after mean-field smoothing, which couples neighbours of similar colour."""
-    colour = image.astype(np.float32)
-    right, below = np.diff(colour, axis=1), np.diff(colour, axis=0)
-    across = SMOOTHNESS * np.exp(-_dot(right, right) / (2 * CONTRAST**2))
-    down = SMOOTHNESS * np.exp(-_dot(below, below) / (2 * CONTRAST**2))
+    across, down = _couplings(image)
     spin = np.tanh(odds / 2)
     for _ in range(MEAN_FIELD_ITERATIONS):
         field = odds.copy()
@@ -137,6 +143,70 @@ def mean_field_probability(
         field[:-1] += down * spin[1:]
         spin = np.tanh(field / 2)
     return 0.5 + 0.5 * spin
+
+
+def log_likelihoods(
+    image: UInt8[np.ndarray, "h w 3"],
+    background: Background,
+    colours: ColourModel,
+    sampled: Float32[np.ndarray, "h w"] | None = None,
+) -> Float32[np.ndarray, "3 h w"]:
+    """Log likelihood of every pixel's colour under object, hand and background.
+
+    Args:
+        sampled: Log likelihood of the background from other frames (`BackgroundSamples`); not a number if unknown.
+    """
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    log_background = _log_density(colours.background, UNKNOWN_BACKGROUND_NOVELTY, lab)
+    static = _background_log_density(image, background)
+    log_background = np.where(background.known, static, log_background)
+    if sampled is not None:
+        known = np.nan_to_num(sampled)
+        both = np.where(background.known, np.logaddexp(static, known) - np.float32(np.log(2)), known)
+        log_background = np.where(np.isnan(sampled), log_background, both)
+    log_object, log_hand = (
+        _log_density(colours.object, OBJECT_NOVELTY, lab),
+        _log_density(colours.hand, HAND_NOVELTY, lab),
+    )
+    return np.stack([log_object, log_hand, log_background]).astype(np.float32)
+
+
+def class_probabilities(
+    log_posterior: Float32[np.ndarray, "3 h w"], image: UInt8[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "3 h w"]:
+    """Probabilities of the classes after mean-field smoothing, which couples neighbours of similar colour."""
+    across, down = _couplings(image)
+    probabilities = _softmax(log_posterior)
+    for _ in range(MEAN_FIELD_ITERATIONS):
+        field = log_posterior.copy()
+        field[:, :, 1:] += across * probabilities[:, :, :-1]
+        field[:, :, :-1] += across * probabilities[:, :, 1:]
+        field[:, 1:] += down * probabilities[:, :-1]
+        field[:, :-1] += down * probabilities[:, 1:]
+        probabilities = _softmax(field)
+    return probabilities
+
+
+def hand_colours(
+    images: UInt8[np.ndarray, "t h w 3"], hands: Sequence[Sequence[Hand]]
+) -> Float32[np.ndarray, "8 32 32"]:
+    """Density of the hands' colours, from their landmarks in all frames.
+
+    Some landmarks are hidden by the object, so half the density of the colours around the hands is subtracted.
+    """
+    at_hand, around, shape = [], [], images.shape[1:3]
+    for image, found in zip(images, hands, strict=True):
+        if found:
+            lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+            at_hand.append(lab[hand_strokes(found, shape)])
+            beyond = hand_region(found, shape) & ~hand_surroundings(found, shape) & ~arm_region(found, shape)
+            around.append(lab[beyond])
+    if not at_hand:
+        return _skin_density()
+    density, others = _density(np.concatenate(at_hand)), np.concatenate(around)
+    if len(others):
+        density = np.maximum(density - _density(others) / 2, 0)
+    return (density / (density.sum() * np.float32(BIN_VOLUME))).astype(np.float32)
 
 
 def trim_rim(
@@ -157,6 +227,20 @@ def trim_rim(
 def skin_coloured(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     """Pixels in the colour range of skin, which includes wood and cardboard."""
     return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb), *SKIN_YCRCB) > 0
+
+
+def _couplings(image: np.ndarray) -> tuple[Float32[np.ndarray, "h w1"], Float32[np.ndarray, "h1 w"]]:
+    """Coupling of every pixel with the next one to the right, and with the one below."""
+    colour = image.astype(np.float32)
+    right, below = np.diff(colour, axis=1), np.diff(colour, axis=0)
+    across = SMOOTHNESS * np.exp(-_dot(right, right) / (2 * CONTRAST**2))
+    down = SMOOTHNESS * np.exp(-_dot(below, below) / (2 * CONTRAST**2))
+    return across, down
+
+
+def _softmax(logits: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]:
+    e = np.exp(logits - logits.max(0))
+    return e / e.sum(0)
 
 
 def _background_log_density(image: np.ndarray, background: Background) -> Float32[np.ndarray, "h w"]:

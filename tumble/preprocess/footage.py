@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import UInt8
@@ -42,6 +43,8 @@ EXIF_EQUIVALENT_FOCAL = 0xA405
 ORIENTATIONS = ((0, False), (0, False), (0, True), (2, False), (2, True), (3, True), (3, False), (1, True), (1, False))
 """Per EXIF orientation 0 (not stated) to 8: number of quarter turns counter-clockwise, and whether to mirror left to
 right after them."""
+PROVENANCE = "ingest.json"
+"""File name, in a capture, of the record of how it was made."""
 
 
 @dataclass(frozen=True)
@@ -258,3 +261,34 @@ def read_mask(path: Path, image: UInt8[np.ndarray, "h w c"], invert: bool) -> UI
         rule = f"has {mask.shape[1]} x {mask.shape[0]} pixels, its frame {image.shape[1]} x {image.shape[0]}"
         raise BadFile(path, rule, "masks must be as large as the upright frames")
     return decode_mask(mask, invert=invert)
+
+
+class SourceFrame(msgspec.Struct, frozen=True):
+    """One frame of the capture."""
+
+    name: str
+    source_frame: int | None = None
+    """Number of the frame in the video; None for images with a COLMAP model."""
+
+
+class Provenance(msgspec.Struct, frozen=True):
+    """The entries of `ingest.json` that are read again."""
+
+    footage: str = ""
+    """SHA-256 of the footage."""
+    options: dict[str, Any] = {}
+    """The `FootageOptions`, by name."""
+    frames: tuple[SourceFrame, ...] = ()
+    focal_source: str = ""
+    window_top_left_height_width: tuple[float, float, float, float] | None = None
+    """Crop window [pixels of the footage]; None for images with a COLMAP model."""
+
+
+def read_provenance(capture: Path) -> Provenance | None:
+    """The record in a capture folder; None if there is none.
+
+    Raises:
+        BadFile: The record is damaged.
+    """
+    path = capture / PROVENANCE
+    return files.read_json(path, Provenance) if path.is_file() else None

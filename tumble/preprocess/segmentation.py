@@ -129,10 +129,10 @@ def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h 
     An object of one colour that rotates in place looks static. So inside the box, pixels that match the background are
     accepted as background only if they are connected to the border of the box.
     """
-    static, moving = _opened(background.same(image), 1), _opened(background.differs(image), 1)
-    inside = _box_mask(moving.shape, seed.box or _box_around(seed.click, moving))
-    _, ids = _components(static & inside)
-    enclosed = static & inside & ~np.isin(ids, np.unique(ids[inside & ~_eroded(inside, 1)]))
+    static, moving = opened(background.same(image), 1), opened(background.differs(image), 1)
+    inside = box_mask(moving.shape, seed.box or box_around(seed.click, moving))
+    _, ids = components(static & inside)
+    enclosed = static & inside & ~np.isin(ids, np.unique(ids[inside & ~eroded(inside, 1)]))
     mostly_static = (moving & inside).sum() < MIN_MOVING_FRACTION * inside.sum()
     return replace(background, known=background.known & ~(inside if mostly_static else enclosed))
 
@@ -143,7 +143,7 @@ def moving_skin(image: UInt8[np.ndarray, "h w 3"], background: Background) -> Bo
     A hand that holds still becomes part of the static background except for its edges, so a few moving pixels suffice.
     A wooden table does not move; an object of the colour of skin is included.
     """
-    return _moved_components(_opened(skin_coloured(image), 1), background.differs(image) | ~background.known)
+    return _moved_components(opened(skin_coloured(image), 1), background.differs(image) | ~background.known)
 
 
 def find_seed(images: UInt8[np.ndarray, "t h w 3"], background: Background) -> Seed | None:
@@ -154,8 +154,8 @@ def find_seed(images: UInt8[np.ndarray, "t h w 3"], background: Background) -> S
     best, largest = None, MIN_PIXELS
     for i in np.unique(np.linspace(0, len(images) - 1, 9).round().astype(int)):
         changing = background.differs(images[i]) | ~background.known
-        moving = _opened(changing & ~skin_coloured(images[i]), 2)
-        count, _, stats, _ = cv2.connectedComponentsWithStats(_closed(moving, 4).astype(np.uint8))
+        moving = opened(changing & ~skin_coloured(images[i]), 2)
+        count, _, stats, _ = cv2.connectedComponentsWithStats(closed(moving, 4).astype(np.uint8))
         if count < 2:
             continue
         left, top, width, height, area = stats[1:][stats[1:, cv2.CC_STAT_AREA].argmax()].tolist()
@@ -181,8 +181,8 @@ def make_trimap(
         unknown: Pixels that are neither object nor certainly background.
         band: Half the width of the band, which straddles the silhouette [pixels].
     """
-    labels = np.where(_dilated(inside, band) | unknown, np.uint8(UNKNOWN), np.uint8(BACKGROUND))
-    labels[_eroded(inside, band)] = OBJECT
+    labels = np.where(dilated(inside, band) | unknown, np.uint8(UNKNOWN), np.uint8(BACKGROUND))
+    labels[eroded(inside, band)] = OBJECT
     _, ids, stats, _ = cv2.connectedComponentsWithStats((labels == BACKGROUND).astype(np.uint8), connectivity=4)
     left, top, width, height, area = stats.T
     enclosed = (left > 0) & (top > 0) & (left + width < labels.shape[1]) & (top + height < labels.shape[0])
@@ -200,13 +200,13 @@ def refine_mask(
         radius: Width of the uncertain band [pixels].
     """
     inner, outer = coarse == OBJECT, coarse != BACKGROUND
-    near = _dilated(inner, radius)
+    near = dilated(inner, radius)
     trimap = np.where(near, np.uint8(cv2.GC_PR_BGD), np.uint8(cv2.GC_BGD))
     trimap[inner] = cv2.GC_PR_FGD
-    trimap[_eroded(inner, radius)] = cv2.GC_FGD
+    trimap[eroded(inner, radius)] = cv2.GC_FGD
     if not (trimap == cv2.GC_FGD).any() or not (trimap == cv2.GC_BGD).any():
         return coarse
-    return make_trimap(_main_components(_grabcut(image, trimap, 2), inner), outer & ~near, 1)
+    return make_trimap(main_components(grabcut(image, trimap, 2), inner), outer & ~near, 1)
 
 
 def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -219,15 +219,13 @@ def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
 
 def _segment_seed(image: np.ndarray, background: Background, seed: Seed) -> tuple[_Segmentation, ColourModel]:
     """Segmentation of the seed frame, and its colour model; moving pixels outside the box count as hand."""
-    moving, static = _opened(background.differs(image), 1), _opened(background.same(image), 1)
-    inside = _box_mask(moving.shape, seed.box or _box_around(seed.click, moving))
+    moving, static = opened(background.differs(image), 1), opened(background.same(image), 1)
+    inside = box_mask(moving.shape, seed.box or box_around(seed.click, moving))
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
     trimap = np.where(inside & ~static, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
     if seed.click is not None:
-        disc = np.zeros(moving.shape, np.uint8)
-        cv2.circle(disc, seed.click, max(3, round(0.05 * float(np.sqrt(inside.sum())))), 1, -1)
-        trimap[disc > 0] = cv2.GC_FGD
-    surroundings = ~_dilated(inside, 1) & ~moving
+        trimap[disc_around(seed.click, inside)] = cv2.GC_FGD
+    surroundings = ~dilated(inside, 1) & ~moving
     initial = initial_colours().updated(
         lab, object=inside & ~static, hand=moving & ~inside, background=surroundings, weight=SEED_WEIGHT
     )
@@ -236,7 +234,7 @@ def _segment_seed(image: np.ndarray, background: Background, seed: Seed) -> tupl
     if not (trimap & 1).any() or (trimap & 1).all():
         empty = np.zeros(moving.shape, bool)
         return _Segmentation(empty, empty, empty.astype(np.float32)), initial
-    rough = _main_components(_grabcut(image, trimap, 5), inside)
+    rough = main_components(grabcut(image, trimap, 5), inside)
     around = (moving | hand) & ~inside
     colours = initial_colours().updated(
         lab, object=rough, hand=around, background=surroundings & ~hand, weight=SEED_WEIGHT
@@ -264,7 +262,7 @@ def _track(
         previous, gray = gray, cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY)
         lost = not current.inside.any()
         probability = (
-            _reappearance(images[i], background, colours) if lost else _warped(dis, gray, previous, current.probability)
+            reappearance(images[i], background, colours) if lost else warped(dis, gray, previous, current.probability)
         )
         predicted = probability > 0.5
         current = _segment_frame(images[i], _spread_prior(probability), predicted, background, colours)
@@ -274,7 +272,7 @@ def _track(
             current, agreement = _Segmentation(empty, current.unknown | current.inside, empty.astype(np.float32)), 0.0
         else:
             lab = cv2.cvtColor(images[i], cv2.COLOR_RGB2LAB)
-            outside = ~_dilated(current.inside | current.unknown, 2)
+            outside = ~dilated(current.inside | current.unknown, 2)
             # Only pixels that certainly differ from the background, so that a wrong mask does not reinforce itself.
             certain = current.inside & background.differs(images[i])
             colours = colours.updated(lab, object=certain, hand=_empty_like(predicted), background=outside)
@@ -289,29 +287,29 @@ def _segment_frame(
     image: np.ndarray, prior: np.ndarray, predicted: np.ndarray, background: Background, colours: ColourModel
 ) -> _Segmentation:
     """Segmentation of a frame, given the prior and the predicted mask."""
-    moving = _opened(background.differs(image), 1)
+    moving = opened(background.differs(image), 1)
     probability = np.zeros(predicted.shape, np.float32)
     if predicted.sum() < MIN_PIXELS:
         return _Segmentation(_empty_like(predicted), moving, probability)
     log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
     hand = _hand_mask(log_ratio, predicted, moving, background)
-    window = _window(predicted, 4 * _search_radius(predicted))
+    window = _window(predicted, 4 * search_radius(predicted))
     cropped = Background(background.image[window], background.noise[window], background.known[window])
     odds = object_log_odds(image[window], prior[window], hand[window], cropped, colours)
     probability[window] = mean_field_probability(odds, image[window])
-    inside = _main_components(probability > 0.5, predicted)
+    inside = main_components(probability > 0.5, predicted)
     probability = np.where(inside, np.maximum(probability, np.float32(0.5)), np.minimum(probability, np.float32(0.3)))
     # Near the object, where the static background is unknown, colour alone is not enough to label a pixel background.
-    undecided = _dilated(predicted, _search_radius(predicted)) & ~background.known
+    undecided = dilated(predicted, search_radius(predicted)) & ~background.known
     return _Segmentation(inside, (moving | hand | undecided) & ~inside, probability)
 
 
 def _hand_mask(log_ratio: np.ndarray, expected: np.ndarray, moving: np.ndarray, background: Background) -> np.ndarray:
     """Components of hand colour that moved, touch the object and extend beyond it (else they are its texture)."""
-    candidates = _moved_components(_opened(log_ratio > MIN_HAND_LOG_RATIO, 1), moving | ~background.known)
-    count, ids = _components(candidates)
-    touching = np.bincount(ids[_dilated(expected, MAX_HAND_GAP)], minlength=count) > 0
-    outside = ~_dilated(expected, _search_radius(expected))
+    candidates = _moved_components(opened(log_ratio > MIN_HAND_LOG_RATIO, 1), moving | ~background.known)
+    count, ids = components(candidates)
+    touching = np.bincount(ids[dilated(expected, MAX_HAND_GAP)], minlength=count) > 0
+    outside = ~dilated(expected, search_radius(expected))
     beyond = np.bincount(ids[outside], minlength=count)
     # Where a silhouette moves past a wall, the colour model learns the wall as hand.
     touching &= (beyond > MIN_FRACTION_OUTSIDE * np.bincount(ids.ravel(), minlength=count)) & (
@@ -323,14 +321,14 @@ def _hand_mask(log_ratio: np.ndarray, expected: np.ndarray, moving: np.ndarray, 
 
 def _moved_components(mask: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Connected components of a mask of which at least `MIN_MOVED_FRACTION` moved."""
-    count, ids = _components(mask)
+    count, ids = components(mask)
     sizes = np.bincount(ids.ravel(), minlength=count)
     keep = np.bincount(ids[moved], minlength=count) > MIN_MOVED_FRACTION * sizes
     keep[0] = False
     return keep[ids]
 
 
-def _warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, probability: np.ndarray) -> np.ndarray:
+def warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, probability: np.ndarray) -> np.ndarray:
     """Probabilities of the previous frame, warped to this one along the optical flow."""
     flow = dis.calc(gray, previous, np.zeros((*gray.shape, 2), np.float32))
     rows, columns = np.indices(gray.shape, np.float32)
@@ -339,35 +337,35 @@ def _warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, pro
 
 def _spread_prior(probability: np.ndarray) -> np.ndarray:
     """The warped probability, blurred by the uncertainty of flow and rotation."""
-    radius = _search_radius(probability > 0.5)
+    radius = search_radius(probability > 0.5)
     spread = 0.5 * probability + 0.5 * cv2.GaussianBlur(probability, (0, 0), radius / 2)
     return spread.clip(MIN_PRIOR, MAX_PRIOR)
 
 
-def _search_radius(mask: np.ndarray) -> int:
+def search_radius(mask: np.ndarray) -> int:
     return max(2, round(SEARCH_FRACTION * float(np.sqrt(mask.sum()))))
 
 
-def _reappearance(image: np.ndarray, background: Background, colours: ColourModel) -> np.ndarray:
+def reappearance(image: np.ndarray, background: Background, colours: ColourModel) -> np.ndarray:
     """Pixels where a hidden object may have reappeared: moving, and closer in colour to the object than to the hand."""
     log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
-    return _opened(background.differs(image) & (log_ratio < -MIN_HAND_LOG_RATIO), 2).astype(np.float32)
+    return opened(background.differs(image) & (log_ratio < -MIN_HAND_LOG_RATIO), 2).astype(np.float32)
 
 
-def _box_mask(shape: tuple[int, ...], box: tuple[int, int, int, int]) -> np.ndarray:
+def box_mask(shape: tuple[int, ...], box: tuple[int, int, int, int]) -> np.ndarray:
     left, top, width, height = box
     inside = np.zeros(shape, bool)
     inside[max(top, 0) : max(top + height, 0), max(left, 0) : max(left + width, 0)] = True
     return inside
 
 
-def _box_around(click: tuple[int, int] | None, moving: np.ndarray) -> tuple[int, int, int, int]:
+def box_around(click: tuple[int, int] | None, moving: np.ndarray) -> tuple[int, int, int, int]:
     """Square around a clicked pixel, sized by the moving component there, at least a quarter of the image wide."""
     if click is None:
         raise ValueError("a seed needs a box or a click")
     h, w = moving.shape
     column, row = min(max(click[0], 0), w - 1), min(max(click[1], 0), h - 1)
-    _, ids = _components(_closed(moving, 4))
+    _, ids = components(closed(moving, 4))
     component = (ids == ids[row, column]) & (ids[row, column] > 0)
     half = round(0.125 * min(h, w))
     if component.any():
@@ -377,10 +375,17 @@ def _box_around(click: tuple[int, int] | None, moving: np.ndarray) -> tuple[int,
     return column - half, row - half, 2 * half + 1, 2 * half + 1
 
 
+def disc_around(click: tuple[int, int], box: np.ndarray) -> np.ndarray:
+    """Pixels around a clicked one that belong to the object, given the mask of its box."""
+    disc = np.zeros(box.shape, np.uint8)
+    cv2.circle(disc, click, max(3, round(0.05 * float(np.sqrt(box.sum())))), 1, -1)
+    return disc > 0
+
+
 # GrabCut and morphology -----------------------------------------------------------------------------------------------
 
 
-def _grabcut(image: np.ndarray, trimap: np.ndarray, steps: int) -> np.ndarray:
+def grabcut(image: np.ndarray, trimap: np.ndarray, steps: int) -> np.ndarray:
     cv2.setRNGSeed(GRABCUT_SEED)
     trimap = np.ascontiguousarray(trimap)
     mixtures = np.zeros((1, 65)), np.zeros((1, 65))
@@ -394,17 +399,17 @@ def _window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
     return slice(top, int(rows[-1]) + margin + 1), slice(left, int(columns[-1]) + margin + 1)
 
 
-def _main_components(mask: np.ndarray, expected: np.ndarray) -> np.ndarray:
+def main_components(mask: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """The component that overlaps the expected object most, and other large ones, with small holes closed."""
-    count, ids = _components(mask)
+    count, ids = components(mask)
     overlaps = np.bincount(ids[expected], minlength=count)
     overlaps[0] = 0
     if not overlaps.any():
         return _empty_like(mask)
-    return _closed((overlaps > MIN_PART_FRACTION * overlaps.max())[ids], 1)
+    return closed((overlaps > MIN_PART_FRACTION * overlaps.max())[ids], 1)
 
 
-def _components(mask: np.ndarray) -> tuple[int, np.ndarray]:
+def components(mask: np.ndarray) -> tuple[int, np.ndarray]:
     """Number of labels, and the label of the connected component of every pixel; label 0 is outside the mask."""
     count, ids = cv2.connectedComponents(mask.astype(np.uint8))
     return count, np.asarray(ids, np.int32)
@@ -418,18 +423,18 @@ def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
-def _dilated(mask: np.ndarray, radius: int) -> np.ndarray:
+def dilated(mask: np.ndarray, radius: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), _disc(radius)) > 0
 
 
-def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
+def eroded(mask: np.ndarray, radius: int) -> np.ndarray:
     """Erosion that does not shrink the mask at the image border."""
     return cv2.erode(mask.astype(np.uint8), _disc(radius)) > 0
 
 
-def _opened(mask: np.ndarray, radius: int) -> np.ndarray:
+def opened(mask: np.ndarray, radius: int) -> np.ndarray:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(radius)) > 0
 
 
-def _closed(mask: np.ndarray, radius: int) -> np.ndarray:
+def closed(mask: np.ndarray, radius: int) -> np.ndarray:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(radius)) > 0

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from tumble import datasets
+from tumble.io import outputs
 from tumble.preprocess import colmap
 from tumble.preprocess.colmap_to_capture import capture_from_model
 from tumble.preprocess.footage import IMAGE_SUFFIXES
@@ -36,7 +37,8 @@ def to_capture(path: Path, out: Path, options: FootageOptions) -> Path:
     """Convert footage to a capture folder (docs/format.md), with poses if it has a COLMAP model; returns `out`.
 
     Raises:
-        BadFile: The footage cannot be converted, or `out` is not empty; nothing is written then.
+        BadFile: The footage cannot be converted, or `out` lies in it or is not empty; nothing is written then.
     """
+    outputs.require_outside(out, path)
     make = capture_from_model if input_kind(path) == "posed images" else capture_from_video
     return make(path, out, options)

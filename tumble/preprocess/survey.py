@@ -9,6 +9,7 @@ masks from it, then gains and background again without the masked pixels, and th
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,9 +18,18 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Integer, UInt8
 
 from tumble.io import BadFile
-from tumble.preprocess import keyframes, sam, segmentation
-from tumble.preprocess.background import Background, compensate, estimate_background, estimate_gains, fill_unknown
+from tumble.preprocess import held_object, keyframes, sam, segmentation
+from tumble.preprocess.background import (
+    Background,
+    BackgroundSamples,
+    compensate,
+    estimate_background,
+    estimate_gains,
+    fill_unknown,
+    sample_background,
+)
 from tumble.preprocess.footage import Footage, FootageFrame, Lens, open_footage, read_frames, resolve_lens
+from tumble.preprocess.hands import Hand, hand_surroundings, track_hands
 from tumble.preprocess.options import MAX_SURVEY_FRAMES, MIN_SIDE, FootageOptions
 from tumble.preprocess.segmentation import Masks, Seed
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera
@@ -145,20 +155,28 @@ def _segment(
 ) -> tuple[np.ndarray, np.ndarray, Background, Seed, Masks]:
     """Images without gain drift, their gains, the background, the seed and the masks."""
     images = _compensated(scan.images, estimate_gains(scan.images))
+    hands = track_hands(images) if options.segmenter == "grabcut" else [[] for _ in images]
     background = estimate_background(images)
-    background = estimate_background(
-        images, np.stack([segmentation.moving_skin(image, background) for image in images])
-    )
+    background = estimate_background(images, _hand_or_skin(images, hands, background))
     seed = _seed(path, scan, images, background, options)
     background = segmentation.exclude_possible_object(background, images[seed.index], seed)
-    masks = _masks(path, images, background, seed, options)
+    masks = _masks(path, images, background, seed, hands, options)
     covered = np.stack([cv2.dilate((m != BACKGROUND).astype(np.uint8), np.ones((5, 5))) for m in masks.labels]) > 0
     gains = estimate_gains(scan.images, covered)
     images = _compensated(scan.images, gains)
     background = fill_unknown(estimate_background(images, covered), background)
     if options.segmenter == "grabcut":
-        masks = _masks(path, images, background, seed, options)
+        at_hands = np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
+        samples = sample_background(images, at_hands | (masks.labels == OBJECT)) if any(hands) else None
+        masks = _masks(path, images, background, seed, hands, options, samples)
     return images, gains, background, seed, masks
+
+
+def _hand_or_skin(images: np.ndarray, hands: Sequence[Sequence[Hand]], background: Background) -> np.ndarray:
+    """Pixels of every frame that may show hands: at their landmarks, or those of moving skin if none were detected."""
+    if any(hands):
+        return np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
+    return np.stack([segmentation.moving_skin(image, background) for image in images])
 
 
 def _read_scan(footage: Footage, options: FootageOptions) -> _Scan:
@@ -252,7 +270,15 @@ def _seed(path: Path, scan: _Scan, images: np.ndarray, background: Background, o
     return Seed(index, (*low, math.ceil(left + width) - low[0], math.ceil(top + height) - low[1]))
 
 
-def _masks(path: Path, images: np.ndarray, background: Background, seed: Seed, options: FootageOptions) -> Masks:
+def _masks(
+    path: Path,
+    images: np.ndarray,
+    background: Background,
+    seed: Seed,
+    hands: Sequence[Sequence[Hand]],
+    options: FootageOptions,
+    samples: BackgroundSamples | None = None,
+) -> Masks:
     if options.segmenter != "grabcut":
         assert options.weights is not None, "checked by FootageOptions"
         inside = sam.SEGMENTERS[options.segmenter](images, seed, options.weights)
@@ -260,6 +286,8 @@ def _masks(path: Path, images: np.ndarray, background: Background, seed: Seed, o
         labels = np.stack([segmentation.make_trimap(m, background.differs(p) & ~m, 1) for p, m in pairs])
         return _masks_from_labels(path, labels)
     try:
+        if any(hands):
+            return held_object.segment(images, background, seed, hands, samples)
         return segmentation.segment(images, background, seed)
     except ValueError as error:
         fix = "the camera must stand still; if it does, give a --box around the whole object"

@@ -26,9 +26,8 @@ from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.preprocess import keyframes, segmentation
 from tumble.preprocess.background import compensate
 from tumble.preprocess.camera_motion import refuse_camera_motion
-from tumble.preprocess.footage import FootageFrame, read_frames
+from tumble.preprocess.footage import PROVENANCE, FootageFrame, read_frames
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
-from tumble.preprocess.provenance import PROVENANCE
 from tumble.preprocess.survey import MIN_GAIN_CHANGE, Survey, downsample_mask, survey_footage, undistort_frame
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
@@ -68,7 +67,9 @@ def require_new_folder(out: Path) -> None:
     Raises:
         BadFile: It is something else.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not out.is_dir():
+        raise BadFile(out, "is a file, where a folder is to be written", "choose a new folder")
+    if out.exists() and any(out.iterdir()):
         raise BadFile(out, "exists already", "choose a new folder")
 
 

@@ -5,7 +5,6 @@ channel, so that the page's background shows behind it.
 """
 
 import base64
-import html
 import io
 import math
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -64,23 +64,26 @@ def hero_image(scene: training_views.LitScene, frame: RenderedFrame) -> UInt8[np
     return _with_alpha(srgb_from_linear(linear / view.alpha.clamp(min=1e-3)[..., None]), view.alpha)
 
 
-def comparison(frame: RenderedFrame) -> str:
+def comparison(frame: RenderedFrame) -> Markup:
     """Photo and render of a frame side by side, with the PSNR."""
-    name = html.escape(frame.name)
-    images = f'<img src="{webp(_code_values(frame.photo))}" alt="Photo {name}">'
-    images += f'<img src="{webp(_code_values(frame.rendered))}" alt="Render of {name}">'
-    return (
-        f'<figure><div class="pair">{images}</div><figcaption class="under"><span>{name}</span>'
-        f"<b>{frame.psnr:.1f} dB</b></figcaption></figure>"
+    template = (
+        '<figure><div class="pair"><img src="{photo}" alt="Photo {name}"><img src="{rendered}" alt="Render of {name}">'
+        '</div><figcaption class="under"><span>{name}</span><b>{psnr:.1f} dB</b></figcaption></figure>'
     )
+    photo, rendered = (webp(_code_values(image)) for image in (frame.photo, frame.rendered))
+    return Markup(template).format(name=frame.name, photo=photo, rendered=rendered, psnr=frame.psnr)
 
 
-def _strip(title: str, subtitle: str, images: Sequence[UInt8[np.ndarray, "h w c"]], colour_bar: str = "") -> str:
-    cells = "".join(f'<img src="{webp(image)}" alt="{title}, view {i + 1}">' for i, image in enumerate(images))
-    return f'<div class="strip"><div><p>{title}<small>{subtitle}</small></p>{colour_bar}</div>{cells}</div>'
+def _strip(
+    title: str, subtitle: str, images: Sequence[UInt8[np.ndarray, "h w c"]], colour_bar: Markup | str = ""
+) -> Markup:
+    cell = Markup('<img src="{}" alt="{}, view {}">')
+    cells = Markup("").join(cell.format(webp(image), title, i + 1) for i, image in enumerate(images))
+    head = Markup('<div class="strip"><div><p>{}<small>{}</small></p>{}</div>{}</div>')
+    return head.format(title, subtitle, colour_bar, cells)
 
 
-def material_maps(asset: Asset, views: Sequence[RenderedFrame]) -> str:
+def material_maps(asset: Asset, views: Sequence[RenderedFrame]) -> Markup:
     """Strips of albedo, roughness and normals, seen from some frames."""
     albedo, roughness, normals = [], [], []
     for frame in views:
@@ -98,7 +101,7 @@ def material_maps(asset: Asset, views: Sequence[RenderedFrame]) -> str:
     )
 
 
-def confidence_maps(asset: Asset, views: Sequence[RenderedFrame], confidence: Confidence) -> str:
+def confidence_maps(asset: Asset, views: Sequence[RenderedFrame], confidence: Confidence) -> Markup:
     """Strips of the observation counts behind the confidence, seen from some frames."""
     n = len(asset.gaussians)
     rows = [
@@ -119,7 +122,7 @@ def confidence_maps(asset: Asset, views: Sequence[RenderedFrame], confidence: Co
     stops = ",".join(
         "#{:02x}{:02x}{:02x}".format(*_viridis(np.full((1, 1, 1), v, np.uint8))[0, 0]) for v in COLOUR_BAR_CODES
     )
-    return "".join(
+    return Markup("").join(
         _strip(title, subtitle, strip, _colour_bar(f"linear-gradient(90deg,{stops})", "0", f"{top:.0f}{unit}"))
         for (title, subtitle, _, unit), top, strip in zip(rows, tops, images, strict=True)
     )
@@ -129,11 +132,11 @@ def _viridis(codes: UInt8[np.ndarray, "h w 1"]) -> UInt8[np.ndarray, "h w 3"]:
     return cv2.applyColorMap(codes, cv2.COLORMAP_VIRIDIS)[..., ::-1]
 
 
-def _colour_bar(gradient: str, low: str, high: str) -> str:
-    return (
-        f'<span class="scale" style="background:{gradient}"></span>'
-        f'<span class="ends"><span>{low}</span><span>{high}</span></span>'
+def _colour_bar(gradient: str, low: str, high: str) -> Markup:
+    template = (
+        '<span class="scale" style="background:{}"></span><span class="ends"><span>{}</span><span>{}</span></span>'
     )
+    return Markup(template).format(gradient, low, high)
 
 
 def panorama(environment: Environment, height: int) -> UInt8[np.ndarray, "{height} {2*height} 3"]:

@@ -1,14 +1,14 @@
 """Report of a run: one self-contained HTML file with results, quality measures and a live relighting view.
 
 All images, the mesh, the lights and the scripts are embedded; a content security policy in the page forbids loading
-anything else. The report never uses the ground truth of a capture.
+anything else, and any script but these. Names, log and settings of a run may come from somebody else: the templates in
+`assets/` escape every value that is not `Markup`. The report never uses the ground truth of a capture.
 """
 
 import base64
-import html
+import hashlib
 import json
 import math
-import re
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -18,17 +18,19 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
 import torch
+from markupsafe import Markup
 from torch.nn.functional import normalize
 
 from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
-from tumble.io import BadFile, files
+from tumble.io import BadFile, files, progress
 from tumble.maths import fibonacci_sphere
-from tumble.poses import PoseQuality, PoseResult
+from tumble.poses import PoseQuality, mask_refinement
 from tumble.report import figures, health_card, preset_lights, svg, training_views
 from tumble.report.training_views import RenderedFrame
 from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
@@ -50,6 +52,15 @@ SECTIONS: dict[str, str] = {
     "configuration": "Configuration",
 }
 """Title of each section, by the id of its element."""
+
+TEMPLATES = jinja2.Environment(
+    loader=jinja2.PackageLoader("tumble.report", "assets"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+"""Templates of the page."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +90,8 @@ def write_report(out: Path, *, capture: Path | None = None) -> Path:
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
     full_capture = reader_for(path).load(path)
+    tracked, full_capture = mask_refinement.stored_result(out, full_capture)
     run_capture = frames_of_run(full_capture, asset, run.frame_names(out, len(asset.trajectory)), path)
-    tracked = run.output(out, run.TRACK, PoseResult)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
     assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
@@ -131,41 +142,38 @@ def build(
         quality: Quality of the poses, if they were estimated.
     """
     scene = training_views.prepare(asset)
-    frames = list(training_views.frames(scene, capture))
+    frames = list(progress.track(training_views.frames(scene, capture), "report: training views", len(capture)))
     selected = figures.select_diverse(asset, frames, N_COMPARISONS)
     views = selected[:N_VIEWS]
     confidence = confidence_of(asset, figures.small_camera(asset.camera))
     rows = health_card.card(frames, quality, confidence)
     rating, word, sentence = health_card.overall(rows)
     hero = figures.hero_image(scene, views[0])
-    parts = {
-        "name": html.escape(summary.name),
-        "rating": rating,
-        "rating_word": word,
-        "rating_sentence": html.escape(sentence),
-        "hero": figures.webp(hero),
-        "facts": _facts(asset, capture, summary),
-        "links": "".join(
-            f'<a href="#{key}">{title}</a>' for key, title in SECTIONS.items() if glb is not None or key != "relight"
-        ),
-        "pairs": "".join(figures.comparison(frame) for frame in sorted(selected, key=lambda frame: frame.number)),
-        "maps": figures.material_maps(asset, views),
-        "panorama": figures.webp(figures.panorama(_environment(asset), 256)),
-        "light_caption": LIGHT_CAPTIONS[asset.trajectory.light],
-        "path": svg.globes(asset.trajectory.camera_positions.cpu().numpy()),
-        "path_caption": _path_caption(asset),
-        "health_lead": f"Measured on all {len(frames)} training frames, without ground truth: the finished asset is "
-        "rendered at the pose of each frame and compared with the photo.",
-        "health": "".join(_row(row) for row in rows),
-        "confidence": figures.confidence_maps(asset, views, confidence),
-        "timings": _timings(summary.records),
-        "configuration": _configuration(summary.recipe),
-        "version": __version__,
-        "css": _read("page.css"),
-        "relight": "" if glb is None else _fill(_read("panel.html"), {"lights": _buttons(asset, views[0])}),
-        "scripts": "" if glb is None else _scripts(asset, views[0], glb.read_bytes()),
-    }
-    page = _fill(_read("page.html"), parts)
+    lights = {} if glb is None else _live_view_lights(asset, views[0])
+    page = TEMPLATES.get_template("page.html").render(
+        summary=summary,
+        rating=rating,
+        rating_word=word,
+        rating_sentence=sentence,
+        hero=figures.webp(hero),
+        facts=_facts(asset, capture, summary),
+        sections={key: title for key, title in SECTIONS.items() if glb is not None or key != "relight"},
+        comparisons=[figures.comparison(frame) for frame in sorted(selected, key=lambda frame: frame.number)],
+        maps=figures.material_maps(asset, views),
+        panorama=figures.webp(figures.panorama(_environment(asset), 256)),
+        light_caption=LIGHT_CAPTIONS[asset.trajectory.light],
+        path=svg.globes(asset.trajectory.camera_positions.cpu().numpy()),
+        path_caption=_path_caption(asset),
+        n_frames=len(frames),
+        rows=[(row, health_card.RATING_LABELS[row.rating], svg.bars(row.bars, row.marks)) for row in rows],
+        confidence=figures.confidence_maps(asset, views, confidence),
+        timings=_timings(summary.records),
+        configuration=_configuration(summary.recipe),
+        version=__version__,
+        css=_own("page.css"),
+        buttons=[(key, name, figures.webp(figures.panorama(light, 64))) for key, (name, light) in lights.items()],
+        live_view=None if glb is None else _live_view(asset, views[0], glb.read_bytes(), lights),
+    )
     files.write_atomically(out, lambda partial: partial.write_text(page, "utf-8"))
     return rows
 
@@ -173,16 +181,13 @@ def build(
 # The page -------------------------------------------------------------------------------------------------------------
 
 
-def _read(name: str) -> str:
-    return (resources.files("tumble.report") / "assets" / name).read_text("utf-8")
+def _own(name: str) -> Markup:
+    """A file of the package that is inserted as it is."""
+    return Markup((resources.files("tumble.report") / "assets" / name).read_text("utf-8"))
 
 
-def _fill(template: str, parts: dict[str, str]) -> str:
-    """The template with every `{{name}}` replaced in one pass, so that inserted text is not expanded again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-
-
-def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> str:
+def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> dict[str, str]:
+    """Short facts at the top of the page, by title."""
     seconds = sum(_seconds(summary.records).values())
     camera = asset.camera
     focal = float(camera.fx_fy_cx_cy[0])
@@ -192,7 +197,7 @@ def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> str:
         if summary.assumed_focal not in (None, focal)
         else source
     )
-    facts = {
+    return {
         "Frames": f"{len(capture)}",
         "Size": f"{camera.width} x {camera.height}",
         "Focal length": f"{focal:.0f} pixels{source}",
@@ -200,7 +205,6 @@ def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> str:
         "Gaussians": f"{len(asset.gaussians):,}".replace(",", " "),
         "Time": _duration(seconds) if seconds else "-",
     }
-    return "".join(f"<div><dt>{key}</dt><dd>{value}</dd></div>" for key, value in facts.items())
 
 
 # Light and motion -----------------------------------------------------------------------------------------------------
@@ -231,18 +235,9 @@ def _path_caption(asset: Asset) -> str:
 # Tables ---------------------------------------------------------------------------------------------------------------
 
 
-def _row(row: health_card.Row) -> str:
-    return (
-        f'<div class="row {row.rating}"><span class="mark {row.rating}">'
-        f"{health_card.RATING_LABELS[row.rating]}</span>"
-        f"<div><small>{row.name}</small><b>{row.value}</b></div><p>{html.escape(row.sentence)}</p>"
-        f'<div class="bars">{svg.bars(row.bars, row.marks)}</div></div>'
-    )
-
-
 def _seconds(records: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Duration of every finished stage, in order [s]."""
-    return {record["name"]: record["seconds"] for record in records if record.get("event") == "done"}
+    return {r["name"]: r["seconds"] for r in records if r.get("event") == "done" and {"name", "seconds"} <= r.keys()}
 
 
 def _duration(seconds: float) -> str:
@@ -251,33 +246,22 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
-def _timings(records: Sequence[dict[str, Any]]) -> str:
+def _timings(records: Sequence[dict[str, Any]]) -> list[tuple[str, str, str, Markup]]:
+    """Name, number of steps, duration and loss curve of every finished stage, and their sum; empty without any."""
     done = _seconds(records)
-    if not done:
-        return '<p class="lead">The log contains no finished stage.</p>'
-    lines = ""
+    lines = []
     for name, seconds in done.items():
         steps = [record for record in records if record.get("name") == name and record.get("metrics")]
         values = [record["metrics"]["render"] for record in steps if record["metrics"].get("render") is not None]
-        count = steps[-1]["of"] if steps else "-"
-        lines += (
-            f'<tr><td>{html.escape(name)}</td><td class="n">{count}</td><td class="n">{_duration(seconds)}</td>'
-            f'<td class="curve">{svg.curve(values)}</td></tr>'
-        )
-    total = f'<tr><th>all</th><td></td><td class="n"><b>{_duration(sum(done.values()))}</b></td><td></td></tr>'
-    head = '<tr><th>stage</th><th class="n">steps</th><th class="n">time</th><th>photometric loss</th></tr>'
-    return f'<div class="wide"><table>{head}{lines}{total}</table></div>'
+        lines.append((name, str(steps[-1].get("of", "-")) if steps else "-", _duration(seconds), svg.curve(values)))
+    return [*lines, ("all", "", _duration(sum(done.values())), Markup(""))] if lines else []
 
 
-def _configuration(recipe: dict[str, Any]) -> str:
+def _configuration(recipe: dict[str, Any]) -> dict[str, list[tuple[str, str]]]:
+    """Names and values of the settings, by stage."""
     single = {key: value for key, value in recipe.items() if not isinstance(value, dict)}
     tables = {key: value for key, value in recipe.items() if isinstance(value, dict)}
-    return "".join(
-        f"<details><summary>{html.escape(name)}</summary><table>"
-        + "".join(f"<tr><td>{html.escape(k)}</td><td>{html.escape(v)}</td></tr>" for k, v in _flat(settings))
-        + "</table></details>"
-        for name, settings in {**tables, **({"run": single} if single else {})}.items()
-    )
+    return {name: _flat(settings) for name, settings in {**tables, **({"run": single} if single else {})}.items()}
 
 
 def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -305,33 +289,28 @@ def _live_view_lights(asset: Asset, frame: RenderedFrame) -> dict[str, tuple[str
     }
 
 
-def _buttons(asset: Asset, frame: RenderedFrame) -> str:
-    return "".join(
-        f'<button type="button" data-light="{key}" aria-pressed="false">'
-        f'<img src="{figures.webp(figures.panorama(light, 64))}" alt="">'
-        f"{name}</button>"
-        for key, (name, light) in _live_view_lights(asset, frame).items()
-    )
-
-
 def _rgbe(light: Environment) -> bytes:
     pixels = light.radiance.detach().cpu().numpy().astype(np.float32)
     return cv2.imencode(".hdr", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
 
 
-def _scripts(asset: Asset, frame: RenderedFrame, glb: bytes) -> str:
+def _live_view(
+    asset: Asset, frame: RenderedFrame, glb: bytes, lights: dict[str, tuple[str, Environment]]
+) -> dict[str, Any]:
+    """Settings, data by the id of its element, and scripts of the live view."""
     pose = asset.trajectory.T_cam_obj[frame.number].rotation
     # From OpenCV to OpenGL axes: rotation by pi about x, (w, x, y, z) -> (-x, w, -z, y); three.js orders x, y, z, w.
     w, x, y, z = pose.wxyz.tolist()
     camera = asset.camera
     fov = math.degrees(2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1])))
-    view = {"fov": fov, "object_to_camera": [w, -z, y, -x]}
-    parts = {"glb": glb} | {key: _rgbe(light) for key, (_, light) in _live_view_lights(asset, frame).items()}
-    embedded = "".join(
-        f'<script type="text/plain" id="{key}">{base64.b64encode(data).decode()}</script>\n'
-        for key, data in parts.items()
-    )
-    return (
-        f'<script type="application/json" id="about">{json.dumps(view)}</script>\n{embedded}'
-        f"<script>{_read('three.js')}</script>\n<script>{_read('panel.js')}</script>"
-    )
+    parts = {"glb": glb} | {key: _rgbe(light) for key, (_, light) in lights.items()}
+    return {
+        "about": {"fov": fov, "object_to_camera": [w, -z, y, -x]},
+        "parts": {key: base64.b64encode(data).decode() for key, data in parts.items()},
+        "scripts": {_sha256(script): script for script in (_own("three.js"), _own("panel.js"))},
+    }
+
+
+def _sha256(script: str) -> str:
+    """Hash of a script as a content security policy writes it."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"

@@ -1,20 +1,24 @@
-"""Small line graphics as SVG whose colours come from the page's style sheet: bars, curves, camera paths."""
+"""Small line graphics as SVG whose colours come from the page's style sheet: bars, curves, camera paths.
+
+All that is drawn are numbers and the ratings of `health_card`, so that the graphics are safe `Markup` as they are.
+"""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from markupsafe import Markup
 
 RADIUS = 100
 """Radius of a globe [SVG units]."""
 
 
-def bars(values: Sequence[float], marks: Sequence[str]) -> str:
+def bars(values: Sequence[float], marks: Sequence[str]) -> Markup:
     """Bar chart with one bar per frame, coloured by its mark; "" without a positive value. NaN leaves a gap."""
     top = max((value for value in values if not math.isnan(value)), default=0.0)
     if top <= 0:
-        return ""
+        return Markup("")
     shapes = [
         f'<rect class="b-{mark}" x="{i + 0.1:.1f}" y="{100 * (1 - value / top):.2f}" width="0.8" '
         f'height="{100 * value / top:.2f}"/>'
@@ -22,30 +26,30 @@ def bars(values: Sequence[float], marks: Sequence[str]) -> str:
         if not math.isnan(value)
     ]
     title = f"One bar per frame; the highest is {top:.3g}"
-    return (
+    return Markup(
         f'<svg viewBox="0 0 {len(values)} 100" preserveAspectRatio="none" role="img"><title>{title}</title>'
         f"{''.join(shapes)}</svg>"
     )
 
 
-def curve(values: Sequence[float]) -> str:
+def curve(values: Sequence[float]) -> Markup:
     """Line chart of equally spaced values, on a logarithmic scale if all are positive; "" for less than two values."""
     if len(values) < 2:
-        return ""
+        return Markup("")
     y = np.log(values) if min(values) > 0 else np.asarray(values)
     y = (y - y.min()) / max(float(np.ptp(y)), 1e-9)
     steps = " L".join(f"{100 * i / (len(y) - 1):.1f} {4 + 92 * (1 - v):.1f}" for i, v in enumerate(y))
-    return f'<svg viewBox="0 0 100 100" preserveAspectRatio="none"><path d="M{steps}"/></svg>'
+    return Markup(f'<svg viewBox="0 0 100 100" preserveAspectRatio="none"><path d="M{steps}"/></svg>')
 
 
-def globes(positions: Float[np.ndarray, "t 3"]) -> str:
+def globes(positions: Float[np.ndarray, "t 3"]) -> Markup:
     """Camera path around the object in the object frame, on a globe drawn from two opposite sides, +y up."""
     d = positions / np.linalg.norm(positions, axis=-1, keepdims=True)
     width = 4 * RADIUS + 60
     sides = "".join(
         _globe(d, azimuth, 15 + RADIUS + i * (2 * RADIUS + 30)) for i, azimuth in enumerate((0.5, 0.5 + math.pi))
     )
-    return f'<svg viewBox="0 0 {width} {2 * RADIUS + 40}" role="img"><title>Camera path</title>{sides}</svg>'
+    return Markup(f'<svg viewBox="0 0 {width} {2 * RADIUS + 40}" role="img"><title>Camera path</title>{sides}</svg>')
 
 
 def _globe(d: Float[np.ndarray, "t 3"], azimuth: float, centre: float) -> str:

@@ -1,5 +1,5 @@
 """Synthetic captures with ground truth: a GLB model under an environment map in one of the three capture settings,
-path traced by Mitsuba."""
+path traced by Mitsuba; on request held by a hand, before a background, and as a film."""
 
 from typing import TYPE_CHECKING
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 Setting = Literal["dome", "turntable", "handheld"]
+Background = Literal["none", "wall", "desk", "clutter", "torso"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,17 @@ class SynthOptions:
     """Omit the poses of the training frames from transforms.json; truth/poses.json still contains them."""
     video: bool = False
     """Also write the training frames as a video, clip.mp4 (H.264)."""
+    hand: bool = False
+    """A hand holds the object on the training frames and takes it anew from time to time. Only with --setting handheld.
+    Without it all else stays the same."""
+    skin: Annotated[Literal["light", "medium", "dark"] | float, arg(metavar="light|medium|dark|VALUE")] = "medium"
+    """Skin tone of the hand, or a number from 0 (light) to 1 (dark)."""
+    background: Background = "none"
+    """What is behind the object on the training frames. none: black; clutter: a desk with boxes; torso: a person who
+    faces the camera. Not with --setting dome."""
+    film: bool = False
+    """Also write film.mp4, as a phone would record it: a wider view with motion blur, noise, drifting exposure and
+    compression; film.json has the object's box on its first frame. Not with --setting dome."""
     seed: int = 0
     """Seed of the hand-held trajectory and of the path tracer."""
 
@@ -63,9 +75,14 @@ class SynthOptions:
             "roughness": self.roughness is None or 0 < self.roughness <= 1,
             "exposure": self.exposure is None or self.exposure > 0,
             "eval_shared": self.eval_shared >= 0 and self.eval_sphere >= 0,
+            "skin": isinstance(self.skin, str) or 0 <= self.skin <= 1,
         }
         if invalid := [name for name, valid in in_range.items() if not valid]:
             raise ValueError(f"{invalid[0]} is out of range: {getattr(self, invalid[0])} (see tumble synth --help)")
+        if self.hand and self.setting != "handheld":
+            raise ValueError(f"a hand does not hold the object in the setting {self.setting}: use --setting handheld")
+        if self.setting == "dome" and (self.film or self.background != "none"):
+            raise ValueError("the camera of a dome moves: a film or a background needs another --setting")
         stems = [Path(name).stem for name in self.relight]
         if len(set(stems)) < len(stems):
             raise ValueError(

@@ -120,6 +120,10 @@ class ObjectModel:
     T_obj_file: Float[np.ndarray, "4 4"]
     """Similarity transform from the file's coordinates to the object frame."""
 
+    def named_parts(self) -> dict[str, Part]:
+        """The parts by the names of their shapes in Mitsuba scenes."""
+        return {f"part_{i}": part for i, part in enumerate(self.parts)}
+
 
 def read_model(path: Path, up: str = "y") -> ObjectModel:
     """Read a GLB with its base colour and roughness; metalness, normal maps and emission are ignored.
@@ -252,7 +256,26 @@ def mitsuba_shapes(model: ObjectModel, shading: Shading, roughness: float | None
         # Mitsuba's "specular" 0.5 means a refractive index of 1.5, hence F0 = 0.04.
         return {"type": "principled", "base_color": _bitmap(part.albedo), "roughness": rough, "specular": 0.5}
 
-    return {f"part_{i}": _mesh(part, bsdf(part)) for i, part in enumerate(model.parts)}
+    return {name: _mesh(part, bsdf(part)) for name, part in model.named_parts().items()}
+
+
+def surrounding_shapes(parts: dict[str, Part]) -> dict[str, Any]:
+    """Hand and background as Mitsuba shapes by name: dielectrics (F0 = 0.04)."""
+
+    def bsdf(part: Part) -> dict[str, Any]:
+        rough = float(part.roughness.mean())
+        return {"type": "principled", "base_color": _bitmap(part.albedo), "roughness": rough, "specular": 0.5}
+
+    return {name: _mesh(part, bsdf(part)) for name, part in parts.items()}
+
+
+def move(scene: Any, parts: dict[str, Part]) -> None:
+    """Give shapes of a scene the vertices and normals of `parts` with the same names and faces."""
+    params = mitsuba().traverse(scene)
+    for name, part in parts.items():
+        params[f"{name}.vertex_positions"] = part.vertices.astype(np.float32).ravel()
+        params[f"{name}.vertex_normals"] = part.normals.astype(np.float32).ravel()
+    params.update()
 
 
 def lit_scene(shapes: dict[str, Any], light: Environment, path_depth: int) -> Any:
@@ -291,8 +314,8 @@ def unlit_scenes(model: ObjectModel, roughness: float | None) -> tuple[Any, Any]
 
     def scene(aovs: str, texture: Callable[[Part], np.ndarray]) -> Any:
         parts = {
-            f"part_{i}": _mesh(part, {"type": "diffuse", "reflectance": _bitmap(texture(part))})
-            for i, part in enumerate(model.parts)
+            name: _mesh(part, {"type": "diffuse", "reflectance": _bitmap(texture(part))})
+            for name, part in model.named_parts().items()
         }
         return mi.load_dict({"type": "scene", "integrator": {"type": "aov", "aovs": aovs}, **parts})
 
@@ -324,6 +347,21 @@ def maps(unlit: tuple[Any, Any], T_cam_obj: SE3, camera: Camera, *, samples: int
 
     albedo, roughness = first[..., :3] / divisor, packed[..., :1] / divisor
     return Maps(masked(albedo), masked(roughness), masked(normal), masked(depth), coverage)
+
+
+def layer_scene(layers: tuple[dict[str, Part], dict[str, Part], dict[str, Part]]) -> Any:
+    """The Mitsuba scene of three groups of parts by name, for `layer_coverage`."""
+    shapes = {
+        name: _mesh(part, {"type": "diffuse", "reflectance": _bitmap(np.eye(3)[i][None, None])})
+        for i, layer in enumerate(layers)
+        for name, part in layer.items()
+    }
+    return mitsuba().load_dict({"type": "scene", "integrator": {"type": "aov", "aovs": "layer:albedo"}, **shapes})
+
+
+def layer_coverage(scene: Any, T_cam_obj: SE3, camera: Camera, *, samples: int) -> Float[np.ndarray, "h w 3"]:
+    """Fraction of each pixel in which each group of a `layer_scene` is the nearest surface."""
+    return np.array(mitsuba().render(scene, sensor=_sensor(T_cam_obj, camera), spp=samples, seed=0))[..., :3]
 
 
 def _bitmap(pixels: np.ndarray) -> dict[str, Any]:

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import Progress
 
 from tumble import __version__
 from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
-from tumble.io import BadFile, files, video
+from tumble.io import BadFile, files, outputs, progress, video
 from tumble.maths import SE3, SO3, to_srgb8
-from tumble.scene import BACKGROUND, OBJECT, Camera, Environment, Light, env_from_obj, opengl_from_opencv
-from tumble.synthetic import pathtracer
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Environment, Light, env_from_obj, opengl_from_opencv
+from tumble.synthetic import film, pathtracer
 from tumble.synthetic.options import SynthOptions
+from tumble.synthetic.surroundings import Surroundings, surroundings
 from tumble.synthetic.trajectories import (
     ELEVATION,
     LIGHT_FRAME,
@@ -35,6 +35,10 @@ from tumble.synthetic.trajectories import (
 
 SATURATED = 0.01
 """Fraction of the object's pixels that saturate under the automatic exposure."""
+LAYER_SAMPLES = 64
+"""Samples per pixel of the masks of object and hand."""
+SURROUNDED = "surrounded"
+"""Name of the Mitsuba scene of the capture's light with hand and background."""
 LIGHT_ROWS = 512
 """Maximum height of an environment map; larger ones are averaged down to it, a resolution of a third of a degree."""
 MAP_SAMPLES = 256
@@ -53,6 +57,8 @@ class _Frame:
     T_cam_obj: SE3
     region: str | None
     """Region of an evaluation view; None for a training frame."""
+    time: float = 0.0
+    """Time of a training frame [frames]."""
 
 
 @dataclass
@@ -68,16 +74,24 @@ class _RenderContext:
     """Mitsuba shapes of the model."""
     unlit: tuple[Any, Any]
     """Mitsuba scenes of the ground-truth maps."""
+    poses: SE3
+    """Poses of the training frames."""
+    surroundings: Surroundings | None
+    """Hand and background of the training frames."""
+    layers: Any
+    """Mitsuba scene of object, hand and background; None without surroundings."""
     scenes: dict[str, Any] = field(default_factory=dict)
-    """Mitsuba scenes by the name of their light; "" is the capture's own."""
+    """Mitsuba scenes by the name of their light; "" is the capture's own, `SURROUNDED` that with the surroundings."""
 
     def render(
-        self, light: str, frame: _Frame, samples: int, seed: int, light_frame: Light
+        self, light: str, frame: _Frame, samples: int, seed: int, light_frame: Light, camera: Camera | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Linear radiance and coverage of a frame under a light that is at rest in `light_frame`."""
+        """Linear radiance and coverage of a frame under a light that is at rest in `light_frame`; the coverage includes
+        the surroundings."""
         R_env_obj = env_from_obj(frame.T_cam_obj, light_frame)
         scene = self.scenes[light]
-        return pathtracer.radiance(scene, frame.T_cam_obj, self.camera, R_env_obj, samples=samples, seed=seed)
+        camera = self.camera if camera is None else camera
+        return pathtracer.radiance(scene, frame.T_cam_obj, camera, R_env_obj, samples=samples, seed=seed)
 
 
 def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
@@ -87,6 +101,7 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
         BadFile: The model or a light cannot be read, or `out` holds something else.
         ModuleNotFoundError: The extra `synth` is not installed.
     """
+    outputs.claim_folder(out, SETTINGS_FILE, fix="choose another folder with -o")
     # All inputs are read before anything is written.
     manifest = _manifest(model, options)
     parts = pathtracer.read_model(model, options.up)
@@ -94,18 +109,18 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
     pathtracer.mitsuba()
     context = _context(parts, out, options)
     resuming = _prepare_folder(out, manifest)
-    frames = list(_frames(options))
+    frames = list(_frames(options, context.poses))
     lights = _expose_lights(context, unexposed, frames, resuming)
-    with Progress(transient=True) as progress:
-        task = progress.add_task(f"rendering {out.name}", total=len(frames))
-        for number, frame in enumerate(frames):
-            _render_frame(context, frame, number)
-            progress.advance(task)
+    for number, frame in enumerate(progress.track(frames, f"rendering {out.name}", len(frames))):
+        _render_frame(context, frame, number)
     pathtracer.write_model(model, context.model, out / "truth" / "mesh.glb")
-    _write_documents(context, frames, lights)
+    training = [frame.name for frame in frames if frame.region is None]
     if options.video:
-        training = [out / "images" / frame.name for frame in frames if frame.region is None]
-        video.write_clip(out / "clip.mp4", (files.read_image(path) for path in training))
+        video.write_clip(out / "clip.mp4", (files.read_image(out / "images" / name) for name in training))
+    if options.film:
+        mask = files.read_image(out / "truth" / "film_object_mask" / training[0])[..., 0]
+        film.write_film(out, training, mask, film.film_camera(context.camera), options.seed)
+    _write_documents(context, frames, lights)
     return out
 
 
@@ -136,11 +151,9 @@ def _prepare_folder(out: Path, manifest: dict[str, Any]) -> bool:
         BadFile: `out` holds something else.
     """
     path = out / SETTINGS_FILE
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+    if not path.is_file():
         files.write_json(path, manifest)
         return False
-    if not path.is_file():
-        raise BadFile(out, "exists already and was not made by tumble synth", "choose another folder with -o")
     if {k: v for k, v in files.read_json(path, dict[str, Any]).items() if k in manifest} != manifest:
         raise BadFile(
             out, "holds a capture made with other options", f"remove it or choose another -o; see {SETTINGS_FILE}"
@@ -151,22 +164,26 @@ def _prepare_folder(out: Path, manifest: dict[str, Any]) -> bool:
 def _context(parts: pathtracer.ObjectModel, out: Path, options: SynthOptions) -> _RenderContext:
     camera = Camera.from_fov(math.radians(options.fov), options.resolution, options.resolution)
     shapes = pathtracer.mitsuba_shapes(parts, options.material, options.roughness)
-    return _RenderContext(options, parts, camera, out, shapes, pathtracer.unlit_scenes(parts, options.roughness))
+    unlit = pathtracer.unlit_scenes(parts, options.roughness)
+    distance = distance_for(math.radians(options.fov))
+    poses = trajectory(options.setting, options.views, distance, seed=options.seed)
+    around = surroundings(parts, poses, options, distance)
+    layers = None if around is None else pathtracer.layer_scene((parts.named_parts(), *around.at(0.0, poses[0])))
+    return _RenderContext(options, parts, camera, out, shapes, unlit, poses, around, layers)
 
 
-def _frames(options: SynthOptions) -> Iterator[_Frame]:
+def _frames(options: SynthOptions, poses: SE3) -> Iterator[_Frame]:
     """All frames in the order of their numbers: training frames, then the evaluation views of each region."""
     distance = distance_for(math.radians(options.fov))
-    training = trajectory(options.setting, options.views, distance, seed=options.seed)
     groups = (
-        (None, training, options.views),
+        (None, poses, options.views),
         ("shared", shared_views(options.eval_shared, distance), options.eval_shared),
         ("sphere", sphere_views(options.eval_sphere, distance), options.eval_sphere),
     )
     number = 0
     for region, poses, n in groups:
         for i in range(n):
-            yield _Frame(f"{number:04}.png", SE3(poses.wxyz[i].float(), poses.xyz[i].float()), region)
+            yield _Frame(f"{number:04}.png", SE3(poses.wxyz[i].float(), poses.xyz[i].float()), region, number)
             number += 1
 
 
@@ -217,6 +234,11 @@ def _expose_lights(
             factor = _exposure(context, unexposed[name], measured, light_frame) if given is None else given
             Environment.from_radiance(unexposed[name].radiance * factor).write(path)
         context.scenes[name] = pathtracer.lit_scene(context.shapes, Environment.read(path), options.path_depth)
+    if context.surroundings is not None:
+        hand, background = context.surroundings.at(0.0, context.poses[0])
+        shapes = context.shapes | pathtracer.surrounding_shapes(hand | background)
+        light = Environment.read(paths[""])
+        context.scenes[SURROUNDED] = pathtracer.lit_scene(shapes, light, options.path_depth)
     return paths
 
 
@@ -247,13 +269,70 @@ def _render_frame(context: _RenderContext, frame: _Frame, number: int) -> None:
         return
     # Noise differs between frames and is the same in every call.
     seed = 10_000 * options.seed + number
-    pixels, coverage = context.render("", frame, options.samples, seed, LIGHT_FRAME[options.setting])
     if frame.region is not None:
+        pixels, _ = context.render("", frame, options.samples, seed, LIGHT_FRAME[options.setting])
         # Mask and maps use the same coverage, so that every object pixel of a view has ground truth.
-        coverage = _render_truth(context, frame, seed)
-    mask = np.where(coverage >= 0.5, OBJECT, BACKGROUND).astype(np.uint8)
+        mask = _two_valued(_render_truth(context, frame, seed))
+    else:
+        pixels, mask = _render_training(context, frame, seed)
+    if frame.region is None and options.film:
+        _render_film(context, frame, seed)
     files.write_png(out / "masks" / frame.name, mask[..., None])
     _write_srgb(out / "images" / frame.name, pixels)
+
+
+def _two_valued(coverage: np.ndarray) -> np.ndarray:
+    return np.where(coverage >= 0.5, OBJECT, BACKGROUND).astype(np.uint8)
+
+
+def _render_training(context: _RenderContext, frame: _Frame, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance and mask of a training frame; what a hand may hide is unknown in the mask."""
+    options, light_frame = context.options, LIGHT_FRAME[context.options.setting]
+    if context.surroundings is None:
+        pixels, coverage = context.render("", frame, options.samples, seed, light_frame)
+        return pixels, _two_valued(coverage)
+    _place_surroundings(context, frame)
+    pixels, _ = context.render(SURROUNDED, frame, options.samples, seed, light_frame)
+    visible = pathtracer.layer_coverage(context.layers, frame.T_cam_obj, context.camera, samples=LAYER_SAMPLES)
+    _write_layers(context.out / "truth", "", frame, visible)
+    elsewhere = np.where(visible[..., :2].sum(-1) >= 0.5, UNKNOWN, BACKGROUND)
+    return pixels, np.where(visible[..., 0] >= 0.5, OBJECT, elsewhere).astype(np.uint8)
+
+
+def _render_film(context: _RenderContext, frame: _Frame, seed: int) -> None:
+    """Write a frame of the film, averaged while the shutter is open, and its masks of object and hand."""
+    options, camera = context.options, film.film_camera(context.camera)
+    samples = math.ceil(options.samples / film.SUBFRAMES)
+    total, visible = np.zeros(()), np.zeros(())
+    for i, time in enumerate(film.shutter_times(frame.time)):
+        pose = film.pose_at(context.poses, time)
+        moment = _Frame(frame.name, SE3(pose.wxyz.float(), pose.xyz.float()), None, time)
+        light = "" if context.surroundings is None else SURROUNDED
+        _place_surroundings(context, moment)
+        seed_of_moment = film.SUBFRAMES * seed + i
+        pixels, coverage = context.render(light, moment, samples, seed_of_moment, LIGHT_FRAME[options.setting], camera)
+        total = total + pixels / film.SUBFRAMES
+        layers = np.stack([coverage, 0 * coverage], -1)
+        if context.layers is not None:
+            layers = pathtracer.layer_coverage(context.layers, moment.T_cam_obj, camera, samples=LAYER_SAMPLES // 4)
+        visible = visible + layers / film.SUBFRAMES
+    _write_layers(context.out / "truth", "film_", frame, visible)
+    _write_srgb(context.out / film.FRAMES_FOLDER / frame.name, total)
+
+
+def _place_surroundings(context: _RenderContext, frame: _Frame) -> None:
+    """Move hand and background to where they are on a training frame."""
+    if context.surroundings is not None:
+        hand, background = context.surroundings.at(frame.time, frame.T_cam_obj)
+        for scene in (context.scenes[SURROUNDED], context.layers):
+            pathtracer.move(scene, hand | background)
+
+
+def _write_layers(truth: Path, prefix: str, frame: _Frame, visible: np.ndarray) -> None:
+    """Write the masks of visible object and hand; `visible` is the fraction of each pixel that each covers."""
+    for i, name in enumerate(("object_mask", "hand_mask")):
+        mask = np.where(visible[..., i : i + 1] > 0.5, 255, 0).astype(np.uint8)
+        files.write_png(truth / f"{prefix}{name}" / frame.name, mask)
 
 
 def _render_truth(context: _RenderContext, frame: _Frame, seed: int) -> np.ndarray:
@@ -262,7 +341,7 @@ def _render_truth(context: _RenderContext, frame: _Frame, seed: int) -> np.ndarr
     maps = pathtracer.maps(context.unlit, frame.T_cam_obj, context.camera, samples=MAP_SAMPLES)
     for name in _map_names(options):
         files.write_exr(truth / name / exr, getattr(maps, name), half=name != "depth")
-    for light in (name for name in context.scenes if name not in ("", "probe")):
+    for light in (name for name in context.scenes if name not in ("", "probe", SURROUNDED)):
         pixels, _ = context.render(light, frame, options.truth_samples, seed, "object")
         _write_srgb(truth / "relit" / light / frame.name, pixels)
     return maps.coverage

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from tests.lopsided import DISTANCE, KNOBS, tumbling
+from tumble.maths.directions import random_rotation
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.result import Observability, PoseResult
 from tumble.poses.sfm import finalize, frontier_points
 from tumble.poses.sfm.finalize import Solution
 from tumble.poses.sfm.tracks import Tracks, chain_matches
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.synthetic import trajectories
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,7 @@ def test_frames_without_observations_are_lost_and_interpolated(result: PoseResul
     true = tumbling(24).T_cam_obj.rotation.matrix()
     found = result.trajectory.T_cam_obj.rotation.matrix().double()
     for k in (7, 12):
-        # Halfway between neighbours of a smooth tumble; the first frame defines the object axes.
+        # Halfway between neighbours of a smooth tumble, relative to the first frame.
         error = SO3.from_matrix(found[k] @ (true[k] @ true[0].T @ found[0]).T).angle()
         assert error.rad2deg() < 3
     assert result.quality.tangency_gap[~result.quality.lost & ~result.quality.tangency_gap.isnan()].max() < 1
@@ -54,6 +56,33 @@ def test_frames_without_observations_are_lost_and_interpolated(result: PoseResul
     assert result.quality.overlap[kept].min() > 0.85
     assert result.quality.inliers[12] == 0
     assert result.quality.residual[12].isnan()
+
+
+def test_up_is_up_in_the_first_frame_that_is_not_lost(result: PoseResult) -> None:
+    """Its camera is at +z, with +y up in the image; points move with the frame."""
+    opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    T_cam_obj = result.trajectory.T_cam_obj
+    torch.testing.assert_close(T_cam_obj[0].rotation.matrix(), opengl, atol=1e-5, rtol=0)
+    lost = replace(result, quality=replace(result.quality, lost=torch.arange(24) < 3))
+    turned = finalize._upright(lost)
+    T_cam_new = turned.trajectory.T_cam_obj
+    torch.testing.assert_close(T_cam_new[3].rotation.matrix(), opengl, atol=1e-5, rtol=0)
+    torch.testing.assert_close(T_cam_new[9] @ turned.points, T_cam_obj[9] @ result.points, atol=1e-5, rtol=0)
+
+
+def test_up_is_the_axis_of_a_turntable() -> None:
+    """Seen from 25 degrees above by a camera that is rolled by 5 degrees; the estimated frame is a random one."""
+    true = trajectories.turntable(30, DISTANCE).rotation
+    roll = SO3.exp(torch.tensor([0.0, 0.0, math.radians(5)], dtype=torch.float64))
+    R_old_obj = random_rotation(torch.Generator().manual_seed(0)).double()
+    R_cam_old = (roll @ true).matrix() @ R_old_obj.mT
+    R_new_obj = finalize._rotation_to_upright(R_cam_old, math.pi) @ R_old_obj
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(R_new_obj @ up, up, atol=1e-6, rtol=0)
+    # A tenth of a revolution is no evidence for a turntable.
+    few = R_cam_old[:3]
+    R_new_old = finalize._rotation_to_upright(few, math.radians(24))
+    torch.testing.assert_close(few[0] @ R_new_old.mT @ up, -up, atol=1e-6, rtol=0)
 
 
 def test_the_sphere_around_a_cube_excludes_an_outlier() -> None:
@@ -117,8 +146,8 @@ def test_rotation_about_an_axis_that_holds_all_texture_is_unobservable(monkeypat
     observability = quality.observability
     assert observability.axis_unobservable
     assert not observability.several_axes_unobservable
-    # The object axes are the camera axes of the first frame.
-    expected = solution.R[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    # The object axes are those of the first camera in OpenGL axes.
+    expected = solution.R[0] @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64) * torch.tensor([1.0, -1.0, -1.0])
     assert abs(float(observability.axis.double() @ expected)) > 0.98
     assert observability.sentence.startswith("Rotation about axis (")
     assert quality.rating == "bad"

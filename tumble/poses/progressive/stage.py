@@ -14,7 +14,7 @@ from tumble.poses.progressive import tracker, virtual_camera
 from tumble.poses.result import PoseResult
 from tumble.scene import Capture, Match, Trajectory
 
-VERSION = 4
+VERSION = 5
 VIRTUAL_SIZE = 128
 """Height and width of the virtual frames [pixels]."""
 

@@ -1,9 +1,11 @@
 """Last step of stage 1: lost frames, the object's frame and unit, surface points and the quality of the poses.
 
 The similarity frame of the result: the smallest sphere around the frontier points, which lie on the object's convex
-hull, becomes the unit sphere, and the object axes are the camera axes of the first frame.
+hull, becomes the unit sphere. The object stands as a person sees it: +y is up in the first frame that is not lost, or
+along the axis of a turntable, and +z points to that frame's camera.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -47,6 +49,13 @@ ASSESSED_FRAMES = 24
 """Number of frames, up to a factor of 2, for which the information of the contour about the pose is evaluated."""
 REFERENCE_FRAMES = 16
 """Number of frames, up to a factor of 2, with whose contours each of these frames is compared."""
+MAX_TURNTABLE_WOBBLE = math.radians(5)
+"""Largest deviation of the rotation axis in the camera frame with which a motion counts as that of a turntable
+[radians]."""
+MIN_TURNTABLE_RANGE = math.radians(90)
+"""Smallest rotation range of a turntable [radians]; during smaller rotations other axes hardly move either."""
+MAX_TURNTABLE_TILT = math.radians(60)
+"""Largest angle between the axis of a turntable and up in the image, which is the elevation of the camera [radians]."""
 HULL_RESOLUTION = 48
 """Cells per side of the visual hull's grid; also rays per side of the image in which its silhouette is compared."""
 
@@ -102,7 +111,40 @@ def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: 
     quality = PoseQuality(
         median.float(), inliers.float(), gap.float(), overlap, disagreement, lost, rotation_range, observability
     )
-    return PoseResult(trajectory, points.float(), colours, quality, camera)
+    return _upright(PoseResult(trajectory, points.float(), colours, quality, camera))
+
+
+def _upright(result: PoseResult) -> PoseResult:
+    """The result with the object frame rotated so that +y is up and +z points to the camera of the first kept frame."""
+    T_cam_obj, quality = result.trajectory.T_cam_obj, result.quality
+    kept = torch.nonzero(~quality.lost)[:, 0]
+    R_cam_obj = T_cam_obj.rotation.matrix()[kept if len(kept) else slice(1)].double()
+    R_new_obj = _rotation_to_upright(R_cam_obj, float(quality.rotation_range)).float()
+    T_obj_new = SE3.from_rotation_matrix(R_new_obj.mT)
+    observability = quality.observability
+    # The axis of an untextured body of revolution is a direction in the first image.
+    if not bool(observability.axis.isnan().any()):
+        observability = replace(observability, axis=R_new_obj @ observability.axis)
+    trajectory = Trajectory(T_cam_obj @ T_obj_new, result.trajectory.light)
+    quality = replace(quality, observability=observability)
+    return replace(result, trajectory=trajectory, points=result.points @ R_new_obj.mT, quality=quality)
+
+
+def _rotation_to_upright(R_cam_obj: Float[Tensor, "t 3 3"], rotation_range: float) -> Float[Tensor, "3 3"]:
+    """Rotation from the object frame to one with +y up and the first camera in the half plane of +z.
+
+    Up is the axis of a turntable, which keeps its direction in the camera frame while the object rotates; for any other
+    motion up is that of the first image.
+    """
+    up_cam = R_cam_obj.new_tensor([0.0, -1.0, 0.0])
+    up = R_cam_obj[0].mT @ up_cam
+    axes_cam, lengths, axes = torch.linalg.svd(R_cam_obj.mean(0))
+    tilt_cosine = axes_cam[:, 0] @ up_cam
+    steady = float(lengths[0]) > math.cos(MAX_TURNTABLE_WOBBLE) and rotation_range > MIN_TURNTABLE_RANGE
+    if steady and float(tilt_cosine.abs()) > math.cos(MAX_TURNTABLE_TILT):
+        up = axes[0] * tilt_cosine.sign()
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, -R_cam_obj[0, 2]), dim=0)
+    return torch.stack([right, up, torch.linalg.cross(right, up)])
 
 
 def _frontier_points(

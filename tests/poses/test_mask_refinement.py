@@ -1,0 +1,80 @@
+"""Masks with a planted arm: it goes, and nothing of the object does."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.lopsided import Tumble, truth, tumbling
+from tumble.engine import run
+from tumble.io import tree
+from tumble.poses import PoseQuality, PoseResult, mask_refinement
+from tumble.poses.result import Observability
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
+
+N, HELD = 24, 6
+
+
+@pytest.fixture(scope="module")
+def scene() -> Tumble:
+    return tumbling(N, size=96, points=10)
+
+
+def with_arm(capture: Capture) -> tuple[Capture, Tensor]:
+    """A bar from the object to the right border, labelled object on the first frames, and its pixels."""
+    masks, arm = capture.masks.clone(), torch.zeros(capture.masks.shape, dtype=torch.bool)
+    arm[:HELD, 42:54, 48:] = True
+    arm &= masks == BACKGROUND
+    masks[arm] = OBJECT
+    masks[:, :3, :3] = UNKNOWN
+    return replace(capture, masks=masks), arm
+
+
+def result(scene: Tumble, overlap: float = 0.9, lost: int = 0) -> PoseResult:
+    """The true poses, with quality as stage 1 would state it."""
+    ones, flags = torch.ones(N), torch.arange(N) < lost
+    observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.full((3,), 0.01))
+    quality = PoseQuality(ones, 50 * ones, ones, overlap * ones, 0.01 * ones, flags, torch.tensor(3.0), observability)
+    return PoseResult(truth(scene), torch.zeros(0, 3), torch.zeros(0, 3), quality, scene.capture.camera)
+
+
+def test_an_arm_that_others_frames_do_not_show_becomes_background(scene: Tumble) -> None:
+    capture, arm = with_arm(scene.capture)
+    trimmed = mask_refinement.trim_masks(capture, result(scene))
+    assert (trimmed.masks[arm] == BACKGROUND).float().mean() > 0.8
+    assert (trimmed.masks[arm] == OBJECT).float().mean() < 0.1
+    inside = scene.capture.masks == OBJECT
+    assert not (trimmed.masks[inside] == BACKGROUND).any()
+    assert (trimmed.masks[inside] == OBJECT).float().mean() > 0.97
+    assert not trimmed.images[trimmed.masks == BACKGROUND].any()
+
+
+def test_a_frame_without_pose_keeps_its_mask(scene: Tumble) -> None:
+    capture, arm = with_arm(scene.capture)
+    trimmed = mask_refinement.trim_masks(capture, result(scene, lost=2))
+    assert torch.equal(trimmed.masks[:2], capture.masks[:2])
+    assert (trimmed.masks[2:][arm[2:]] == BACKGROUND).float().mean() > 0.8
+
+
+def test_only_doubtful_masks_of_a_known_shape_are_trimmed(scene: Tumble) -> None:
+    capture, _ = with_arm(scene.capture)
+    assert mask_refinement.can_be_trimmed(capture, result(scene, lost=1))
+    assert not mask_refinement.can_be_trimmed(capture, result(scene, overlap=1.0))
+    assert not mask_refinement.can_be_trimmed(capture, result(scene, overlap=0.4))
+    # Masks without unknown pixels were given, or made of an object that nothing covers.
+    assert not mask_refinement.can_be_trimmed(scene.capture, result(scene, lost=1))
+
+
+def test_a_stored_result_is_that_of_the_best_round(scene: Tumble, tmp_path: Path) -> None:
+    capture, _ = with_arm(scene.capture)
+    assert mask_refinement.stored_result(tmp_path, capture) == (None, capture)
+    first, better, worse = (result(scene, lost=lost) for lost in (4, 1, 7))
+    for number, each in ((1, first), (2, better), (3, worse)):
+        (tmp_path / mask_refinement.folder(number)).mkdir()
+        tree.save(each, tmp_path / mask_refinement.folder(number) / run.OUT)
+    found, trimmed = mask_refinement.stored_result(tmp_path, capture)
+    assert found is not None
+    assert int(found.quality.lost.sum()) == 1
+    assert torch.equal(trimmed.masks, mask_refinement.trim_masks(capture, first).masks)

@@ -1,0 +1,79 @@
+"""Masks of an object in a hand whose landmarks are known, compared with the true masks of a synthetic video."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.films import Scene, scene
+from tumble.preprocess import held_object
+from tumble.preprocess.background import estimate_background
+from tumble.preprocess.hands import Hand
+from tumble.preprocess.segmentation import Masks, Seed, overlap
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
+
+PRINT = (196, 140, 112)
+"""A print on the object in the colour of the hand [sRGB code values]."""
+
+
+def landmarks(i: int) -> Hand:
+    """Those of the hand that `scene` draws: three fingers upwards on a palm at the lower border."""
+    sway, points = 5 * np.sin(i / 3), np.zeros((21, 2), np.float32)
+    points[0], points[1], points[2:5] = (80 + sway, 129), (46 + sway, 122), (44 + sway, 116)
+    for first, finger in ((5, 0), (9, 1), (13, 1), (17, 2)):
+        x, y = 60 + 18 * finger + sway, 98 + 4 * np.sin(i / 4 + finger)
+        points[first : first + 4] = [(x, y + reach) for reach in (18, 6, -6, -18)]
+    return Hand(points, 1.0, 1.0)
+
+
+@cache
+def segmented(printed: bool = False) -> tuple[Masks, Scene]:
+    video = scene(hand=True)
+    if printed:
+        pictures = video.pictures.copy()
+        for i, inside in enumerate(video.object):
+            row, column = (int(x.mean()) for x in np.nonzero(inside & ~video.hand[i]))
+            square, column = np.zeros_like(inside), column + round(12 * np.sin(i / 2))
+            square[max(row - 20, 0) : row - 6, column - 7 : column + 7] = True
+            pictures[i][square & inside] = PRINT
+        video = Scene(pictures, video.object, video.hand, video.background)
+    hands = [[landmarks(i)] for i in range(len(video.pictures))]
+    # Known wherever neither object nor hand was, as after a first segmentation.
+    background = estimate_background(video.pictures, video.object | video.hand)
+    return held_object.segment(video.pictures, background, Seed(0, video.box()), hands), video
+
+
+def test_the_object_is_segmented_without_the_hand() -> None:
+    masks, video = segmented()
+    pairs = list(zip(masks.labels, video.object, strict=True))
+    assert np.mean([overlap(labels == OBJECT, truth & (labels != UNKNOWN)) for labels, truth in pairs]) > 0.92
+    assert (masks.labels[video.hand] == OBJECT).mean() < 0.01
+    # Fingers in front of the object must not be background, which would carve the visual hull.
+    assert (masks.labels[video.hand] == BACKGROUND).mean() < 0.05
+    assert max((labels[truth] == BACKGROUND).mean() for labels, truth in pairs) < 0.06
+
+
+def test_a_print_in_the_colour_of_the_hand_is_object() -> None:
+    """The landmarks say that the hand is elsewhere."""
+    masks, video = segmented(printed=True)
+    printed = (np.abs(video.pictures.astype(int) - PRINT).max(-1) < 8) & video.object
+    assert printed.sum() > 100 * len(printed)
+    assert (masks.labels[printed] == OBJECT).mean() > 0.9
+
+
+def test_an_object_that_leaves_is_not_found() -> None:
+    video = scene()
+    pictures = video.pictures.copy()
+    pictures[12:] = video.background
+    hands = [[] for _ in pictures]
+    masks = held_object.segment(pictures, estimate_background(pictures), Seed(0, video.box()), hands)
+    assert (masks.labels[13:] == OBJECT).mean() < 1e-3
+    assert masks.confidence[13:].max() == 0
+    assert masks.uncertain[13:].all()
+
+
+def test_a_box_on_the_empty_wall_is_refused() -> None:
+    video = scene()
+    hands = [[] for _ in video.pictures]
+    with pytest.raises(ValueError, match="no object in the box, or at the click, on frame 0"):
+        held_object.segment(video.pictures, estimate_background(video.pictures), Seed(0, (0, 100, 20, 20)), hands)

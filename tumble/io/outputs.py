@@ -1,0 +1,58 @@
+"""Where commands write: the rules by which nothing of the user is overwritten.
+
+A command writes into a folder that is new, empty, or holds its own earlier output, which is recognised by a file that
+the command always writes first, its *mark*. It writes a file only where none is. Anything else takes `--overwrite`.
+"""
+
+from collections.abc import Collection
+from pathlib import Path
+
+from tumble.io.files import PARTIAL_PREFIX, BadFile
+
+OTHER_PLACE = "choose another place, or insist with --overwrite (overwrite=True in Python)"
+"""Fix for an output that would replace something."""
+
+
+def claim_folder(folder: Path, mark: str, *, overwrite: bool = False, fix: str = OTHER_PLACE) -> None:
+    """Check that a command may write into a folder, which need not exist.
+
+    Args:
+        mark: Name of the file by which an earlier output of the same command is recognised.
+        overwrite: Allow a folder with other files, of which those with the same names are replaced.
+        fix: What the error suggests for a folder with other files.
+
+    Raises:
+        BadFile: The path or a part of it is a file, or the folder holds something other than the command's output.
+    """
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise BadFile(existing, "is a file, where a folder is to be written", "choose another folder with -o")
+    if overwrite or existing != folder or (folder / mark).is_file():
+        return
+    if any(not path.name.startswith(PARTIAL_PREFIX) for path in folder.iterdir()):
+        raise BadFile(folder, f"holds other files, and no {mark} of an earlier output of this command", fix)
+
+
+def claim_file(path: Path, suffixes: Collection[str], *, overwrite: bool = False) -> None:
+    """Check that a command may write a file, whose format its extension tells.
+
+    Args:
+        suffixes: Extensions of the formats that can be written.
+
+    Raises:
+        BadFile: The format is not among them, or the file exists and may not be overwritten.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise BadFile(path, f"has the extension {path.suffix!r}", f"these can be written: {', '.join(suffixes)}")
+    if path.exists() and not (overwrite and path.is_file()):
+        raise BadFile(path, "exists already", OTHER_PLACE)
+
+
+def require_outside(out: Path, source: Path) -> None:
+    """Check that an output does not lie in the folder of its input, which would change with every run.
+
+    Raises:
+        BadFile: It does.
+    """
+    if source.is_dir() and out.resolve().is_relative_to(source.resolve()):
+        raise BadFile(out, f"lies in the input folder {source}", "choose a folder outside of it with -o")

@@ -1,0 +1,123 @@
+"""Masks without what the shape of the object contradicts: an arm, a sleeve, a wall that moved with it for a while.
+
+Such parts stand at another place of the object's frame as soon as the object is held in another way, so other frames
+show background there. The visual hull by a vote of all frames lacks them, and its silhouettes trim the masks. Stage 1
+is then repeated; the new result is kept only if it explains more.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from tumble.engine import run
+from tumble.maths import SE3
+from tumble.poses.result import PoseResult
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
+
+RESOLUTION = 96
+"""Cells of the visual hull along each axis."""
+EXTENT = 1.15
+"""Half the side of the cube of cells [object radius]; the radius was estimated from untrimmed masks."""
+MAX_BACKGROUND_FRACTION = 0.05
+"""Maximum fraction of frames that show background at a cell of the hull; a wrong pose or mask does not carve."""
+MARGIN = 0.03
+"""Distance from the predicted silhouette up to which a pixel may show the object, as a fraction of its diameter."""
+MIN_OVERLAP = 0.5
+"""Minimum median overlap of silhouettes and hull; below it, poses and hull are too wrong to trim masks."""
+ROUNDS = 3
+"""Maximum number of times that stage 1 is run."""
+
+
+def folder(round: int) -> str:
+    """Folder, in a run directory, of the poses of a round, counted from 1."""
+    return run.TRACK if round == 1 else f"{run.TRACK}-{round}"
+
+
+def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Capture]:
+    """The poses of a run, None if there are none, and its capture with the masks from which they were estimated."""
+    best = run.output(out, folder(1), PoseResult)
+    for number in range(2, ROUNDS + 1):
+        new = run.output(out, folder(number), PoseResult)
+        if best is None or new is None or not can_be_trimmed(capture, best) or not explains_more(new, best):
+            break
+        capture, best = trim_masks(capture, best), new
+    return best, capture
+
+
+def can_be_trimmed(capture: Capture, result: PoseResult) -> bool:
+    """Whether masks are doubtful, as they have unknown pixels and contradict each other, but the hull is usable."""
+    quality = result.quality
+    if quality.rating == "good" or not bool((capture.masks == UNKNOWN).any()):
+        return False
+    return not bool(quality.lost.all()) and float(quality.overlap[~quality.lost].median()) > MIN_OVERLAP
+
+
+def trim_masks(capture: Capture, result: PoseResult) -> Capture:
+    """The capture with trimmed masks; the frames without a pose stay as they are.
+
+    Pixels outside the silhouette of the hull become background, and black as everywhere in a capture; those near its
+    border that were object become unknown.
+    """
+    kept = torch.nonzero(~result.quality.lost)[:, 0].tolist()
+    camera, T_cam_obj = result.camera, result.trajectory.T_cam_obj
+    cells = _hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
+    masks = capture.masks.clone()
+    for k in kept:
+        silhouette = _silhouette(camera, T_cam_obj[k] @ cells)
+        near = _dilated(silhouette, max(2, round(MARGIN * float(np.sqrt(silhouette.sum())))))
+        labels = masks[k].numpy()
+        trimmed = np.where(near, labels, np.uint8(BACKGROUND))
+        trimmed[(labels == OBJECT) & near & ~silhouette] = UNKNOWN
+        masks[k] = torch.from_numpy(trimmed)
+    shown = (masks != BACKGROUND)[..., None]
+    return replace(capture, masks=masks, images=torch.where(shown, capture.images, torch.zeros_like(capture.images)))
+
+
+def explains_more(new: PoseResult, old: PoseResult) -> bool:
+    """Whether poses from trimmed masks are better: by their rating, else by the number of frames with a pose."""
+    order = ("bad", "warn", "good")
+    ranks = [(order.index(each.quality.rating), -int(each.quality.lost.sum())) for each in (new, old)]
+    return ranks[0] > ranks[1]
+
+
+def _hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[Tensor, "n 3"]:
+    """Centres of the cells at which few frames show background, object frame."""
+    ticks = ((torch.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1) * EXTENT
+    cells = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    size = torch.tensor([capture.camera.width, capture.camera.height])
+    background, seen = torch.zeros(len(cells)), torch.zeros(len(cells))
+    for k in frames:
+        uv = capture.camera.project(T_cam_obj[k] @ cells).floor().long()
+        inside = ((uv >= 0) & (uv < size)).all(-1)
+        column, row = uv.clamp(min=torch.zeros_like(size), max=size - 1).unbind(-1)
+        background += inside & (capture.masks[k][row, column] == BACKGROUND)
+        seen += inside
+    return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen)]
+
+
+def _silhouette(camera: Camera, cells: Float[Tensor, "n 3"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that show cells of the hull, camera frame."""
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    if not len(cells):
+        return mask > 0
+    column, row = camera.project(cells).floor().long().numpy().T
+    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    mask[row[inside], column[inside]] = 1
+    # Neighbouring cells are further apart than pixels where the object is large in the image.
+    spacing = float(camera.fx_fy_cx_cy[0]) * 2 * EXTENT / RESOLUTION / float(cells[:, 2].mean())
+    radius = max(1, int(np.ceil(spacing)))
+    return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(radius)) > 0
+
+
+def _dilated(mask: Bool[np.ndarray, "h w"], radius: int) -> Bool[np.ndarray, "h w"]:
+    return cv2.dilate(mask.astype(np.uint8), _disc(radius)) > 0
+
+
+def _disc(radius: int) -> UInt8[np.ndarray, "i j"]:
+    """A disc of ones."""
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)

@@ -1,0 +1,106 @@
+"""Regions of an image that belong to a hand for certain, or perhaps, from its landmarks: seeds of a segmentation."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from tumble.preprocess.hands.detection import MIDDLE, RING, WRIST, Hand
+
+FINGERS = ((1, 2, 3, 4), (5, 6, 7, 8), (0, 9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
+"""Landmarks of thumb, index, middle, ring and little finger, from the palm to the tip; the middle one from the wrist,
+because a palm seen from its edge has no area."""
+PALM = (0, 1, 5, 9, 13, 17)
+"""Landmarks around the palm."""
+STROKE_WIDTH = 0.1
+"""Width of a stroke as a fraction of the size of the palm; a finger is almost twice as wide."""
+PALM_MARGIN = 0.05
+"""Width of the rim of the palm that is not certain, as a fraction of the size of the palm."""
+REGION_MARGIN = 0.4
+"""Distance from the landmarks up to which a hand may reach, as a fraction of the size of the palm."""
+
+FINGER_MARGIN = 0.25
+"""Distance from the strokes up to which pixels may show fingers, as a fraction of the size of the palm."""
+ARM_WIDTH = 0.8
+"""Width of an arm as a fraction of the size of the palm."""
+ARM_REACH = (0.3, 6.0)
+"""Distances from the wrist between which the arm is expected [size of the palm]."""
+
+
+def hand_strokes(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the hands: lines along the bones of the fingers, and the palms without their rims.
+
+    There are landmarks of hidden parts of a hand too: strokes may run over an object that is held.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, np.uint8)
+    for hand in hands:
+        points, size = np.floor(hand.landmarks).astype(np.int32), palm_size(hand)
+        palm = cv2.fillPoly(np.zeros(shape, np.uint8), [points[list(PALM)]], 1)
+        cv2.polylines(palm, [points[list(PALM)]], True, 0, _thickness(2 * PALM_MARGIN * size))
+        mask[palm > 0] = 1
+        for finger in FINGERS:
+            cv2.polylines(mask, [points[list(finger)]], False, 1, _thickness(STROKE_WIDTH * size))
+    return mask.astype(bool)
+
+
+def hand_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that may belong to the hands: the convex hulls of their landmarks, with a margin. Arms reach further.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, np.uint8)
+    for hand in hands:
+        hull = cv2.convexHull(np.floor(hand.landmarks).astype(np.int32))
+        cv2.fillConvexPoly(mask, hull, 1)
+        cv2.polylines(mask, [hull], True, 1, _thickness(2 * REGION_MARGIN * palm_size(hand)))
+    return mask.astype(bool)
+
+
+def hand_surroundings(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the hands and close to them: the strokes, widened to fingers.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, bool)
+    for hand in hands:
+        radius = _thickness(FINGER_MARGIN * palm_size(hand))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        mask |= cv2.dilate(hand_strokes([hand], shape).astype(np.uint8), disc) > 0
+    return mask
+
+
+def arm_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels behind the wrists, in the direction of the palms: an arm is there unless the wrist is bent.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, np.uint8)
+    for hand in hands:
+        wrist, knuckles = hand.landmarks[WRIST], (hand.landmarks[MIDDLE] + hand.landmarks[RING]) / 2
+        size, direction = palm_size(hand), wrist - knuckles
+        direction /= max(float(np.linalg.norm(direction)), 1e-3)
+        near, far = (np.floor(wrist + reach * size * direction).astype(int).tolist() for reach in ARM_REACH)
+        cv2.line(mask, near, far, 1, _thickness(ARM_WIDTH * size))
+    return mask.astype(bool)
+
+
+def palm_size(hand: Hand) -> float:
+    """Largest distance between landmarks of the palm, about the same from all sides [pixels]."""
+    palm = hand.landmarks[list(PALM)]
+    return float(np.linalg.norm(palm[:, None] - palm, axis=-1).max())
+
+
+def _thickness(width: float) -> int:
+    """Width of a line that OpenCV can draw [pixels]."""
+    return max(1, round(width))

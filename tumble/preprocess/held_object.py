@@ -1,0 +1,289 @@
+"""Segmentation of an object that is held by a hand, from a box or a click on one frame and the landmarks of the hands.
+
+Every pixel has the probabilities of three classes: object, hand (with arm, sleeve and body) and background. From the
+seed frame they are propagated forwards and backwards by optical flow (DIS); in each frame they are the prior, the
+colours and the static background give the likelihood, and the landmarks say where a hand is. The hand's colours are
+learnt from the landmarks of the whole video, without those that surround the hands; the object's on the seed frame, and
+later only from pixels that certainly differ from the background, so that a wrong mask does not reinforce itself.
+
+Limits: a sleeve of the object's colours that touches the object is segmented as object; what the shape of the object
+contradicts is removed when that is known (`silhouette_prior`).
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from tumble.preprocess import segmentation
+from tumble.preprocess.background import Background, BackgroundSamples
+from tumble.preprocess.colour_model import (
+    BACKGROUND_CLASS,
+    HAND_CLASS,
+    NO_HAND_LOG_LIKELIHOOD,
+    OBJECT_CLASS,
+    SEED_WEIGHT,
+    ColourModel,
+    class_probabilities,
+    hand_colours,
+    log_likelihoods,
+    trim_rim,
+)
+from tumble.preprocess.hands import Hand, arm_region, hand_strokes, hand_surroundings
+from tumble.preprocess.segmentation import Masks, Seed
+
+STROKE_LOG_ODDS = 3.0
+"""Log odds of a hand at its landmarks, against the other classes."""
+MAX_OBJECT_LOG_RATIO = 1.5
+"""Log likelihood ratio of object to hand above which a pixel at a landmark, which may be hidden, shows the object."""
+ARM_LOG_ODDS = 1.5
+"""Log odds of a hand behind the wrist."""
+MAX_LOG_RATIO = 8.0
+"""Limit of the log likelihood ratios of one pixel."""
+MIN_PROBABILITY = 0.01
+"""Lower limit of a prior probability, because optical flow alone is not conclusive."""
+MAX_DISTANT_PROBABILITY = 1e-4
+"""Prior probability of the object beyond the search radius around its prediction."""
+MIN_HAND_ELSEWHERE = 0.1
+"""Lower limit of the prior probability of a hand there: an arm or a body may appear."""
+CERTAIN = 0.9
+"""Probability of a class above which a pixel's colour is learnt."""
+HAND_LEARNING_RATE = 0.02
+"""Weight of a new frame in the hand's colours, which the landmarks of the whole video have given already."""
+MAX_HOLE_FRACTION = 0.3
+"""Maximum area of a hole in the predicted object that counts as part of it, as a fraction of the object's."""
+SEED_ITERATIONS = 2
+"""Number of times that the colours and the mask of the seed frame are estimated in turn."""
+SEED_PRIOR = {
+    "object": (0.9, 0.05, 0.05),
+    "hand": (0.25, 0.6, 0.15),
+    "box": (0.4, 0.1, 0.5),
+    "moving": (0.01, 0.9, 0.09),
+    "rest": (0.01, 0.2, 0.79),
+}
+"""Prior probabilities of object, hand and background on the seed frame: in GrabCut's mask, at the hands, elsewhere in
+the box, at moving pixels outside it, and elsewhere."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame, and what is known of it before its segmentation."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    lab: UInt8[np.ndarray, "h w 3"]
+    differs: Bool[np.ndarray, "h w"]
+    """Pixels that certainly differ from the known background."""
+    sampled: Float32[np.ndarray, "h w"] | None
+    """Log likelihood of the background from other frames; not a number where there are too few."""
+    strokes: Bool[np.ndarray, "h w"]
+    surroundings: Bool[np.ndarray, "h w"] | None
+    """Pixels that may show the detected hands or their arms; None if no hand was detected."""
+    arm: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class _State:
+    """Segmentation of one frame."""
+
+    probabilities: Float32[np.ndarray, "3 h w"]
+    inside: Bool[np.ndarray, "h w"]
+
+
+def segment(
+    images: UInt8[np.ndarray, "t h w 3"],
+    background: Background,
+    seed: Seed,
+    hands: Sequence[Sequence[Hand]],
+    samples: BackgroundSamples | None = None,
+) -> Masks:
+    """Masks of all frames from a box or a click on one.
+
+    Args:
+        hands: The hands of every frame.
+        samples: Colours of the background at each pixel, known from an earlier segmentation.
+
+    Raises:
+        ValueError: No object was found at the seed.
+    """
+
+    def frame(i: int) -> _Frame:
+        shape, found = images.shape[1:3], hands[i]
+        arm = arm_region(found, shape)
+        return _Frame(
+            images[i],
+            cv2.cvtColor(images[i], cv2.COLOR_RGB2LAB),
+            segmentation.opened(background.differs(images[i]), 1),
+            samples.log_likelihood(images[i], i) if samples else None,
+            hand_strokes(found, shape),
+            hand_surroundings(found, shape) | arm if found else None,
+            arm,
+        )
+
+    start = frame(seed.index)
+    first, colours = _segment_seed(start, background, seed, hand_colours(images, hands))
+    if first.inside.sum() < segmentation.MIN_PIXELS:
+        raise ValueError(f"shows no object in the box, or at the click, on frame {seed.index}")
+    labels = np.zeros(images.shape[:3], np.uint8)
+    confidence, uncertain = np.ones(len(images), np.float32), np.zeros(len(images), bool)
+    labels[seed.index] = _labels(start, first, background)
+    for order in (range(seed.index + 1, len(images)), range(seed.index - 1, -1, -1)):
+        frames = [frame(i) for i in order]
+        tracked = _track(start, frames, first, background, colours)
+        for i, each, (state, agreement, is_uncertain) in zip(order, frames, tracked, strict=True):
+            labels[i] = _labels(each, state, background)
+            confidence[i], uncertain[i] = agreement, is_uncertain
+    return Masks(labels, confidence, uncertain)
+
+
+def _segment_seed(
+    frame: _Frame, background: Background, seed: Seed, hand: Float32[np.ndarray, "8 32 32"]
+) -> tuple[_State, ColourModel]:
+    """Segmentation of the seed frame and the colours of the classes."""
+    static = segmentation.opened(background.same(frame.image), 1)
+    box = segmentation.box_mask(frame.differs.shape, seed.box or segmentation.box_around(seed.click, frame.differs))
+    at_hand = frame.strokes if frame.surroundings is None else frame.surroundings
+    trimap = np.where(box & ~static, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
+    trimap[box & at_hand] = cv2.GC_PR_BGD
+    trimap[box & frame.strokes] = cv2.GC_BGD
+    if seed.click is not None:
+        trimap[segmentation.disc_around(seed.click, box)] = cv2.GC_FGD
+    empty = np.zeros(frame.differs.shape, bool)
+    if not (trimap & 1).any() or (trimap & 1).all():
+        return _State(np.zeros((3, *empty.shape), np.float32), empty), ColourModel(hand, hand, hand)
+    rough = segmentation.main_components(segmentation.grabcut(frame.image, trimap, 5), box)
+    unlearnt = np.zeros_like(hand)
+    colours = ColourModel(unlearnt, hand, unlearnt).updated(
+        frame.lab,
+        object=rough & ~at_hand,
+        hand=empty,
+        background=~segmentation.dilated(box, 1) & ~frame.differs,
+        weight=SEED_WEIGHT,
+    )
+    regions = (rough, box & at_hand, box, frame.differs)
+    prior = np.empty((3, *empty.shape), np.float32)
+    prior[:] = np.array(SEED_PRIOR["rest"], np.float32)[:, None, None]
+    for name, region in reversed(list(zip(SEED_PRIOR, regions, strict=False))):
+        prior[:, region] = np.array(SEED_PRIOR[name], np.float32)[:, None]
+    state = _State(prior, rough)
+    for _ in range(SEED_ITERATIONS):
+        state = _segment_frame(frame, prior, state.inside | (box & ~static), box, background, colours)
+        certain = state.inside & (state.probabilities[OBJECT_CLASS] > CERTAIN)
+        colours = colours.updated(frame.lab, object=certain, hand=empty, background=empty, weight=SEED_WEIGHT / 2)
+    return state, colours
+
+
+def _track(
+    start: _Frame, frames: Iterable[_Frame], first: _State, background: Background, colours: ColourModel
+) -> Iterator[tuple[_State, float, bool]]:
+    """Segmentation of consecutive frames, its overlap with the prediction, and whether it is uncertain."""
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    state, area, gray = first, int(first.inside.sum()), cv2.cvtColor(start.image, cv2.COLOR_RGB2GRAY)
+    for frame in frames:
+        previous, gray = gray, cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        lost = not state.inside.any()
+        warped = segmentation.warped(dis, gray, previous, state.probabilities.transpose(1, 2, 0)).transpose(2, 0, 1)
+        if lost:
+            warped[OBJECT_CLASS] = segmentation.reappearance(frame.image, background, colours)
+        predicted = warped[OBJECT_CLASS] > 0.5
+        prior = _prior(warped, predicted)
+        state = _segment_frame(frame, prior, predicted, _filled(predicted), background, colours)
+        agreement, new_area = segmentation.overlap(predicted, state.inside), int(state.inside.sum())
+        if new_area < segmentation.MIN_PIXELS or agreement < segmentation.LOST_OVERLAP:
+            state, agreement = _State(_without_object(state.probabilities), np.zeros_like(predicted)), 0.0
+        else:
+            colours = _updated(colours, frame, state, predicted, background)
+        ratio = new_area / max(area, 1)
+        uncertain = (
+            lost
+            or agreement < segmentation.CERTAIN_OVERLAP
+            or not 1 / segmentation.MAX_AREA_RATIO < ratio < segmentation.MAX_AREA_RATIO
+        )
+        area = new_area
+        yield state, agreement, uncertain
+
+
+def _prior(warped: Float32[np.ndarray, "3 h w"], predicted: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "3 h w"]:
+    """Prior probabilities: the warped ones, blurred by the uncertainty of the flow."""
+    radius = segmentation.search_radius(predicted)
+    blurred = np.stack([cv2.GaussianBlur(each, (0, 0), radius / 2) for each in warped])
+    prior = (0.5 * (warped + blurred)).clip(MIN_PROBABILITY, 1 - 2 * MIN_PROBABILITY)
+    far = ~segmentation.dilated(predicted, radius)
+    prior[OBJECT_CLASS, far] = MAX_DISTANT_PROBABILITY
+    prior[HAND_CLASS, far] = np.maximum(prior[HAND_CLASS, far], MIN_HAND_ELSEWHERE)
+    return prior / prior.sum(0)
+
+
+def _segment_frame(
+    frame: _Frame,
+    prior: Float32[np.ndarray, "3 h w"],
+    predicted: Bool[np.ndarray, "h w"],
+    expected: Bool[np.ndarray, "h w"],
+    background: Background,
+    colours: ColourModel,
+) -> _State:
+    """Segmentation of a frame.
+
+    Args:
+        predicted: The object, as predicted.
+        expected: Where the object is expected; away from the landmarks, a colour in it does not tell a hand: it is the
+            object's print.
+    """
+    log_ratio = log_likelihoods(frame.image, background, colours, frame.sampled)
+    if frame.surroundings is not None:
+        far = expected & ~frame.surroundings
+        log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)
+    log_ratio = np.maximum(log_ratio, log_ratio.max(0) - MAX_LOG_RATIO)
+    hidden = log_ratio[OBJECT_CLASS] - log_ratio[HAND_CLASS] > MAX_OBJECT_LOG_RATIO
+    log_ratio[HAND_CLASS, frame.strokes & ~hidden] += STROKE_LOG_ODDS
+    inner = segmentation.eroded(predicted, segmentation.search_radius(predicted))
+    log_ratio[HAND_CLASS, frame.arm & ~inner] += ARM_LOG_ODDS
+    probabilities = class_probabilities(log_ratio + np.log(prior), frame.image)
+    inside = _connected(probabilities.argmax(0) == OBJECT_CLASS, predicted)
+    return _State(np.where(inside, probabilities, _without_object(probabilities)), inside)
+
+
+def _connected(mask: Bool[np.ndarray, "h w"], predicted: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The main components; besides the largest, none that touches the border of the image, as arms and walls do."""
+    mask = segmentation.main_components(mask, predicted)
+    count, ids = segmentation.components(mask)
+    sizes = np.bincount(ids.ravel(), minlength=count)
+    sizes[0] = 0
+    at_border = np.unique(np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]]))
+    return mask & ~np.isin(ids, at_border[at_border != sizes.argmax()])
+
+
+def _without_object(probabilities: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]:
+    """Probabilities of pixels that are not the object."""
+    others = probabilities.copy()
+    others[OBJECT_CLASS] = np.minimum(others[OBJECT_CLASS], 0.2)
+    return others / others.sum(0)
+
+
+def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The mask without holes, except large ones: those inside a handle are smaller than a print."""
+    _, ids, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    return mask | (stats[:, cv2.CC_STAT_AREA] <= MAX_HOLE_FRACTION * mask.sum())[ids]
+
+
+def _updated(
+    colours: ColourModel, frame: _Frame, state: _State, predicted: Bool[np.ndarray, "h w"], background: Background
+) -> ColourModel:
+    """The colours after a frame."""
+    certain = state.probabilities > CERTAIN
+    around = ~segmentation.dilated(state.inside, 2)
+    inside = state.inside & segmentation.eroded(predicted, 1) & frame.differs & ~frame.strokes
+    nowhere = np.zeros_like(predicted)
+    colours = colours.updated(
+        frame.lab, object=inside & certain[OBJECT_CLASS], hand=nowhere, background=around & certain[BACKGROUND_CLASS]
+    )
+    hand = certain[HAND_CLASS] & around & (frame.differs | ~background.known)
+    return colours.updated(frame.lab, object=nowhere, hand=hand, background=nowhere, weight=HAND_LEARNING_RATE)
+
+
+def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
+    """Three-valued mask. What moves is unknown, and so is a pixel of unknown background near the object."""
+    near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
+    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & ~background.known)
+    return segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
