@@ -2,12 +2,14 @@
 
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.films import Scene, scene
 from tumble.preprocess import held_object
 from tumble.preprocess.background import estimate_background
+from tumble.preprocess.colour_model import UNIFORM_DENSITY, hand_colours
 from tumble.preprocess.hands import Hand
 from tumble.preprocess.segmentation import Masks, Seed, overlap
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
@@ -59,6 +61,38 @@ def test_a_print_in_the_colour_of_the_hand_is_object() -> None:
     printed = (np.abs(video.pictures.astype(int) - PRINT).max(-1) < 8) & video.object
     assert printed.sum() > 100 * len(printed)
     assert (masks.labels[printed] == OBJECT).mean() > 0.9
+
+
+def test_what_a_hand_had_hidden_is_object_again() -> None:
+    """A second hand covers three quarters of the object for some frames."""
+    video, covered = scene(), slice(6, 11)
+    pictures, truth, hands = video.pictures.copy(), video.object.copy(), [[] for _ in video.pictures]
+    columns = np.nonzero(video.object[6].any(0))[0]
+    edge = int(columns[0] + 0.25 * (columns[-1] - columns[0]))
+    pictures[covered, :, edge:] = (205, 150, 120)
+    truth[covered, :, edge:] = False
+    palm = landmarks(0).landmarks * 1.4
+    palm += (edge + 6, 20) - palm.min(0)
+    hands[covered] = [[Hand(palm.astype(np.float32), 1.0, 1.0)] for _ in hands[covered]]
+    background = estimate_background(video.pictures, video.object)
+    masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
+    pairs = list(zip(masks.labels, truth, strict=True))[covered.stop :]
+    assert min(overlap(labels == OBJECT, inside & (labels != UNKNOWN)) for labels, inside in pairs) > 0.9
+    assert np.mean([(labels[inside] == OBJECT).mean() for labels, inside in pairs[-4:]]) > 0.8
+
+
+def test_a_sleeve_has_the_colours_of_the_hand() -> None:
+    """It moves at the border of the image, below the hand."""
+    video, sleeve = scene(hand=True), (30, 60, 160)
+    pictures = video.pictures.copy()
+    for i, picture in enumerate(pictures):
+        left = 50 + 6 * (i % 5)
+        picture[-14:, left : left + 50] = sleeve
+    hands = [[landmarks(i)] for i in range(len(pictures))]
+    background = estimate_background(pictures, video.object | video.hand)
+    density = hand_colours(pictures, hands, background)
+    lab = cv2.cvtColor(np.array([[sleeve]], np.uint8), cv2.COLOR_RGB2LAB)[0, 0]
+    assert density[lab[0] >> 5, lab[1] >> 3, lab[2] >> 3] > 100 * UNIFORM_DENSITY
 
 
 def test_an_object_that_leaves_is_not_found() -> None:

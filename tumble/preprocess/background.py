@@ -4,6 +4,7 @@ The camera is on a tripod, so a pixel that nothing covers keeps its radiance, an
 one *gain* per frame and colour channel, in linear light, relative to the median frame.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -36,7 +37,6 @@ UNCLIPPED = (25, 235)
 """Range of the code values from which gains are estimated: neither noise nor clipped."""
 MIN_USABLE_FRACTION = 0.01
 """Minimum fraction of usable pixels of an image; with fewer, the gain is not estimated."""
-
 N_BACKGROUND_SAMPLES = 30
 """Number of frames from which colours of the background are sampled."""
 SAMPLE_MARGIN = 4
@@ -49,6 +49,8 @@ MIN_AGREEING_SAMPLES = 1.2
 """Minimum number of samples of a colour that count, weighted by similarity."""
 SAMPLE_NOVELTY = 0.02
 """Probability that a pixel of the background has a colour of none of its samples."""
+NO_SAMPLE_LOG_LIKELIHOOD = math.log(2 * SAMPLE_NOVELTY * 256.0**-3)
+"""Log likelihood of the background below which a colour is more likely to be new than one of the samples."""
 
 
 @dataclass(frozen=True)

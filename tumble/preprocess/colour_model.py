@@ -51,6 +51,10 @@ SEED_WEIGHT = 0.7
 """Weight of the seed frame in a histogram."""
 MIN_PIXELS = 30
 """Minimum number of pixels of a class in a frame; fewer do not update its histogram."""
+BORDER_WIDTH = 0.04
+"""Width of the border of the image at which arms are expected, as a fraction of its longer side."""
+MIN_ARM_PIXELS = 500
+"""Minimum number of pixels in all frames from which the colours of arms are learnt."""
 SKIN_YCRCB = (40, 138, 85), (255, 175, 125)
 """Lower and upper limit of Y, Cr, Cb of skin of all tones; wider than skin, because hands are searched for with it."""
 RIM_WIDTH = 2
@@ -188,25 +192,36 @@ def class_probabilities(
 
 
 def hand_colours(
-    images: UInt8[np.ndarray, "t h w 3"], hands: Sequence[Sequence[Hand]]
+    images: UInt8[np.ndarray, "t h w 3"], hands: Sequence[Sequence[Hand]], background: Background
 ) -> Float32[np.ndarray, "8 32 32"]:
-    """Density of the hands' colours, from their landmarks in all frames.
+    """Density of the colours of hands, arms and sleeves in all frames.
 
-    Some landmarks are hidden by the object, so half the density of the colours around the hands is subtracted.
+    The mean of three densities: of the hands' landmarks; of what moves behind the wrists; of what moves at the border
+    of the image, which an arm reaches and an object that is shown does not. Some landmarks are hidden by the object, so
+    half the density of the colours around the hands is subtracted from theirs.
     """
-    at_hand, around, shape = [], [], images.shape[1:3]
+    shape = images.shape[1:3]
+    width = round(BORDER_WIDTH * max(shape))
+    border = np.ones(shape, bool)
+    border[width:-width, width:-width] = False
+    skin, around, arms, at_border = [], [], [], []
     for image, found in zip(images, hands, strict=True):
+        lab, moving = cv2.cvtColor(image, cv2.COLOR_RGB2LAB), background.differs(image)
+        at_border.append(lab[border & (cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))) > 0)])
         if found:
-            lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-            at_hand.append(lab[hand_strokes(found, shape)])
-            beyond = hand_region(found, shape) & ~hand_surroundings(found, shape) & ~arm_region(found, shape)
-            around.append(lab[beyond])
-    if not at_hand:
+            skin.append(lab[hand_strokes(found, shape)])
+            arm, close = arm_region(found, shape), hand_surroundings(found, shape)
+            around.append(lab[hand_region(found, shape) & ~close & ~arm])
+            arms.append(lab[arm & ~close & moving])
+    if not skin:
         return _skin_density()
-    density, others = _density(np.concatenate(at_hand)), np.concatenate(around)
+    density, others = _density(np.concatenate(skin)), np.concatenate(around)
     if len(others):
         density = np.maximum(density - _density(others) / 2, 0)
-    return (density / (density.sum() * np.float32(BIN_VOLUME))).astype(np.float32)
+        density /= density.sum() * np.float32(BIN_VOLUME)
+    moving = (np.concatenate(each) for each in (arms, at_border))
+    densities = [density, *(_density(lab) for lab in moving if len(lab) >= MIN_ARM_PIXELS)]
+    return np.stack(densities).mean(0)
 
 
 def trim_rim(

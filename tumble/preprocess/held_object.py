@@ -2,12 +2,13 @@
 
 Every pixel has the probabilities of three classes: object, hand (with arm, sleeve and body) and background. From the
 seed frame they are propagated forwards and backwards by optical flow (DIS); in each frame they are the prior, the
-colours and the static background give the likelihood, and the landmarks say where a hand is. The hand's colours are
-learnt from the landmarks of the whole video, without those that surround the hands; the object's on the seed frame, and
-later only from pixels that certainly differ from the background, so that a wrong mask does not reinforce itself.
+colours and the static background give the likelihood, and the landmarks say where a hand is. The colours of hands, arms
+and sleeves are learnt once, from the whole video; the object's on the seed frame, and later only from pixels that
+certainly differ from the background, so that a wrong mask does not reinforce itself. Foreground that no hand covers and
+that does not reach the border of the image is likely to be the object, so parts of it that a hand had hidden return.
 
 Limits: a sleeve of the object's colours that touches the object is segmented as object; what the shape of the object
-contradicts is removed when that is known (`silhouette_prior`).
+contradicts is removed when that is known (`tumble.poses.mask_refinement`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from tumble.preprocess import segmentation
-from tumble.preprocess.background import Background, BackgroundSamples
+from tumble.preprocess.background import NO_SAMPLE_LOG_LIKELIHOOD, Background, BackgroundSamples
 from tumble.preprocess.colour_model import (
     BACKGROUND_CLASS,
     HAND_CLASS,
@@ -50,10 +51,15 @@ MIN_HAND_ELSEWHERE = 0.1
 """Lower limit of the prior probability of a hand there: an arm or a body may appear."""
 CERTAIN = 0.9
 """Probability of a class above which a pixel's colour is learnt."""
-HAND_LEARNING_RATE = 0.02
-"""Weight of a new frame in the hand's colours, which the landmarks of the whole video have given already."""
+ISLAND_PROBABILITY = 0.6
+"""Prior probability of the object in an island of the foreground, unless the prediction is higher."""
+MIN_ISLAND_LOG_RATIO = 1.0
+"""Minimum mean log likelihood ratio of object to hand in an island away from the predicted object, and of a pixel that
+belongs to an island where no hand was detected."""
+MAX_ISLAND_LOG_RATIO = 4.0
+"""Limit of the log likelihood ratios that are averaged over an island."""
 MAX_HOLE_FRACTION = 0.3
-"""Maximum area of a hole in the predicted object that counts as part of it, as a fraction of the object's."""
+"""Maximum area of a hole in the predicted object that is expected to be its print, as a fraction of the object's."""
 SEED_ITERATIONS = 2
 """Number of times that the colours and the mask of the seed frame are estimated in turn."""
 SEED_PRIOR = {
@@ -77,6 +83,10 @@ class _Frame:
     """Pixels that certainly differ from the known background."""
     sampled: Float32[np.ndarray, "h w"] | None
     """Log likelihood of the background from other frames; not a number where there are too few."""
+    foreground: Bool[np.ndarray, "h w"]
+    """Pixels that differ from the known background or, where it is unknown, from its samples."""
+    known: Bool[np.ndarray, "h w"]
+    """Pixels whose background is known, or sampled."""
     strokes: Bool[np.ndarray, "h w"]
     surroundings: Bool[np.ndarray, "h w"] | None
     """Pixels that may show the detected hands or their arms; None if no hand was detected."""
@@ -111,29 +121,35 @@ def segment(
     def frame(i: int) -> _Frame:
         shape, found = images.shape[1:3], hands[i]
         arm = arm_region(found, shape)
+        differs = segmentation.opened(background.differs(images[i]), 1)
+        sampled = samples.log_likelihood(images[i], i) if samples else None
+        foreground, known = differs, background.known
+        if sampled is not None:
+            foreground = differs | (~known & (sampled < NO_SAMPLE_LOG_LIKELIHOOD))
+            known = known | ~np.isnan(sampled)
         return _Frame(
             images[i],
             cv2.cvtColor(images[i], cv2.COLOR_RGB2LAB),
-            segmentation.opened(background.differs(images[i]), 1),
-            samples.log_likelihood(images[i], i) if samples else None,
+            differs,
+            sampled,
+            foreground,
+            known,
             hand_strokes(found, shape),
             hand_surroundings(found, shape) | arm if found else None,
             arm,
         )
 
     start = frame(seed.index)
-    first, colours = _segment_seed(start, background, seed, hand_colours(images, hands))
+    first, colours = _segment_seed(start, background, seed, hand_colours(images, hands, background))
     if first.inside.sum() < segmentation.MIN_PIXELS:
         raise ValueError(f"shows no object in the box, or at the click, on frame {seed.index}")
     labels = np.zeros(images.shape[:3], np.uint8)
     confidence, uncertain = np.ones(len(images), np.float32), np.zeros(len(images), bool)
     labels[seed.index] = _labels(start, first, background)
     for order in (range(seed.index + 1, len(images)), range(seed.index - 1, -1, -1)):
-        frames = [frame(i) for i in order]
-        tracked = _track(start, frames, first, background, colours)
-        for i, each, (state, agreement, is_uncertain) in zip(order, frames, tracked, strict=True):
-            labels[i] = _labels(each, state, background)
-            confidence[i], uncertain[i] = agreement, is_uncertain
+        tracked = _track(start, map(frame, order), first, background, colours)
+        for i, each in zip(order, tracked, strict=True):
+            labels[i], confidence[i], uncertain[i] = each
     return Masks(labels, confidence, uncertain)
 
 
@@ -176,36 +192,32 @@ def _segment_seed(
 
 def _track(
     start: _Frame, frames: Iterable[_Frame], first: _State, background: Background, colours: ColourModel
-) -> Iterator[tuple[_State, float, bool]]:
-    """Segmentation of consecutive frames, its overlap with the prediction, and whether it is uncertain."""
+) -> Iterator[tuple[UInt8[np.ndarray, "h w"], float, bool]]:
+    """Mask of consecutive frames, its overlap with the prediction, and whether it is uncertain."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     state, area, gray = first, int(first.inside.sum()), cv2.cvtColor(start.image, cv2.COLOR_RGB2GRAY)
     for frame in frames:
         previous, gray = gray, cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         lost = not state.inside.any()
         warped = segmentation.warped(dis, gray, previous, state.probabilities.transpose(1, 2, 0)).transpose(2, 0, 1)
-        if lost:
-            warped[OBJECT_CLASS] = segmentation.reappearance(frame.image, background, colours)
-        predicted = warped[OBJECT_CLASS] > 0.5
-        prior = _prior(warped, predicted)
+        prior = _prior(warped)
+        islands = _islands(frame, warped[OBJECT_CLASS] > 0.5, background, colours)
+        prior = _raised(prior, islands & (prior[OBJECT_CLASS] < ISLAND_PROBABILITY))
+        predicted = prior[OBJECT_CLASS] > 0.5
         state = _segment_frame(frame, prior, predicted, _filled(predicted), background, colours)
         agreement, new_area = segmentation.overlap(predicted, state.inside), int(state.inside.sum())
-        if new_area < segmentation.MIN_PIXELS or agreement < segmentation.LOST_OVERLAP:
+        if segmentation.is_lost(agreement, new_area):
             state, agreement = _State(_without_object(state.probabilities), np.zeros_like(predicted)), 0.0
         else:
-            colours = _updated(colours, frame, state, predicted, background)
-        ratio = new_area / max(area, 1)
-        uncertain = (
-            lost
-            or agreement < segmentation.CERTAIN_OVERLAP
-            or not 1 / segmentation.MAX_AREA_RATIO < ratio < segmentation.MAX_AREA_RATIO
-        )
+            colours = _updated(colours, frame, state, predicted)
+        uncertain = lost or segmentation.is_uncertain(agreement, area, new_area)
         area = new_area
-        yield state, agreement, uncertain
+        yield _labels(frame, state, background), agreement, uncertain
 
 
-def _prior(warped: Float32[np.ndarray, "3 h w"], predicted: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "3 h w"]:
+def _prior(warped: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]:
     """Prior probabilities: the warped ones, blurred by the uncertainty of the flow."""
+    predicted = warped[OBJECT_CLASS] > 0.5
     radius = segmentation.search_radius(predicted)
     blurred = np.stack([cv2.GaussianBlur(each, (0, 0), radius / 2) for each in warped])
     prior = (0.5 * (warped + blurred)).clip(MIN_PROBABILITY, 1 - 2 * MIN_PROBABILITY)
@@ -213,6 +225,38 @@ def _prior(warped: Float32[np.ndarray, "3 h w"], predicted: Bool[np.ndarray, "h 
     prior[OBJECT_CLASS, far] = MAX_DISTANT_PROBABILITY
     prior[HAND_CLASS, far] = np.maximum(prior[HAND_CLASS, far], MIN_HAND_ELSEWHERE)
     return prior / prior.sum(0)
+
+
+def _islands(
+    frame: _Frame, predicted: Bool[np.ndarray, "h w"], background: Background, colours: ColourModel
+) -> Bool[np.ndarray, "h w"]:
+    """Connected parts of the foreground that are likely to show the object.
+
+    No hand covers them, and they do not reach the border of the image, as arms do. They are near the predicted object,
+    or they have its colours and are next to a hand; any place will do if the object was not predicted anywhere.
+    """
+    log_object, log_hand, _ = log_likelihoods(frame.image, background, colours, frame.sampled)
+    log_ratio = cv2.blur((log_object - log_hand).clip(-MAX_ISLAND_LOG_RATIO, MAX_ISLAND_LOG_RATIO), (3, 3))
+    hand = log_ratio < MIN_ISLAND_LOG_RATIO if frame.surroundings is None else frame.surroundings
+    count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
+    size = np.bincount(ids.ravel(), minlength=count)
+    mean = np.bincount(ids.ravel(), log_ratio.ravel(), minlength=count) / np.maximum(size, 1)
+    radius = segmentation.search_radius(predicted)
+    near = _touches(ids, count, segmentation.dilated(predicted, 2 * radius))
+    place = np.ones_like(predicted)
+    if predicted.any():
+        place = predicted if frame.surroundings is None else segmentation.dilated(frame.surroundings, radius)
+    coloured = (mean > MIN_ISLAND_LOG_RATIO) & _touches(ids, count, place)
+    chosen = (size >= segmentation.MIN_PIXELS) & ((near & (mean > 0)) | coloured) & ~_at_border(ids, count)
+    chosen[0] = False
+    return chosen[ids]
+
+
+def _raised(prior: Float32[np.ndarray, "3 h w"], where: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "3 h w"]:
+    """Prior probabilities with that of an island where one is."""
+    others = prior * ((1 - ISLAND_PROBABILITY) / np.maximum(1 - prior[OBJECT_CLASS], MIN_PROBABILITY))
+    others[OBJECT_CLASS] = ISLAND_PROBABILITY
+    return np.where(where, others, prior)
 
 
 def _segment_frame(
@@ -245,13 +289,28 @@ def _segment_frame(
 
 
 def _connected(mask: Bool[np.ndarray, "h w"], predicted: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The main components; besides the largest, none that touches the border of the image, as arms and walls do."""
+    """The main components without those at the border of the image, which are arms and walls.
+
+    Only the one that overlaps the prediction most may reach the border, if it was predicted for the most part.
+    """
     mask = segmentation.main_components(mask, predicted)
     count, ids = segmentation.components(mask)
-    sizes = np.bincount(ids.ravel(), minlength=count)
-    sizes[0] = 0
-    at_border = np.unique(np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]]))
-    return mask & ~np.isin(ids, at_border[at_border != sizes.argmax()])
+    size, hit = np.bincount(ids.ravel(), minlength=count), np.bincount(ids[predicted], minlength=count)
+    hit[0] = 0
+    main = (hit == hit.max()) & (hit >= 0.5 * size)
+    return mask & (main | ~_at_border(ids, count))[ids]
+
+
+def _touches(ids: np.ndarray, count: int, where: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, " n"]:
+    """Whether each labelled component has pixels in a region."""
+    return np.bincount(ids[where], minlength=count) > 0
+
+
+def _at_border(ids: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
+    """Whether each labelled component touches the border of the image."""
+    border = np.ones(ids.shape, bool)
+    border[1:-1, 1:-1] = False
+    return _touches(ids, count, border)
 
 
 def _without_object(probabilities: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]:
@@ -262,28 +321,25 @@ def _without_object(probabilities: Float32[np.ndarray, "3 h w"]) -> Float32[np.n
 
 
 def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The mask without holes, except large ones: those inside a handle are smaller than a print."""
+    """The mask without holes, except those too large for a print that was taken for something else."""
     _, ids, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     return mask | (stats[:, cv2.CC_STAT_AREA] <= MAX_HOLE_FRACTION * mask.sum())[ids]
 
 
-def _updated(
-    colours: ColourModel, frame: _Frame, state: _State, predicted: Bool[np.ndarray, "h w"], background: Background
-) -> ColourModel:
-    """The colours after a frame."""
+def _updated(colours: ColourModel, frame: _Frame, state: _State, predicted: Bool[np.ndarray, "h w"]) -> ColourModel:
+    """The colours after a frame; those of the hand stay."""
     certain = state.probabilities > CERTAIN
-    around = ~segmentation.dilated(state.inside, 2)
     inside = state.inside & segmentation.eroded(predicted, 1) & frame.differs & ~frame.strokes
-    nowhere = np.zeros_like(predicted)
-    colours = colours.updated(
-        frame.lab, object=inside & certain[OBJECT_CLASS], hand=nowhere, background=around & certain[BACKGROUND_CLASS]
+    return colours.updated(
+        frame.lab,
+        object=inside & certain[OBJECT_CLASS],
+        hand=np.zeros_like(predicted),
+        background=~segmentation.dilated(state.inside, 2) & certain[BACKGROUND_CLASS],
     )
-    hand = certain[HAND_CLASS] & around & (frame.differs | ~background.known)
-    return colours.updated(frame.lab, object=nowhere, hand=hand, background=nowhere, weight=HAND_LEARNING_RATE)
 
 
 def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
     """Three-valued mask. What moves is unknown, and so is a pixel of unknown background near the object."""
     near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
-    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & ~background.known)
+    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & ~frame.known)
     return segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)

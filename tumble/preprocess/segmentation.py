@@ -214,6 +214,16 @@ def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
     return float(iou(torch.from_numpy(a), torch.from_numpy(b)))
 
 
+def is_lost(agreement: float, area: int) -> bool:
+    """Whether the object counts as hidden in a frame, from the overlap of its mask with the prediction and its area."""
+    return area < MIN_PIXELS or agreement < LOST_OVERLAP
+
+
+def is_uncertain(agreement: float, old_area: int, new_area: int) -> bool:
+    """Whether the mask of a frame should be checked by eye, from its overlap and the areas of the last two masks."""
+    return agreement < CERTAIN_OVERLAP or not 1 / MAX_AREA_RATIO < new_area / max(old_area, 1) < MAX_AREA_RATIO
+
+
 # One frame ------------------------------------------------------------------------------------------------------------
 
 
@@ -267,7 +277,7 @@ def _track(
         predicted = probability > 0.5
         current = _segment_frame(images[i], _spread_prior(probability), predicted, background, colours)
         agreement, new_area = overlap(predicted, current.inside), int(current.inside.sum())
-        if new_area < MIN_PIXELS or agreement < LOST_OVERLAP:
+        if is_lost(agreement, new_area):
             empty = np.zeros(predicted.shape, bool)
             current, agreement = _Segmentation(empty, current.unknown | current.inside, empty.astype(np.float32)), 0.0
         else:
@@ -276,9 +286,7 @@ def _track(
             # Only pixels that certainly differ from the background, so that a wrong mask does not reinforce itself.
             certain = current.inside & background.differs(images[i])
             colours = colours.updated(lab, object=certain, hand=_empty_like(predicted), background=outside)
-        uncertain = (
-            lost or agreement < CERTAIN_OVERLAP or not 1 / MAX_AREA_RATIO < new_area / max(area, 1) < MAX_AREA_RATIO
-        )
+        uncertain = lost or is_uncertain(agreement, area, new_area)
         area = new_area
         yield i, current, agreement, uncertain
 

@@ -1,0 +1,155 @@
+"""Masks and poses of synthetic films in which a hand holds the object, against the truth.
+
+`python -m benchmarks.held CAPTURE... [--until masks|poses] [--draw FOLDER]` takes captures of `tumble synth --hand
+--film`, reads their film as `tumble run` does, with the box and the focal length of `film.json`, and writes
+`benchmarks/held.json` and the table `benchmarks/held.md`. Truth is used for the scores only. Masks are scored where the
+truth is certain: a pixel is object or hand if nine tenths of it are.
+"""
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+import tumble
+from benchmarks.kernels import machine
+from benchmarks.poses import pose_scores
+from tumble.io import files
+from tumble.preprocess import FootageOptions
+from tumble.preprocess.survey import Survey, survey_footage
+from tumble.preprocess.video_to_capture import capture_from_video
+from tumble.scene import BACKGROUND, OBJECT, Trajectory
+
+COMMAND = "python -m benchmarks.held CAPTURE..."
+CERTAIN = 0.9
+"""Fraction of a pixel that is object, or hand, above which the truth counts as certain."""
+DRAWN = 20
+"""Frames per contact sheet."""
+Row = dict[str, Any]
+SCORES = {
+    "iou_median": "mask IoU, median",
+    "iou_worst_tenth": "worst tenth",
+    "hand_percent": "hand in the mask [%]",
+    "unknown_percent": "object unknown [%]",
+    "survey_seconds": "time [s]",
+    "posed_percent": "posed [%]",
+    "rotation_median_degrees": "rotation, median [deg]",
+    "rotation_below_10_percent": "< 10 deg [%]",
+    "claimed_degrees": "estimated [deg]",
+    "verdict": "rating",
+    "pose_seconds": "time [s]",
+}
+"""Column titles by the key of a row."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--until", choices=["masks", "poses"], default="poses")
+    parser.add_argument("--draw", type=Path, help="folder of the contact sheets of the masks")
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    arguments = parser.parse_args()
+    rows: list[Row] = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
+    for path in arguments.captures:
+        row = measure(path, arguments.until, arguments.draw)
+        rows = [each for each in rows if each["name"] != row["name"]] + [row]
+        print(line(row), flush=True)
+        if arguments.until == "poses":
+            files.write_json(arguments.out, {"command": COMMAND, "machine": machine(), "rows": rows})
+
+
+def measure(path: Path, until: str, draw: Path | None) -> Row:
+    """A row of figures for a capture with a film."""
+    film = json.loads((path / "film.json").read_text())
+    options = FootageOptions(box=tuple(film["box"]), at=film["frame"], focal=film["focal"])
+    started = time.perf_counter()
+    survey = survey_footage(path / "film.mp4", options)
+    row: Row = {"name": path.name, **mask_scores(survey, path), "survey_seconds": round(time.perf_counter() - started)}
+    if draw:
+        draw.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(draw / f"{path.name}.png"), contact_sheet(survey, path)[..., ::-1])
+    return row if until == "masks" else row | poses(path, options)
+
+
+def poses(path: Path, options: FootageOptions) -> Row:
+    """Scores of the poses of the capture made from the film."""
+    with TemporaryDirectory() as folder:
+        capture = tumble.read_capture(capture_from_video(path / "film.mp4", Path(folder) / "capture", options))
+        numbers = json.loads((Path(folder) / "capture" / "ingest.json").read_text())["frames"]
+    started = time.perf_counter()
+    result = tumble.estimate_poses(capture)
+    truth = true_trajectory(path, [each["source_frame"] for each in numbers])
+    kept = (~result.quality.lost).nonzero()[:, 0]
+    scores = pose_scores(result.trajectory.select(kept), truth.select(kept)) if len(kept) > 2 else {}
+    return {
+        "frames": len(capture),
+        "posed_percent": round(100 * len(kept) / len(capture)),
+        **{name: round(value, 2) for name, value in scores.items()},
+        "claimed_degrees": round(math.degrees(result.quality.uncertainty), 2),
+        "verdict": result.quality.rating,
+        "sentence": result.quality.sentence,
+        "pose_seconds": round(time.perf_counter() - started),
+    }
+
+
+def true_trajectory(path: Path, numbers: list[int]) -> Trajectory:
+    """True poses of some frames of the film."""
+    return tumble.read_capture(path).trajectory.select(torch.tensor(numbers))
+
+
+def mask_scores(survey: Survey, path: Path) -> dict[str, float]:
+    """Scores of the masks over all frames; the band of unknown pixels along the silhouette counts as neither."""
+    overlaps, hands, unknown = [], 0, []
+    pixels = 0
+    for i, labels in zip(survey.numbers, survey.masks.labels, strict=True):
+        there, hand = (true_mask(path, kind, int(i), labels.shape) for kind in ("object", "hand"))
+        inside, decided = labels == OBJECT, (labels == OBJECT) | (labels == BACKGROUND)
+        certain = decided & ((there > CERTAIN) | (there < 1 - CERTAIN))
+        union = certain & (inside | (there > CERTAIN))
+        overlaps.append((certain & inside & (there > CERTAIN)).sum() / max(union.sum(), 1))
+        hands += int((inside & (hand > CERTAIN)).sum())
+        pixels += int(inside.sum())
+        unknown.append((~decided & (there > CERTAIN)).sum() / max((there > CERTAIN).sum(), 1))
+    return {
+        "iou_median": round(float(np.median(overlaps)), 3),
+        "iou_worst_tenth": round(float(np.quantile(overlaps, 0.1)), 3),
+        "hand_percent": round(100 * hands / max(pixels, 1), 2),
+        "unknown_percent": round(100 * float(np.mean(unknown)), 1),
+    }
+
+
+def true_mask(path: Path, kind: str, number: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Fraction of every pixel that shows the object or the hand."""
+    mask = files.read_image(path / "truth" / f"film_{kind}_mask" / f"{number:04d}.png")[..., 0]
+    return cv2.resize(mask.astype(np.float32) / 255, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+
+
+def contact_sheet(survey: Survey, path: Path) -> np.ndarray:
+    """Frames with the object green, unknown pixels red, and the true outline of the object white."""
+    tiles = []
+    for i in np.linspace(0, len(survey.images) - 1, DRAWN).round().astype(int):
+        image, labels = survey.images[i].copy(), survey.masks.labels[i]
+        for value, colour in ((OBJECT, (0, 255, 0)), (128, (255, 0, 0))):
+            where = labels == value
+            image[where] = (0.6 * image[where] + 0.4 * np.array(colour)).astype(np.uint8)
+        truth = (true_mask(path, "object", int(survey.numbers[i]), labels.shape) > 0.5).astype(np.uint8)
+        outline, _ = cv2.findContours(truth, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        tiles.append(cv2.drawContours(image, outline, -1, (255, 255, 255), 1))
+        cv2.putText(tiles[-1], f"{survey.numbers[i]}", (4, 14), 0, 0.5, (255, 255, 0), 1)
+    return np.concatenate([np.concatenate(tiles[k : k + 5], 1) for k in range(0, DRAWN, 5)])
+
+
+def line(row: Row) -> str:
+    """A row as a line of a Markdown table."""
+    return "| " + " | ".join(str(row.get(name, "")) for name in ("name", *SCORES)) + " |"
+
+
+if __name__ == "__main__":
+    main()
