@@ -22,9 +22,7 @@ import tumble
 from benchmarks.kernels import machine
 from benchmarks.poses import pose_scores
 from tumble.io import files
-from tumble.preprocess import FootageOptions
-from tumble.preprocess.survey import Survey, survey_footage
-from tumble.preprocess.video_to_capture import capture_from_video
+from tumble.preprocess import FootageOptions, Survey, survey_footage
 from tumble.scene import BACKGROUND, OBJECT, Trajectory
 
 COMMAND = "python -m benchmarks.held CAPTURE..."
@@ -81,7 +79,7 @@ def measure(path: Path, until: str, draw: Path | None) -> Row:
 def poses(path: Path, options: FootageOptions) -> Row:
     """Scores of the poses of the capture made from the film."""
     with TemporaryDirectory() as folder:
-        capture = tumble.read_capture(capture_from_video(path / "film.mp4", Path(folder) / "capture", options))
+        capture = tumble.read_capture(tumble.video_to_capture(path / "film.mp4", Path(folder) / "capture", options))
         numbers = json.loads((Path(folder) / "capture" / "ingest.json").read_text())["frames"]
     started = time.perf_counter()
     result = tumble.estimate_poses(capture)
@@ -101,7 +99,9 @@ def poses(path: Path, options: FootageOptions) -> Row:
 
 def true_trajectory(path: Path, numbers: list[int]) -> Trajectory:
     """True poses of some frames of the film."""
-    return tumble.read_capture(path).trajectory.select(torch.tensor(numbers))
+    trajectory = tumble.read_capture(path).trajectory
+    assert trajectory is not None, "the capture has poses"
+    return trajectory.select(torch.tensor(numbers))
 
 
 def mask_scores(survey: Survey, path: Path) -> dict[str, float]:

@@ -78,7 +78,7 @@ def test_what_a_hand_had_hidden_is_object_again() -> None:
     masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
     pairs = list(zip(masks.labels, truth, strict=True))[covered.stop :]
     assert min(overlap(labels == OBJECT, inside & (labels != UNKNOWN)) for labels, inside in pairs) > 0.9
-    assert np.mean([(labels[inside] == OBJECT).mean() for labels, inside in pairs[-4:]]) > 0.8
+    assert np.mean([(labels[inside] == OBJECT).mean() for labels, inside in pairs[-4:]]) > 0.7
 
 
 def test_a_sleeve_has_the_colours_of_the_hand() -> None:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tumble.preprocess.footage import PROVENANCE, read_provenance
     from tumble.preprocess.options import FootageOptions
     from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
+    from tumble.preprocess.survey import Survey, survey_footage
     from tumble.preprocess.video_to_capture import PREVIEW, footage_fingerprint
 
 __all__ = [
@@ -20,12 +21,14 @@ __all__ = [
     "FootageOptions",
     "PREVIEW",
     "PROVENANCE",
+    "Survey",
     "check_footage",
     "passes",
     "input_kind",
     "footage_fingerprint",
     "pick_box",
     "read_provenance",
+    "survey_footage",
     "to_capture",
 ]
 
@@ -36,6 +39,7 @@ __getattr__ = lazy_getattr(
         "check": ("check_footage", "passes"),
         "options": ("FootageOptions",),
         "source": ("FOOTAGE", "input_kind", "to_capture"),
+        "survey": ("Survey", "survey_footage"),
         "footage": ("PROVENANCE", "read_provenance"),
         "video_to_capture": ("PREVIEW", "footage_fingerprint"),
     },
