@@ -127,6 +127,9 @@ def test_the_extension_of_a_turntable_video_is_its_format(command: Callable[...,
         error = command("relight", "--turntable", tmp_path / name)
         assert f"has the extension '{Path(name).suffix}' (these can be written: .mp4, .mov, .mkv)" in error
         assert not (tmp_path / name).exists()
+    error = command("relight", "--turntable", tmp_path / "y.mp4", "-o", tmp_path / "y")
+    assert "leave one of them out" in error
+    assert not list(tmp_path.glob("y*"))
     (tmp_path / "x.mp4").write_text("of somebody else")
     assert "exists already (" in command("relight", "--turntable", tmp_path / "x.mp4")
     assert (tmp_path / "x.mp4").read_text() == "of somebody else"

@@ -173,6 +173,8 @@ def relight(
     """
     from tumble.actions import relight_run, relight_turntable
 
+    if turntable is not None and out is not None:
+        raise ValueError("-o is the folder of images, and --turntable a video instead of them: leave one of them out")
     if turntable is not None:
         print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure, overwrite=overwrite))
     else:
@@ -224,12 +226,13 @@ def evaluate(
     Args:
         prediction: Run directory, whose prediction is rendered first, or prediction folder (docs/prediction.md).
         capture: Capture with ground truth (docs/format.md). Default: the capture of the run.
-        out: Folder for report.json and the contact sheet sheet.png. Default: the first argument.
+        out: Folder for report.json, the contact sheet sheet.png and, for a run, its prediction/.
+            Default: the run directory; for a prediction folder, which is not written to, runs/evaluate/NAME.
     """
-    from tumble.actions import evaluate_folder
+    from tumble.actions import evaluate_folder, score_folder
 
     _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite))
-    print((out or prediction) / "report.json")
+    print((out or score_folder(prediction)) / "report.json")
 
 
 def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = "", /) -> None:
