@@ -331,7 +331,9 @@ def _relit_folder(out: Path, name: str, sha256: str) -> Path:
     for number in itertools.count(1):
         folder = out / run.RELIT / (name if number == 1 else f"{name}-{number}")
         note = folder / LIGHT_FILE
-        if not folder.exists() or (note.is_file() and files.read_json(note, dict[str, Any]).get("sha256") == sha256):
+        if not folder.exists():
+            return folder
+        if note.is_file() and files.read_json(note, dict[str, Any], f"remove {folder}").get("sha256") == sha256:
             return folder
     raise AssertionError("unreachable")
 

@@ -214,6 +214,8 @@ def test_the_scripts_of_the_page_are_those_of_the_package(page: Path) -> None:
     scripts = re.findall(r"<script>(.*?)</script>", page.read_text("utf-8"), flags=re.S)
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     assert len(hashes) == 2
+    # These would make a browser see another text than the one that was hashed.
+    assert not any(sign in script for script in scripts for sign in ("<!--", "<script", "\r", "\0"))
     assert f"script-src 'sha256-{hashes[0]}' 'sha256-{hashes[1]}';" in source
 
 

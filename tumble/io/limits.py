@@ -19,6 +19,8 @@ MAX_CAPTURE_BYTES = 1 << 32
 """Maximum size of all decoded images and masks of a capture: 4 GiB, or 3400 frames of 640 x 480 pixels."""
 MAX_DOCUMENT_BYTES = 1 << 25
 """Maximum size of a JSON document: 32 MiB; ten thousand frames have 6."""
+MAX_LOG_BYTES = 1 << 24
+"""Size of the part at the end of a run's log that is read: 16 MiB; a run of a day writes 7."""
 MAX_MODEL_BYTES = 1 << 30
 """Maximum size of a file of a COLMAP model: 1 GiB; a model of a thousand images has a tenth of it."""
 
