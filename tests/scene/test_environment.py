@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tumble.io import files
+from tumble.io import files, limits
 from tumble.io.files import BadFile
 from tumble.maths.directions import texel_directions
 from tumble.maths.se3 import SO3
@@ -109,6 +109,22 @@ def test_environments_are_written_and_read(tmp_path: Path, name: str) -> None:
     # Radiance HDR keeps eight bits of the brightest channel, here up to three times another.
     rtol = 1e-5 if name.endswith("exr") else 3 / 128
     torch.testing.assert_close(Environment.read(tmp_path / name).radiance, radiance, rtol=rtol, atol=0)
+
+
+@pytest.mark.parametrize("name", ["sun.exr", "sun.hdr"])
+def test_a_large_map_is_averaged_when_it_is_read(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a map of 8k x 4k pixels, one rotation took 5 GiB. A sun of one texel keeps its energy."""
+    monkeypatch.setattr(limits, "MAX_LIGHT_ROWS", 64)
+    pixels = np.full((128, 256, 3), 0.5, np.float32)
+    pixels[41, 100] = 1000.0
+    (files.write_exr if name == "sun.exr" else files.write_hdr)(tmp_path / name, pixels)
+    radiance = Environment.read(tmp_path / name).radiance
+    assert radiance.shape == (64, 128, 3)
+    # Radiance HDR keeps 8 bits of a colour.
+    torch.testing.assert_close(radiance[20, 50], torch.full((3,), (3 * 0.5 + 1000) / 4), rtol=0.01, atol=0)
+    assert radiance.min() == pytest.approx(0.5, rel=0.01)
+    files.write_exr(tmp_path / "odd.exr", pixels[:126, :252])
+    assert Environment.read(tmp_path / "odd.exr").radiance.shape == (64, 128, 3)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,12 @@ Texel centres lie at +0.5. Radiance is linear RGB.
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.io import BadFile, files
+from tumble.io import BadFile, files, limits
 from tumble.maths import equirect_from_direction, texel_directions, texel_solid_angles
 
 MIN_RADIANCE = 1e-6
@@ -33,7 +34,7 @@ class Environment:
 
     @staticmethod
     def read(path: Path | str) -> "Environment":
-        """The environment in an equirectangular .exr or .hdr image.
+        """The environment in an equirectangular .exr or .hdr image; of more than `MAX_LIGHT_ROWS` rows, averaged.
 
         Raises:
             BadFile: The image is not finite, non-negative RGB and twice as wide as high.
@@ -47,6 +48,9 @@ class Environment:
         if pixels.min() < 0:
             rule = f"an environment map must have no negative values, but the least is {pixels.min():.3g}"
             raise BadFile(path, rule, "clamp at 0")
+        if pixels.shape[0] > limits.MAX_LIGHT_ROWS:
+            size = 2 * limits.MAX_LIGHT_ROWS, limits.MAX_LIGHT_ROWS
+            pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
         return Environment.from_radiance(torch.from_numpy(pixels))
 
     def write(self, path: Path) -> None:
