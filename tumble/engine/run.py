@@ -28,7 +28,7 @@ from torch import Tensor
 from tumble import __version__
 from tumble.engine import loop
 from tumble.engine.loop import Progress
-from tumble.io import BadFile, files, limits, tree
+from tumble.io import BadFile, files, limits, outputs, tree
 
 T = TypeVar("T")
 
@@ -293,16 +293,17 @@ def asset(path: Path, cls: type[T]) -> T:
     """The asset of a finished run as a tree of class `cls`.
 
     Raises:
-        BadFile: The run is not finished, or is of an older format.
+        BadFile: The run is not finished, is of an older format, or holds a link out of it.
     """
     if not (path / ASSET).is_file():
         raise BadFile(path, f"has no {ASSET}", "finish the run first: tumble run")
+    outputs.require_no_links(path)  # who reads the asset goes on to write into the run
     _document(path)
     return tree.load(cls, path / ASSET)
 
 
 def _require_run_folder(path: Path) -> None:
-    """Raise `BadFile` if the path is a file, or a folder that holds something other than a run."""
+    """Raise `BadFile` if the path is a file, or a folder that holds something other than a run, or a link out of it."""
     if not path.exists():
         return
     if not path.is_dir():
@@ -311,6 +312,7 @@ def _require_run_folder(path: Path) -> None:
     others = [name for name in names if name not in (CAPTURE, LOCK) and not name.startswith(files.PARTIAL_PREFIX)]
     if others and not (path / RECIPE).is_file():
         raise BadFile(path, "exists and is not a run directory", WRONG_FOLDER)
+    outputs.require_no_links(path)
 
 
 def stage(
