@@ -13,7 +13,7 @@ import warnings
 # Idle OpenMP threads of torch otherwise spin on the cores that the kernels need. Torch reads this on import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -280,6 +280,7 @@ def main() -> None:
     warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        _require_text(sys.argv[1:])
         about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}
         with _progress_lines():
@@ -292,6 +293,13 @@ def main() -> None:
             raise
         print(f"tumble: {error}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def _require_text(words: Sequence[str]) -> None:
+    """Raise `ValueError` for a path that is not valid UTF-8, which JSON, safetensors and OpenEXR cannot name."""
+    for word in words:
+        if any(0xD800 <= ord(character) <= 0xDFFF for character in word):
+            raise ValueError(f"{word!a} is not valid UTF-8: rename the file or folder")
 
 
 # Printing -------------------------------------------------------------------------------------------------------------

@@ -361,6 +361,7 @@ def test_records_of_the_log_with_values_of_the_wrong_type_are_left_out(tmp_path:
         *({"name": "refine", key: "x"} for key in ("seconds", "step", "of", "eta", "metrics")),
         {"name": "refine", "metrics": {"render": "<script>"}},
         {"name": "refine", "event": 3},
+        {"name": "refine \ud800", "event": "start"},
         ["refine"],
     ]
     lines = [json.dumps(record) for record in [*bad, *good, *bad]]

@@ -320,6 +320,12 @@ def test_a_window_is_a_square_around_the_object_inside_the_image() -> None:
     assert training_views.window(torch.zeros(50, 80, dtype=torch.bool)) == (0, 0, 50, 80)
 
 
+def test_curves_leave_out_what_is_no_loss() -> None:
+    """Of a log from elsewhere; numpy would warn of the arithmetic, and the path would hold "nan"."""
+    assert svg.curve([1.0, math.nan, 0.1, math.inf, 1e308, -1e308]) == svg.curve([1.0, 0.1])
+    assert svg.curve([math.nan, 2.0]) == ""
+
+
 def test_bars_leave_gaps_for_nan() -> None:
     drawn = svg.bars([1.0, math.nan, 2.0], ["good", "none", "bad"])
     assert re.findall(r'class="b-(\w+)" x="([\d.]+)" y="([\d.]+)"', drawn) == [

@@ -435,13 +435,14 @@ def log(run: Run, record: dict[str, Any]) -> None:
 def log_records(path: Path) -> list[dict[str, Any]]:
     """The records in the log of a run directory; of a log over the limit of `io.limits`, those at its end.
 
-    Lines that a killed process left incomplete are left out, and so are records whose values are of the wrong type. A
-    record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
+    Lines that a killed process left incomplete are left out, and so are records whose values are of the wrong type or
+    no valid text. A record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
     """
     records = []
     for line in _last_lines(path / LOG, limits.MAX_LOG_BYTES):
         with contextlib.suppress(ValueError, RecursionError):
             record = json.loads(line)
+            json.dumps(record, ensure_ascii=False).encode()  # JSON can hold halves of characters, which no file can
             msgspec.convert(record, _LogRecord)
             needed = {"name", "of", "eta", "metrics"} if "step" in record else {"name", "seconds"}
             if needed <= record.keys() or not ("step" in record or record.get("event") == "done"):

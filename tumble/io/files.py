@@ -172,9 +172,19 @@ def violated_rule(error: msgspec.ValidationError) -> str:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write an indented JSON document; NaN and infinities, which JSON does not define, become null."""
-    text = json.dumps(_without_nan(document), indent=1, allow_nan=False)
-    write_atomically(path, lambda partial: partial.write_text(text + "\n", "utf-8"))
+    """Write an indented JSON document; NaN and infinities, which JSON does not define, become null.
+
+    Raises:
+        BadFile: The document names a file whose name is not valid UTF-8, as JSON is.
+        WriteError: See `write_atomically`.
+    """
+    text = json.dumps(_without_nan(document), indent=1, allow_nan=False, ensure_ascii=False)
+    try:
+        content = text.encode()
+    except UnicodeEncodeError as error:  # Python represents other bytes of file names by halves of characters
+        name = text[max(0, error.start - 20) : error.end + 20]
+        raise BadFile(path, f"would name a file whose name is not valid UTF-8: ...{name}...", "rename it") from None
+    write_atomically(path, lambda partial: partial.write_bytes(content + b"\n"))
 
 
 def image_size(path: Path) -> tuple[int, int]:
