@@ -277,7 +277,7 @@ def main() -> None:
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
         return
-    warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
+    warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {_line(message)}\n"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         _require_text(sys.argv[1:])
@@ -291,7 +291,7 @@ def main() -> None:
     except (ValueError, OSError, ModuleNotFoundError) as error:
         if os.environ.get("TUMBLE_DEBUG"):
             raise
-        print(f"tumble: {error}", file=sys.stderr)
+        print(f"tumble: {_line(error)}", file=sys.stderr)
         raise SystemExit(1) from None
 
 
@@ -320,35 +320,45 @@ def _progress_lines() -> Iterator[None]:
         log.setLevel(before)
 
 
+def _line(text: object) -> str:
+    """A text as one line: names of files may hold line breaks, and control sequences of terminals."""
+    from tumble.io import one_line
+
+    return one_line(str(text))
+
+
 def _print_finding(mark: str, subject: str, state: str, advice: str, *, width: int) -> None:
     """Print one finding: a coloured mark, its subject, its state and the advice."""
     from rich.console import Console
+    from rich.markup import escape
 
     console = Console(highlight=False)
     colour = {"+": "green", "!": "yellow", "x": "red"}[mark]
-    console.print(f" [{colour}]{mark}[/] [bold]{subject:{width}}[/] {state}", soft_wrap=True)
+    console.print(f" [{colour}]{mark}[/] [bold]{subject:{width}}[/] {escape(_line(state))}", soft_wrap=True)
     if advice:
-        console.print(f"   {'':{width}} -> {advice}", markup=False, soft_wrap=True)
+        console.print(f"   {'':{width}} -> {_line(advice)}", markup=False, soft_wrap=True)
 
 
 def _print_scores(report: "Report") -> None:
     """Print the scores of a report, one column per region, and its notes."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     def formatted(value: float | None) -> str:
         return "-" if value is None else f"{value:.4g}"
 
-    table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
+    title = _line(f"{report['prediction']} on {report['capture']['name']}")
+    table = Table(title=escape(title), title_justify="left")
     regions = report["regions"]
     for heading in ("metric", *regions):
         table.add_column(heading, justify="left" if heading == "metric" else "right")
     for key in dict.fromkeys(key for scores in regions.values() for key in scores):
-        table.add_row(key, *(formatted(scores.get(key)) for scores in regions.values()))
+        table.add_row(escape(_line(key)), *(formatted(scores.get(key)) for scores in regions.values()))
     for key, value in {**report["light"], **report["poses"]}.items():
         if value is None or isinstance(value, int | float):
             table.add_row(key, formatted(value))
     console = Console()
     console.print(table)
     for note in report["notes"]:
-        console.print(f"note: {note}", markup=False, highlight=False)
+        console.print(f"note: {_line(note)}", markup=False, highlight=False)
