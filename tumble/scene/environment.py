@@ -115,16 +115,20 @@ class Environment:
 
 def bilinear(texels: Float[Tensor, "h w c"], uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
     """Bilinear lookup in an equirectangular map at coordinates in [0, 1]^2, continuous across seam and poles."""
-    h, w, _ = texels.shape
+    h, w, c = texels.shape
     x, y = uv[..., 0] * w - 0.5, uv[..., 1] * h - 0.5
     left, top = x.detach().floor(), y.detach().floor()
     fx, fy = (x - left)[..., None], (y - top)[..., None]
-    left, top = left.long(), top.long()
+    left, top = left.int(), top.int()
 
     def at(row: Tensor, column: Tensor) -> Tensor:
         # The neighbour across a pole is the same row, half a revolution away.
         across_pole = (row < 0) | (row >= h)
-        return texels[row.clamp(0, h - 1), torch.where(across_pole, column + w // 2, column) % w]
+        row, column = row.clamp(0, h - 1), torch.where(across_pole, column + w // 2, column) % w
+        if texels.requires_grad:
+            return texels[row, column]
+        # The same in a tenth of the time; its gradient would be summed in another order.
+        return texels.reshape(-1, c).index_select(0, (row * w + column).flatten()).reshape(*row.shape, c)
 
     upper = at(top, left) * (1 - fx) + at(top, left + 1) * fx
     lower = at(top + 1, left) * (1 - fx) + at(top + 1, left + 1) * fx
