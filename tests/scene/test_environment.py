@@ -95,6 +95,14 @@ def test_a_rotated_map_is_the_same_light_in_another_frame() -> None:
     )
 
 
+def test_a_lookup_without_a_gradient_has_the_same_bits() -> None:
+    light = Environment.from_radiance(torch.rand(6, 12, 3, generator=torch.Generator().manual_seed(0)))
+    d_env = torch.cat([texel_directions(9, 17).flatten(0, 1), torch.tensor([[0.0, 1, 0], [0, -1, 0], [0, 0, 1]])])
+    trained = Environment(light.log_radiance.clone().requires_grad_())
+    assert torch.equal(trained.lookup(d_env), light.lookup(d_env))
+    assert light.lookup(d_env[None]).shape == (1, len(d_env), 3)
+
+
 def test_lookup_has_a_gradient_to_texels_and_direction() -> None:
     torch.manual_seed(4)
     d = torch.nn.functional.normalize(torch.randn(6, 3, dtype=torch.float64), dim=-1).requires_grad_()
