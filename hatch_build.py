@@ -4,7 +4,6 @@ Without a C++ compiler, and for editable installations, the wheel has no kernels
 """
 
 import importlib.util
-import sysconfig
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ class KernelsHook(BuildHookInterface):
             return
         build_data["force_include"] |= {str(path): f"tumble/backends/prebuilt/{path.name}" for path in libraries}
         build_data["pure_python"] = False
-        build_data["tag"] = f"py3-none-{sysconfig.get_platform().replace('-', '_').replace('.', '_')}"
+        build_data["tag"] = f"py3-none-{prebuilt.platform_tag(libraries)}"
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove the temporary folder."""

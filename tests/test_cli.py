@@ -52,6 +52,7 @@ def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(
         (["synth", "nowhere.glb", "--env", "white", "-o", "OUT", "--fov", "500"], "fov is out of range: 500"),
         (["evaluate", "nowhere", "nowhere-either"], "nowhere-either: is missing"),
         (["evaluate", "nowhere"], "nowhere is not a finished run: give the capture"),
+        (["report", "caf\udce9"], "'caf\\udce9' is not valid UTF-8: rename the file or folder"),
         (["run", "film.mp4", "-o", "OUT", "--matcher", "mixd"], "no 'mixd' in tumble/matching; available: aliked"),
     ],
 )
@@ -69,6 +70,17 @@ def test_an_error_is_one_line_that_names_the_file_and_ends_with_code_1(
     assert message in error
     assert len(error.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_printed_of_names_is_one_line_without_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of predictions, captures, lights and videos of somebody else."""
+    name = "a [/red] \x1b[2J\n"
+    cli._print_finding("!", "video", name, name, width=10)
+    scores = {"regions": {"shared": {name: 1.0}}, "light": {}, "poses": {}, "notes": [name]}
+    cli._print_scores({"prediction": name, "capture": {"name": name}, **scores})  # type: ignore[arg-type]
+    printed = capsys.readouterr().out
+    assert printed.count(r"a [/red] \x1b[2J\n") >= 5
+    assert "\x1b" not in printed
 
 
 def test_an_unknown_command_ends_with_code_2(

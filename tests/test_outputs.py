@@ -127,6 +127,9 @@ def test_the_extension_of_a_turntable_video_is_its_format(command: Callable[...,
         error = command("relight", "--turntable", tmp_path / name)
         assert f"has the extension '{Path(name).suffix}' (these can be written: .mp4, .mov, .mkv)" in error
         assert not (tmp_path / name).exists()
+    error = command("relight", "--turntable", tmp_path / "y.mp4", "-o", tmp_path / "y")
+    assert "leave one of them out" in error
+    assert not list(tmp_path.glob("y*"))
     (tmp_path / "x.mp4").write_text("of somebody else")
     assert "exists already (" in command("relight", "--turntable", tmp_path / "x.mp4")
     assert (tmp_path / "x.mp4").read_text() == "of somebody else"
@@ -167,3 +170,38 @@ def test_the_output_may_not_lie_in_the_footage(tmp_path: Path, command: Callable
     made = pipeline.capture_of(source, tmp_path / "images-run", options)
     assert pipeline.capture_of(source, tmp_path / "images-run", options) == made
     shutil.rmtree(tmp_path / "images-run")
+
+
+@pytest.mark.parametrize("name", ["prediction", "relit", "export/splat", ".lock", "log.jsonl", "2-refine", "asset"])
+def test_nothing_is_written_through_the_links_of_a_run_from_elsewhere(
+    command: Callable[..., str],
+    name: str,
+    whole: Path,  # noqa: F811
+    capture: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    """Through them pictures of the user were removed, a file was replaced by a number, and another one extended."""
+    mine, foreign = tmp_path / "mine", tmp_path / "foreign"
+    (mine / "image").mkdir(parents=True)
+    (mine / "image" / "photo.jpg").write_text("kept")
+    (mine / "notes").write_text("kept")
+    shutil.copytree(whole, foreign)
+    place = foreign / name
+    place.parent.mkdir(exist_ok=True)
+    shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+    place.symlink_to(mine / "notes" if name in (".lock", "log.jsonl") else mine)
+    before = content(mine)
+    for call in (
+        lambda: pipeline.reconstruct(capture, foreign, RECIPE),
+        lambda: actions.evaluate_run(foreign, capture),
+        lambda: actions.export_run(foreign, None, "splat", None),
+        lambda: actions.write_report(foreign),
+    ):
+        with pytest.raises(BadFile, match=rf"{name}: is a link to .*mine.*, outside of .*foreign \(remove it; "):
+            call()
+    for words in ("export", "relight"):
+        out = tmp_path / words
+        assert command(words, "-o", out) == ""
+        (out / "more").symlink_to(mine)
+        assert f"{out / 'more'}: is a link to {mine}" in command(words, "-o", out)
+    assert content(mine) == before

@@ -171,6 +171,34 @@ def test_a_run_is_scored_with_known_poses_as_they_are(
     assert (finished[0] / "sheet.png").is_file()
 
 
+def test_a_run_is_scored_into_itself_or_elsewhere_and_an_input_is_never_written_to(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A prediction folder and a capture are inputs; a run is our own output."""
+    for name, path in (("run", finished[0]), ("truth", capture)):
+        shutil.copytree(path, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+
+    def changed(*where: Path) -> set[Path]:
+        """Folders of the files that scoring changes."""
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+        actions.evaluate_folder(*where)
+        after = [path for path in tmp_path.rglob("*") if before.get(path) != path.stat().st_mtime_ns]
+        return {path.parent.relative_to(tmp_path) for path in after if path.is_file()}
+
+    elsewhere = changed(Path("run"), Path("truth"), Path("other"))
+    assert {path.parts[0] for path in elsewhere} == {"other"}
+    assert {path.parts[0] for path in changed(Path("run"), Path("truth"))} == {"run"}
+    shutil.move("other/prediction", "method")
+    scores = Path("runs/evaluate/method")
+    for _ in range(2):
+        assert changed(Path("method"), Path("truth")) == {scores}
+        assert actions.score_folder(Path("method")) == scores
+    for taken in ("method", "truth"):
+        with pytest.raises(BadFile, match=f"{taken}: holds other files"):
+            actions.evaluate_folder(Path("method"), Path("truth"), Path(taken))
+
+
 def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,9 +286,13 @@ def _check_up(scene: Tumble, run: Path, recipe: recipes.Recipe, asset: Asset, mo
     # The few steps blur the ends by a tenth.
     assert abs(row_of_top(asset, 0, vertices)) < 0.15
     error = actions.evaluate_run(run, run.parent / "true", run)["poses"]["poses.rotation_mean_degrees"]
-    upright_in_frame_9 = turned("9.png")
+    old = "export shows the object before this run; repeat tumble export"
+    with pytest.warns(UserWarning, match=old):
+        upright_in_frame_9 = turned("9.png")
+    assert_same(turned("9.png"), upright_in_frame_9)  # nothing changes, and there is no warning
     assert abs(row_of_top(upright_in_frame_9, 9, upright_in_frame_9.gaussians.means)) < 0.15
-    over = turned("-y")
+    with pytest.warns(UserWarning, match=old):
+        over = turned("-y")
     assert abs(row_of_top(over, 0, over.gaussians.means) - 1) < 0.15
     again = actions.evaluate_run(run, run.parent / "true", run)["poses"]
     assert again["poses.rotation_mean_degrees"] == pytest.approx(error, abs=1e-3)
@@ -268,6 +300,7 @@ def _check_up(scene: Tumble, run: Path, recipe: recipes.Recipe, asset: Asset, mo
         turned("up")
     with pytest.raises(ValueError, match="the poses of this capture define its frame"):
         pipeline.reconstruct(dataclasses.replace(scene.capture, trajectory=truth(scene)), up="z")
+    shutil.rmtree(run / runs.EXPORT)
     assert_same(turned("auto"), asset)
 
 

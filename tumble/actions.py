@@ -40,6 +40,8 @@ from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "relight.json"
 """File in a folder of relit images that records the environment map, and by which the folder is recognised."""
+SCORES = Path("runs/evaluate")
+"""Folder of the scores of prediction folders."""
 MAX_RAYS = 1 << 16
 """Maximum number of rays per pixel."""
 MAX_EXPOSURE = 32
@@ -147,8 +149,7 @@ def evaluate(
     names = names or known.capture.names
     aligned = align_views(asset.trajectory, names, known.capture, known.truth, known_poses=poses_given)
     with tempfile.TemporaryDirectory() as scratch:
-        where = Path(out or scratch)
-        return _scored(asset, known, aligned, names, where, where, cfg or relighting.Config())
+        return _scored(asset, known, aligned, names, Path(out or scratch), cfg or relighting.Config())
 
 
 def _scored(
@@ -156,15 +157,14 @@ def _scored(
     known: CaptureWithTruth,
     aligned: tuple[Any, str],
     names: tuple[str, ...],
-    folder: Path,
-    where: Path,
+    out: Path,
     cfg: relighting.Config,
 ) -> Report:
-    """Render a prediction into `folder/prediction`, score it, and write the scores into `where`."""
+    """Render a prediction into `out/prediction`, score it, and write the scores into `out`."""
     alignment, words = aligned
     prediction: Prediction = predict_views(cfg, asset, known.capture, known.truth, alignment, names=names)
-    prediction.write(folder / run.PREDICTION)
-    return score(folder / run.PREDICTION, known, where, notes=[words])
+    prediction.write(out / run.PREDICTION)
+    return score(out / run.PREDICTION, known, out, notes=[words])
 
 
 # Runs -----------------------------------------------------------------------------------------------------------------
@@ -216,20 +216,32 @@ def evaluate_folder(
     """Score a prediction folder, or a run, whose prediction is rendered first.
 
     Args:
-        out: Folder for `report.json` and `sheet.png`. Default: `prediction`.
+        out: Folder for `report.json` and `sheet.png`, and for a run its `prediction/`. A run directory may be its
+            own. Default: `score_folder`.
         overwrite: Write into `out` even if it holds something else than an earlier evaluation.
 
     Raises:
         ValueError: A prediction folder is given without its capture.
         BadFile: `out` holds something else.
     """
-    if out is not None and out.resolve() != prediction.resolve():
-        outputs.claim_folder(out, SHEET, overwrite=overwrite)
-    if (prediction / run.ASSET).is_file():
-        return evaluate_run(prediction, capture, out)
-    if capture is None:
+    is_run, out = _is_run(prediction), out or score_folder(prediction)
+    if not is_run and capture is None:
         raise ValueError(f"{prediction} is not a finished run: give the capture of the prediction as second argument")
-    return score(prediction, capture, out or prediction)
+    if not (is_run and out.resolve() == prediction.resolve()):
+        outputs.claim_folder(out, SHEET, overwrite=overwrite)
+    if is_run or capture is None:
+        return evaluate_run(prediction, capture, out)
+    return score(prediction, capture, out)
+
+
+def score_folder(prediction: Path) -> Path:
+    """Default folder of scores: a run directory itself; for a prediction folder, which is an input, a new one."""
+    return prediction if _is_run(prediction) else SCORES / prediction.resolve().name
+
+
+def _is_run(path: Path) -> bool:
+    """Whether a folder holds a finished run."""
+    return (path / run.ASSET).is_file()
 
 
 def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = None) -> Report:
@@ -239,7 +251,7 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
 
     Args:
         capture: Capture with ground truth. Default: the capture of the run.
-        where: Folder for `report.json` and `sheet.png`. Default: the run directory.
+        where: Folder for `prediction/`, `report.json` and `sheet.png`. Default: the run directory.
 
     Raises:
         BadFile: There is no finished run in `out`, or the capture has no ground truth.
@@ -252,7 +264,7 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     lens = _focal_ratio(out, asset, known.capture)
     training = asset.trajectory, names, known.capture, known.truth
     aligned = align_views(*training, known_poses=given, focal_ratio=lens)
-    return _scored(asset, known, aligned, names, out, where or out, _relighting(out))
+    return _scored(asset, known, aligned, names, where or out, _relighting(out))
 
 
 def _focal_ratio(out: Path, asset: Asset, capture: Capture) -> float:
@@ -319,7 +331,9 @@ def _relit_folder(out: Path, name: str, sha256: str) -> Path:
     for number in itertools.count(1):
         folder = out / run.RELIT / (name if number == 1 else f"{name}-{number}")
         note = folder / LIGHT_FILE
-        if not folder.exists() or (note.is_file() and files.read_json(note, dict[str, Any]).get("sha256") == sha256):
+        if not folder.exists():
+            return folder
+        if note.is_file() and files.read_json(note, dict[str, Any], f"remove {folder}").get("sha256") == sha256:
             return folder
     raise AssertionError("unreachable")
 

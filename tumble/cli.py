@@ -13,7 +13,7 @@ import warnings
 # Idle OpenMP threads of torch otherwise spin on the cores that the kernels need. Torch reads this on import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -173,6 +173,8 @@ def relight(
     """
     from tumble.actions import relight_run, relight_turntable
 
+    if turntable is not None and out is not None:
+        raise ValueError("-o is the folder of images, and --turntable a video instead of them: leave one of them out")
     if turntable is not None:
         print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure, overwrite=overwrite))
     else:
@@ -224,12 +226,13 @@ def evaluate(
     Args:
         prediction: Run directory, whose prediction is rendered first, or prediction folder (docs/prediction.md).
         capture: Capture with ground truth (docs/format.md). Default: the capture of the run.
-        out: Folder for report.json and the contact sheet sheet.png. Default: the first argument.
+        out: Folder for report.json, the contact sheet sheet.png and, for a run, its prediction/.
+            Default: the run directory; for a prediction folder, which is not written to, runs/evaluate/NAME.
     """
-    from tumble.actions import evaluate_folder
+    from tumble.actions import evaluate_folder, score_folder
 
     _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite))
-    print((out or prediction) / "report.json")
+    print((out or score_folder(prediction)) / "report.json")
 
 
 def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = "", /) -> None:
@@ -274,9 +277,10 @@ def main() -> None:
     if sys.argv[1:] in (["--version"], ["version"]):
         print(f"tumble {__version__}")
         return
-    warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {message}\n"
+    warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {_line(message)}\n"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        _require_text(sys.argv[1:])
         about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}
         with _progress_lines():
@@ -287,8 +291,15 @@ def main() -> None:
     except (ValueError, OSError, ModuleNotFoundError) as error:
         if os.environ.get("TUMBLE_DEBUG"):
             raise
-        print(f"tumble: {error}", file=sys.stderr)
+        print(f"tumble: {_line(error)}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def _require_text(words: Sequence[str]) -> None:
+    """Raise `ValueError` for a path that is not valid UTF-8, which JSON, safetensors and OpenEXR cannot name."""
+    for word in words:
+        if any(0xD800 <= ord(character) <= 0xDFFF for character in word):
+            raise ValueError(f"{word!a} is not valid UTF-8: rename the file or folder")
 
 
 # Printing -------------------------------------------------------------------------------------------------------------
@@ -309,35 +320,45 @@ def _progress_lines() -> Iterator[None]:
         log.setLevel(before)
 
 
+def _line(text: object) -> str:
+    """A text as one line: names of files may hold line breaks, and control sequences of terminals."""
+    from tumble.io import one_line
+
+    return one_line(str(text))
+
+
 def _print_finding(mark: str, subject: str, state: str, advice: str, *, width: int) -> None:
     """Print one finding: a coloured mark, its subject, its state and the advice."""
     from rich.console import Console
+    from rich.markup import escape
 
     console = Console(highlight=False)
     colour = {"+": "green", "!": "yellow", "x": "red"}[mark]
-    console.print(f" [{colour}]{mark}[/] [bold]{subject:{width}}[/] {state}", soft_wrap=True)
+    console.print(f" [{colour}]{mark}[/] [bold]{subject:{width}}[/] {escape(_line(state))}", soft_wrap=True)
     if advice:
-        console.print(f"   {'':{width}} -> {advice}", markup=False, soft_wrap=True)
+        console.print(f"   {'':{width}} -> {_line(advice)}", markup=False, soft_wrap=True)
 
 
 def _print_scores(report: "Report") -> None:
     """Print the scores of a report, one column per region, and its notes."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     def formatted(value: float | None) -> str:
         return "-" if value is None else f"{value:.4g}"
 
-    table = Table(title=f"{report['prediction']} on {report['capture']['name']}", title_justify="left")
+    title = _line(f"{report['prediction']} on {report['capture']['name']}")
+    table = Table(title=escape(title), title_justify="left")
     regions = report["regions"]
     for heading in ("metric", *regions):
         table.add_column(heading, justify="left" if heading == "metric" else "right")
     for key in dict.fromkeys(key for scores in regions.values() for key in scores):
-        table.add_row(key, *(formatted(scores.get(key)) for scores in regions.values()))
+        table.add_row(escape(_line(key)), *(formatted(scores.get(key)) for scores in regions.values()))
     for key, value in {**report["light"], **report["poses"]}.items():
         if value is None or isinstance(value, int | float):
             table.add_row(key, formatted(value))
     console = Console()
     console.print(table)
     for note in report["notes"]:
-        console.print(f"note: {note}", markup=False, highlight=False)
+        console.print(f"note: {_line(note)}", markup=False, highlight=False)

@@ -35,6 +35,8 @@ MIN_FRAMES = 8
 """Minimum number of frames with a pose; fewer show too little of the object."""
 IN_MEMORY = Path("capture")
 """Name, in error messages, of a capture that was not read from disk."""
+MADE_OF_ASSET = {run.EXPORT: "export", run.RELIT: "relight"}
+"""Folders of a run that another command makes of its asset, with that command."""
 ROTATIONS_TO_UP = {
     "x": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "-x": ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -288,7 +290,15 @@ def _upright(asset: Asset, names: tuple[str, ...], up: str) -> Asset:
 
 
 def _keep(asset: Asset, names: tuple[str, ...], out: Path) -> None:
+    """Write the asset, its light and its poses; warn of files that other commands made of another asset."""
+    kept = [out / run.LIGHT, out / run.POSES]
+    before = [path.read_bytes() if path.is_file() else b"" for path in kept]
     tree.save(asset, out / run.ASSET)
     asset.environment.write(out / run.LIGHT)
     poses = dict(zip(names, asset.trajectory.camera_to_object().tolist(), strict=True))
     files.write_json(out / run.POSES, poses)
+    if before == [path.read_bytes() for path in kept]:
+        return
+    for name, command in MADE_OF_ASSET.items():
+        if (out / name).exists():
+            warnings.warn(f"{out / name} shows the object before this run; repeat tumble {command}", stacklevel=2)

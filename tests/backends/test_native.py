@@ -196,6 +196,20 @@ def test_without_a_cache_that_can_be_trusted_the_folder_belongs_to_the_process(
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
+def test_warp_gets_a_folder_that_others_cannot_enter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp loads any kernel that it finds in its cache; others could have put one into a folder that they can write."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _cache._process_folder.cache_clear()
+    folder = _cache.of_warp()
+    assert folder.is_relative_to(tmp_path)
+    folder.chmod(0o755)
+    assert _cache.of_warp() == folder
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    folder.chmod(0o777)
+    with pytest.warns(RuntimeWarning, match=r"warp: compiled kernels cannot be kept: .* \(fix: chmod 700"):
+        assert not _cache.of_warp().is_relative_to(tmp_path)
+
+
 def test_python_threads_can_render_concurrently() -> None:
     """One thread uses the pool, the others render without it; the images are equal."""
     cpu, scene = backends.load("cpu"), cases.hard()

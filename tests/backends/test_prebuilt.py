@@ -1,5 +1,6 @@
 """Kernels in wheels: which of them a processor gets, and a machine without a compiler."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,25 @@ def test_a_wheel_without_a_compiler_has_no_kernels(tmp_path: Path, monkeypatch: 
     assert _prebuilt.compile_all(tmp_path) == []
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="manylinux is for Linux")
+def test_the_tag_of_a_wheel_admits_the_systems_that_have_its_symbols(tmp_path: Path) -> None:
+    tag = _prebuilt.platform_tag([Path(compiled()._name)])
+    own = os.confstr("CS_GNU_LIBC_VERSION") or ""
+    assert tag.startswith("manylinux_2_")
+    assert 5 <= int(tag.split("_")[2]) <= int(own.rpartition(".")[2]), "pip would install the wheel here"
+    start = b"\x7fELF\0libc.so.6\0GLIBC_2.2.5\0"
+    for names, expected in [
+        (b"GLIBC_2.14\0GLIBC_2.9\0", "manylinux_2_14_"),
+        (b"libm.so.6\0GLIBC_2.34\0", "manylinux_2_34_"),
+        (b"libstdc++.so.6\0GLIBC_2.14\0", "linux_"),  # its version matters too
+        (b"libgomp.so.1\0", "linux_"),  # not on every system
+    ]:
+        (tmp_path / "x.so").write_bytes(start + names)
+        assert _prebuilt.platform_tag([tmp_path / "x.so"]).startswith(expected)
+    (tmp_path / "x.so").write_bytes(b"\x7fELF\0libc.musl-x86_64.so.1\0")
+    assert _prebuilt.platform_tag([tmp_path / "x.so"]).startswith("linux_")
+
+
 def test_the_doctor_names_the_kernels_and_their_speed() -> None:
     (kernels,) = (finding for finding in doctor.findings() if finding.subject == "kernels")
     assert backends.origin_of_kernels()[0] in kernels.state
@@ -76,6 +96,7 @@ def test_an_installed_wheel_renders_without_a_compiler(tmp_path: Path) -> None:
     pip = [sys.executable, "-m", "pip", "--quiet"]
     subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)], check=True)
     (wheel,) = tmp_path.glob("*.whl")
+    assert "-manylinux_2_" in wheel.name or sys.platform != "linux"
     site, home = tmp_path / "site", tmp_path / "home"
     subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(wheel)], check=True)
     assert (site / "tumble" / "backends" / "prebuilt").is_dir()

@@ -22,6 +22,7 @@ from tumble.engine import run
 from tumble.io import files
 from tumble.io.files import BadFile
 from tumble.maths.se3 import SE3
+from tumble.preprocess import footage
 from tumble.scene.camera import Camera
 from tumble.scene.capture import Capture, content_key
 from tumble.scene.trajectory import Trajectory
@@ -360,8 +361,46 @@ def test_records_of_the_log_with_values_of_the_wrong_type_are_left_out(tmp_path:
         *({"name": "refine", key: "x"} for key in ("seconds", "step", "of", "eta", "metrics")),
         {"name": "refine", "metrics": {"render": "<script>"}},
         {"name": "refine", "event": 3},
+        {"name": "refine \ud800", "event": "start"},
         ["refine"],
     ]
     lines = [json.dumps(record) for record in [*bad, *good, *bad]]
     (tmp_path / run.LOG).write_text("\n".join([*lines, "[" * 100_000, f'{{"step": {"9" * 5000}}}']))
     assert run.log_records(tmp_path) == good
+
+
+def test_of_a_log_of_any_size_the_end_is_read(tmp_path: Path) -> None:
+    """A log may come from somebody else, and be larger than the memory; here a sparse file of 8 GiB."""
+    record = {"name": "refine", "event": "start"}
+    with (tmp_path / run.LOG).open("wb") as file:
+        file.write(json.dumps({"name": "first"}).encode())
+        file.seek(8 << 30)
+        file.write(f"\n{json.dumps(record)}\n".encode())
+    assert run.log_records(tmp_path) == [record]
+    (tmp_path / run.LOG).unlink()
+    (tmp_path / run.LOG).mkdir()
+    assert run.log_records(tmp_path) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"capture": "x", "a": 1, "frames": 3', b'{"frames": 3, "key": []}'])
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        (run.RECIPE, run.recipe),
+        (run.RECIPE, lambda path: run.open(path, path, Recipe())),
+        (run.POSES, run.frame_names),
+        (f"1-first/{run.DONE}", lambda path: pipeline(path, Recipe(), [])),
+        (footage.PROVENANCE, footage.read_provenance),
+    ],
+)
+def test_a_damaged_document_of_a_run_is_named_with_the_fix(
+    tmp_path: Path, name: str, read: Callable[[Path], object], content: bytes
+) -> None:
+    path = tmp_path / "run"
+    pipeline(path, Recipe(), [])
+    (path / name).write_bytes(content)
+    if name.endswith(run.DONE) and content.endswith(b"}"):
+        read(path)  # another key: the stage runs again
+        return
+    with pytest.raises(BadFile, match=rf"{name}: .* \((give|repeat|remove) .*\)$"):
+        read(path)

@@ -193,6 +193,14 @@ def colmap_cases() -> Iterator[Case]:
         yield Case(f"COLMAP: {name}", partial(put, contents=colmap(images=lines)), RUN, r"(in|out/capture)[:/]")
     for name, line in {"words": "1 a b c 0 0 0 0", "infinity": "1 inf 0 0 0 0 0 0", "too few numbers": "1 2"}.items():
         yield Case(f"COLMAP: points of {name}", partial(put, contents=colmap(points=line)), RUN, r"in/.*points3D")
+    many: dict[str, Callable[[], bytes]] = {
+        "images.txt": lambda: b"\n" * (300 << 20),
+        "points3D.txt": lambda: b"1" * (300 << 20),
+        "cameras.txt": lambda: b"".join(b"%d SIMPLE_PINHOLE 9 9 9 4 4\n" % i for i in range(500_000)),
+    }
+    for name, made in many.items():
+        files = {**colmap(), f"in/sparse/0/{name}": made}
+        yield Case(f"COLMAP: {name} of many lines", partial(put, contents=files), RUN, rf"{name}: ", large=True)
     binary = {
         "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, SIDE, SIDE, 40, 40, 12, 12),
         "images.bin": struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 4, 1) + b"0000.png\0" + struct.pack("<Q", 0),

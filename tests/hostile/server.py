@@ -30,7 +30,7 @@ def readers() -> dict[str, Callable[[Path], object]]:
     from tumble.datasets import bop
     from tumble.engine import loop, run
     from tumble.io import files, tree, video
-    from tumble.preprocess import colmap, provenance
+    from tumble.preprocess import colmap, footage
     from tumble.rendering import relight
     from tumble.scene import Asset, Environment
     from tumble.synthetic import pathtracer
@@ -49,7 +49,7 @@ def readers() -> dict[str, Callable[[Path], object]]:
         "recipe": lambda path: run.settings(path, "relight", relight.Config),
         "poses": run.frame_names,
         "log": run.log_records,
-        "provenance": provenance.read_provenance,
+        "provenance": footage.read_provenance,
     }
 
 

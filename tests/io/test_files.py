@@ -113,6 +113,15 @@ def test_an_image_that_is_millions_of_pixels_wide_is_rejected(tmp_path: Path) ->
         files.read_radiance(tmp_path / "x.hdr")
 
 
+def test_a_document_names_files_in_utf8_only(tmp_path: Path) -> None:
+    """File names can be any bytes; a document with such a name could be written, but not be read again."""
+    files.write_json(tmp_path / "x.json", {"path": "caf\u00e9 \U0001f600"})
+    assert files.read_json(tmp_path / "x.json") == {"path": "caf\u00e9 \U0001f600"}
+    with pytest.raises(BadFile, match=r"y\.json: would name a file .*caf\\udce9.* \(rename it\)"):
+        files.write_json(tmp_path / "y.json", {"path": "/home/caf\udce9/x"})
+    assert not (tmp_path / "y.json").exists()
+
+
 def test_a_document_is_validated_with_its_keys(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text('{"a": [{"b": 1}, {"b": null}]}')
     with pytest.raises(BadFile, match=r'x\.json: "\[\.\.\.\]\[1\]\[\.\.\.\]": expected int, got null'):

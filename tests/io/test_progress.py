@@ -28,6 +28,22 @@ def test_a_task_is_one_line_of_the_log_and_another_every_while(
     assert caplog.messages[2:] == ["slow (9 steps)", *["slow: step 4 of 9, 0 s"] * 2, "unknown", "unknown: 0 s"]
 
 
+def test_names_of_files_are_shown_as_they_are(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They may hold what terminals and `rich` execute, or line breaks."""
+    caplog.set_level(logging.INFO, "tumble")
+    terminal = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0.05)
+    with progress.task("converting \x1b[2J[/red]\n.mp4"):
+        pass
+    assert caplog.messages == [r"converting \x1b[2J[/red]\n.mp4"]
+    monkeypatch.setattr(progress, "Console", lambda **_: terminal)
+    with progress.task("converting [/red].mp4", 2) as update:
+        update(1, lambda: "[/b]")
+    assert "[/red].mp4" in terminal.file.getvalue()
+
+
 def test_without_a_reader_of_the_log_a_task_starts_no_thread_and_describes_nothing(
     capfd: pytest.CaptureFixture[str],
 ) -> None:

@@ -231,3 +231,33 @@ def test_a_file_over_the_size_limit_is_refused(tmp_path: Path) -> None:
         handle.truncate(limits.MAX_MODEL_BYTES + 1)
     with pytest.raises(BadFile, match=r"points3D\.bin: has 1073741825 bytes, over the limit"):
         colmap.read(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("write", [write_text, write_binary])
+def test_a_model_of_too_many_entries_is_refused(
+    name: str, write: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gigabyte of shortest entries took ten."""
+    write(tmp_path / "sparse" / "0")
+    monkeypatch.setattr(colmap, "MAX_POINTS" if name == "points3D" else "MAX_IMAGES", 0)
+    file = "cameras" if name == "images" else name  # cameras are read first
+    with pytest.raises(BadFile, match=rf"{file}\..*: lists more than 0 entries \(make a model of fewer images\)"):
+        colmap.read(tmp_path)
+
+
+def test_text_is_read_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    images = write_text(tmp_path / "sparse" / "0") / "images.txt"
+    whole = images.read_text()
+    images.write_text(whole + "\n" * 9)
+    assert len(colmap.read(tmp_path).views) > 1
+    images.write_text(whole + "\n\n" + whole)
+    with pytest.raises(BadFile, match=r"images\.txt: has an empty line where an image is expected"):
+        colmap.read(tmp_path)
+    images.write_text(whole + "\n" * 20)
+    monkeypatch.setattr(colmap, "MAX_IMAGES", 5)
+    with pytest.raises(BadFile, match=r"images\.txt: has an empty line where an image is expected"):
+        colmap.read(tmp_path)
+    monkeypatch.setattr(colmap, "MAX_LINE_BYTES", 5)
+    with pytest.raises(BadFile, match=r"cameras\.txt: has a line of more than 5 bytes"):
+        colmap.read(tmp_path)

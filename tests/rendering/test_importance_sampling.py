@@ -74,6 +74,16 @@ def test_a_fine_map_is_sampled_by_averages_of_its_texels(monkeypatch: pytest.Mon
     torch.testing.assert_close((sampler.environment.lookup(d) / sampler.pdf(d)).mean(0), integral, rtol=0.1, atol=0)
 
 
+def test_few_and_many_numbers_find_the_same_bins() -> None:
+    """Fewer numbers than bins are sorted first."""
+    generator = torch.Generator().manual_seed(0)
+    ends, x = torch.rand(1000, generator=generator).double().cumsum(0), torch.rand(4, 500, generator=generator).double()
+    ends = ends / ends[-1]
+    many = importance_sampling._locate(ends, x)
+    few = importance_sampling._locate(ends, x[:, :20])
+    assert all(torch.equal(a[:, :20], b) for a, b in zip(many, few, strict=True))
+
+
 def test_samples_of_a_light_estimate_its_integral() -> None:
     environment = lamp([0.1, 0.9, -0.3])
     sampler = importance_sampling.light_sampler(environment)

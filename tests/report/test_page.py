@@ -214,6 +214,8 @@ def test_the_scripts_of_the_page_are_those_of_the_package(page: Path) -> None:
     scripts = re.findall(r"<script>(.*?)</script>", page.read_text("utf-8"), flags=re.S)
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     assert len(hashes) == 2
+    # These would make a browser see another text than the one that was hashed.
+    assert not any(sign in script for script in scripts for sign in ("<!--", "<script", "\r", "\0"))
     assert f"script-src 'sha256-{hashes[0]}' 'sha256-{hashes[1]}';" in source
 
 
@@ -316,6 +318,12 @@ def test_a_window_is_a_square_around_the_object_inside_the_image() -> None:
     assert left <= 70
     assert 79 <= left + width <= 80
     assert training_views.window(torch.zeros(50, 80, dtype=torch.bool)) == (0, 0, 50, 80)
+
+
+def test_curves_leave_out_what_is_no_loss() -> None:
+    """Of a log from elsewhere; numpy would warn of the arithmetic, and the path would hold "nan"."""
+    assert svg.curve([1.0, math.nan, 0.1, math.inf, 1e308, -1e308]) == svg.curve([1.0, 0.1])
+    assert svg.curve([math.nan, 2.0]) == ""
 
 
 def test_bars_leave_gaps_for_nan() -> None:

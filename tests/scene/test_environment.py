@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tumble.io import files
+from tumble.io import files, limits
 from tumble.io.files import BadFile
 from tumble.maths.directions import texel_directions
 from tumble.maths.se3 import SO3
@@ -95,6 +95,14 @@ def test_a_rotated_map_is_the_same_light_in_another_frame() -> None:
     )
 
 
+def test_a_lookup_without_a_gradient_has_the_same_bits() -> None:
+    light = Environment.from_radiance(torch.rand(6, 12, 3, generator=torch.Generator().manual_seed(0)))
+    d_env = torch.cat([texel_directions(9, 17).flatten(0, 1), torch.tensor([[0.0, 1, 0], [0, -1, 0], [0, 0, 1]])])
+    trained = Environment(light.log_radiance.clone().requires_grad_())
+    assert torch.equal(trained.lookup(d_env), light.lookup(d_env))
+    assert light.lookup(d_env[None]).shape == (1, len(d_env), 3)
+
+
 def test_lookup_has_a_gradient_to_texels_and_direction() -> None:
     torch.manual_seed(4)
     d = torch.nn.functional.normalize(torch.randn(6, 3, dtype=torch.float64), dim=-1).requires_grad_()
@@ -109,6 +117,22 @@ def test_environments_are_written_and_read(tmp_path: Path, name: str) -> None:
     # Radiance HDR keeps eight bits of the brightest channel, here up to three times another.
     rtol = 1e-5 if name.endswith("exr") else 3 / 128
     torch.testing.assert_close(Environment.read(tmp_path / name).radiance, radiance, rtol=rtol, atol=0)
+
+
+@pytest.mark.parametrize("name", ["sun.exr", "sun.hdr"])
+def test_a_large_map_is_averaged_when_it_is_read(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a map of 8k x 4k pixels, one rotation took 5 GiB. A sun of one texel keeps its energy."""
+    monkeypatch.setattr(limits, "MAX_LIGHT_ROWS", 64)
+    pixels = np.full((128, 256, 3), 0.5, np.float32)
+    pixels[41, 100] = 1000.0
+    (files.write_exr if name == "sun.exr" else files.write_hdr)(tmp_path / name, pixels)
+    radiance = Environment.read(tmp_path / name).radiance
+    assert radiance.shape == (64, 128, 3)
+    # Radiance HDR keeps 8 bits of a colour.
+    torch.testing.assert_close(radiance[20, 50], torch.full((3,), (3 * 0.5 + 1000) / 4), rtol=0.01, atol=0)
+    assert radiance.min() == pytest.approx(0.5, rel=0.01)
+    files.write_exr(tmp_path / "odd.exr", pixels[:126, :252])
+    assert Environment.read(tmp_path / "odd.exr").radiance.shape == (64, 128, 3)
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,24 @@ def writable() -> Path:
     Raises:
         NoCache: Neither can be written.
     """
-    folder = user_folder()
+    return _created(user_folder())
+
+
+def of_warp() -> Path:
+    """A folder in `writable` for Warp, which loads whatever it finds there, and writes with the modes of the umask.
+
+    Nobody else can enter it from now on; one into which others could write before is not used.
+
+    Raises:
+        NoCache: See `writable`.
+    """
+    folder = _created(writable() / "warp")
+    folder.chmod(0o700)
+    return folder
+
+
+def _created(folder: Path) -> Path:
+    """A folder that only this user can write, created if missing; a temporary one, with a warning, if others can."""
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
@@ -57,7 +74,7 @@ def writable() -> Path:
         f"{folder}: compiled kernels cannot be kept: {reason}; each process compiles them again until this is fixed or "
         "XDG_CACHE_HOME names another folder",
         RuntimeWarning,
-        stacklevel=2,
+        stacklevel=3,
     )
     return _process_folder()
 

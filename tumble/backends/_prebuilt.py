@@ -6,8 +6,11 @@ has none. Only the standard library is imported, because the build has nothing e
 
 import os
 import platform
+import re
 import shutil
 import subprocess
+import sysconfig
+from collections.abc import Iterable
 from pathlib import Path
 
 FOLDER = Path(__file__).parent / "prebuilt"
@@ -27,6 +30,9 @@ _X86: tuple[tuple[str, frozenset[str]], ...] = (("x86-64-v4", _V4), ("x86-64-v3"
 VARIANTS = {"x86_64": _X86, "aarch64": (("armv8-a", frozenset()),), "arm64": (("armv8-a", frozenset()),)}
 """By machine, fastest first: the -march of each library, of 16, 8 and 4 floats per vector on x86-64, and the processor
 features that it needs, as Linux names them. Other systems do not list features and use the last one."""
+
+SYSTEM_LIBRARIES = frozenset({b"libc.so.6", b"libm.so.6", b"libpthread.so.0", b"libgcc_s.so.1"})
+"""Libraries that every Linux with glibc has (PEP 600); of these, only the version of glibc matters to the kernels."""
 
 
 def choose(machine: str, features: frozenset[str], folder: Path = FOLDER) -> Path | None:
@@ -64,3 +70,19 @@ def compile_all(folder: Path) -> list[Path]:
         if subprocess.run(command, check=False).returncode == 0:
             libraries.append(library)
     return libraries
+
+
+def platform_tag(libraries: Iterable[Path]) -> str:
+    """Tag of the platform of a wheel with these libraries: that of every system with their symbols, as far as known.
+
+    Of libraries for Linux that need nothing but glibc this is `manylinux_X_Y_MACHINE` (PEP 600), where X.Y is the
+    newest version of glibc that they refer to, which an older build system lowers. Package indices accept no other.
+    """
+    content = b"".join(path.read_bytes() for path in libraries)
+    own = re.sub("[-.]", "_", sysconfig.get_platform())
+    needed = set(re.findall(rb"\0(lib[\w+-]+\.so[\d.]*)(?=\0)", content))
+    versions = [tuple(map(int, found.split(b"."))) for found in re.findall(rb"\0GLIBC_(\d+\.\d+)[\d.]*(?=\0)", content)]
+    if not own.startswith("linux_") or not versions or not needed <= SYSTEM_LIBRARIES:
+        return own
+    major, minor = max(versions)
+    return f"manylinux_{major}_{minor}_{own.removeprefix('linux_')}"

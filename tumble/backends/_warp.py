@@ -22,7 +22,7 @@ LANES = 32
 """Threads of a GPU warp."""
 
 if "WARP_CACHE_PATH" not in os.environ and wp.config.kernel_cache_dir is None:
-    wp.config.kernel_cache_dir = str(_cache.writable() / "warp")
+    wp.config.kernel_cache_dir = str(_cache.of_warp())
 # Suppresses Warp's banner, but not its warnings.
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 wp.init()

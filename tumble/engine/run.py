@@ -28,7 +28,7 @@ from torch import Tensor
 from tumble import __version__
 from tumble.engine import loop
 from tumble.engine.loop import Progress
-from tumble.io import BadFile, files, tree
+from tumble.io import BadFile, files, limits, outputs, tree
 
 T = TypeVar("T")
 
@@ -79,6 +79,12 @@ MAX_CHECKPOINTS = 20
 
 WRONG_FOLDER = "choose another folder with -o"
 """Fix that errors suggest for a folder that holds something else."""
+WRONG_RECIPE = "give the folder of a run; if this one is damaged, run the capture again, into another folder"
+"""Fix for a recipe that is missing or damaged."""
+WRONG_POSES = "repeat the tumble run that made this folder, which writes it again"
+"""Fix for a damaged list of poses."""
+WRONG_NOTE = "remove it, and repeat the tumble run that made it: the stage runs again"
+"""Fix for a damaged key of a stage."""
 
 
 class _CaptureRecord(TypedDict):
@@ -246,7 +252,7 @@ def settings(path: Path, part: str, cls: type[T]) -> T:
     try:
         return msgspec.convert(recipe(path).get(part), cls)
     except msgspec.ValidationError as error:
-        raise BadFile(path / RECIPE, f'"recipe.{part}": {files.violated_rule(error)}', WRONG_FOLDER) from None
+        raise BadFile(path / RECIPE, f'"recipe.{part}": {files.violated_rule(error)}', WRONG_RECIPE) from None
 
 
 def frame_names(path: Path, count: int | None = None) -> list[str]:
@@ -258,9 +264,10 @@ def frame_names(path: Path, count: int | None = None) -> list[str]:
     Raises:
         BadFile: `poses.json` is damaged, or holds another number of frames.
     """
-    names = list(files.read_json(path / POSES, dict[str, list[Annotated[list[float], msgspec.Meta(max_length=4)]]]))
+    kind = dict[str, list[Annotated[list[float], msgspec.Meta(max_length=4)]]]
+    names = list(files.read_json(path / POSES, kind, WRONG_POSES))
     if count is not None and len(names) != count:
-        raise BadFile(path / POSES, f"holds {len(names)} frames, the asset {count}", "repeat the command that made it")
+        raise BadFile(path / POSES, f"holds {len(names)} frames, the asset {count}", WRONG_POSES)
     return names
 
 
@@ -269,7 +276,7 @@ def _document(path: Path, *, of_any_format: bool = False) -> _RunRecord:
     try:
         document = files.read_json(path / RECIPE, _RunRecord)
     except BadFile as error:
-        raise BadFile(path / RECIPE, f"is not the recipe of a run: {error.rule}", WRONG_FOLDER) from None
+        raise BadFile(path / RECIPE, f"is not the recipe of a run: {error.rule}", WRONG_RECIPE) from None
     if document.get("format") != FORMAT and not of_any_format:
         rule = f"is a run of format {document.get('format', 1)}, made by another version; this version reads {FORMAT}"
         raise BadFile(path, rule, "run the capture again, into another folder with -o")
@@ -286,16 +293,17 @@ def asset(path: Path, cls: type[T]) -> T:
     """The asset of a finished run as a tree of class `cls`.
 
     Raises:
-        BadFile: The run is not finished, or is of an older format.
+        BadFile: The run is not finished, is of an older format, or holds a link out of it.
     """
     if not (path / ASSET).is_file():
         raise BadFile(path, f"has no {ASSET}", "finish the run first: tumble run")
+    outputs.require_no_links(path)  # who reads the asset goes on to write into the run
     _document(path)
     return tree.load(cls, path / ASSET)
 
 
 def _require_run_folder(path: Path) -> None:
-    """Raise `BadFile` if the path is a file, or a folder that holds something other than a run."""
+    """Raise `BadFile` if the path is a file, or a folder that holds something other than a run, or a link out of it."""
     if not path.exists():
         return
     if not path.is_dir():
@@ -304,6 +312,7 @@ def _require_run_folder(path: Path) -> None:
     others = [name for name in names if name not in (CAPTURE, LOCK) and not name.startswith(files.PARTIAL_PREFIX)]
     if others and not (path / RECIPE).is_file():
         raise BadFile(path, "exists and is not a run directory", WRONG_FOLDER)
+    outputs.require_no_links(path)
 
 
 def stage(
@@ -424,21 +433,32 @@ def log(run: Run, record: dict[str, Any]) -> None:
 
 
 def log_records(path: Path) -> list[dict[str, Any]]:
-    """The records in the log of a run directory.
+    """The records in the log of a run directory; of a log over the limit of `io.limits`, those at its end.
 
-    Lines that a killed process left incomplete are left out, and so are records whose values are of the wrong type. A
-    record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
+    Lines that a killed process left incomplete are left out, and so are records whose values are of the wrong type or
+    no valid text. A record with "step" is a `Progress`; one of the event "done" has "name" and "seconds".
     """
-    lines = (path / LOG).read_text("utf-8", errors="replace").splitlines() if (path / LOG).is_file() else []
     records = []
-    for line in lines:
+    for line in _last_lines(path / LOG, limits.MAX_LOG_BYTES):
         with contextlib.suppress(ValueError, RecursionError):
             record = json.loads(line)
+            json.dumps(record, ensure_ascii=False).encode()  # JSON can hold halves of characters, which no file can
             msgspec.convert(record, _LogRecord)
             needed = {"name", "of", "eta", "metrics"} if "step" in record else {"name", "seconds"}
             if needed <= record.keys() or not ("step" in record or record.get("event") == "done"):
                 records.append(record)
     return records
+
+
+def _last_lines(path: Path, size: int) -> list[str]:
+    """The whole lines among the last bytes of a text file; none if it is missing or no file."""
+    if not path.is_file():
+        return []
+    with path.open("rb") as file:
+        start = max(0, file.seek(0, os.SEEK_END) - size)
+        file.seek(start)
+        lines = file.read(size).decode(errors="replace").splitlines()
+    return lines[1:] if start else lines
 
 
 # Folder of a stage ----------------------------------------------------------------------------------------------------
@@ -448,7 +468,7 @@ def _is_done(folder: Path, own_key: str) -> bool:
     """Whether the folder of a stage holds an output with this key."""
     if not ((folder / OUT).is_file() and (folder / DONE).is_file()):
         return False
-    return files.read_json(folder / DONE, dict[str, Any]).get("key") == own_key
+    return files.read_json(folder / DONE, dict[str, Any], WRONG_NOTE).get("key") == own_key
 
 
 def _store(output: Any, folder: Path, about: dict[str, Any]) -> None:

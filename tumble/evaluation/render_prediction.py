@@ -54,6 +54,7 @@ def predict_views(
     coverage = torch.stack([view.alpha for view in buffers])
     # Maps extend beyond the silhouette to all pixels with a usable value; `masks` holds the silhouette.
     known = coverage >= cfg.alpha_min
+    geometry = relight.trace_geometry(asset)
     albedo = torch.stack([view.features["albedo"] for view in buffers]) * known[..., None]
     normals = torch.stack([normalize(view.normal, dim=-1) for view in buffers]) * known[..., None]
     return replace(
@@ -62,8 +63,8 @@ def predict_views(
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
         masks=coverage >= MIN_OBJECT_COVERAGE,
-        images=_rendered_views(cfg, asset, estimated_light, views, capture, "the estimated light"),
-        relit=_relit_views(cfg, asset, albedo, alignment, capture, truth),
+        images=_rendered_views(cfg, asset, geometry, estimated_light, views, capture, "the estimated light"),
+        relit=_relit_views(cfg, asset, geometry, albedo, alignment, capture, truth),
     )
 
 
@@ -119,6 +120,7 @@ def _with_scaled_depths(focal_ratio: float, trajectory: Trajectory) -> Trajector
 def _relit_views(
     cfg: relight.Config,
     asset: Asset,
+    geometry: relight.TracedGeometry,
     albedo: Float[Tensor, "v h w 3"],
     alignment: Similarity,
     capture: Capture,
@@ -131,14 +133,20 @@ def _relit_views(
     views = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     return {
-        name: _rendered_views(cfg, scaled, light.rotated(R_pred_true), views, capture, name)
+        name: _rendered_views(cfg, scaled, geometry, light.rotated(R_pred_true), views, capture, name)
         for name, light in truth.lights.items()
     }
 
 
 def _rendered_views(
-    cfg: relight.Config, asset: Asset, light: Environment, views: Trajectory, capture: Capture, name: str
+    cfg: relight.Config,
+    asset: Asset,
+    geometry: relight.TracedGeometry,
+    light: Environment,
+    views: Trajectory,
+    capture: Capture,
+    name: str,
 ) -> UInt8[Tensor, "v h w 3"]:
     """The views under a light with this name."""
-    linear = relight.relight(cfg, asset, light, views, capture.camera)
+    linear = relight.relight(cfg, asset, light, views, capture.camera, geometry=geometry)
     return to_srgb8(torch.stack(list(progress.track(linear, f"rendering views under {name}", len(views)))))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int8, Int32
 from torch import Tensor
-from torch.nn.functional import max_pool3d, normalize
+from torch.nn.functional import normalize
 
 from tumble.maths import SE3, SO3, fibonacci_sphere, local_frame
 from tumble.rendering import Buffers, rasterize
@@ -104,10 +104,12 @@ class _DepthMap:
 
     state: Int8[Tensor, " p"]
     """Per pixel: 1 surface, 0 unknown, -1 free space."""
+    depth: Float[Tensor, " p"]
+    """Per pixel, its z-depth [object radius]; meaningless unless the state is 1."""
     plane_index: Int32[Tensor, " p"]
     """Per pixel, its row in `planes`; meaningless unless the state is 1."""
-    planes: Float[Tensor, "k 5"]
-    """Unit normal, offset (object frame) and depth."""
+    planes: Float[Tensor, "k 4"]
+    """Unit normal and offset, object frame."""
 
 
 def _depth_map(
@@ -118,10 +120,8 @@ def _depth_map(
     offset = (normal * x_obj[known]).sum(-1)
     state = known.to(torch.int8) - ((view.alpha < 0.5) & (back < 0.5)).to(torch.int8)
     plane_index = (known.flatten().cumsum(0, dtype=torch.int32) - 1).clamp(min=0)
-    planes = torch.cat([normal, torch.stack([offset, view.depth[known]], -1)], -1)
-    # A view without any surface needs one row, because `plane_index` is 0 there.
-    planes = planes if len(planes) else planes.new_zeros(1, 5)
-    return _DepthMap(state.flatten(), plane_index, planes)
+    planes = torch.cat([normal, offset[:, None]], -1)
+    return _DepthMap(state.flatten(), view.depth.flatten(), plane_index, planes)
 
 
 def _fuse(
@@ -134,19 +134,28 @@ def _fuse(
         column, row = camera.project(x_cam).floor().long().unbind(-1)
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         pixel = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-        state, (normal, rest) = view.state[pixel], view.planes[view.plane_index[pixel].long()].split([3, 2], -1)
-        offset, depth = rest.unbind(-1)
-        distance = ((normal * x_obj).sum(-1) - offset) / cell
-        behind = (x_cam[:, 2] - depth) / cell
-        n_free += ~inside | (state < 0) | ((state > 0) & (behind < -3 * TRUNCATION) & (distance > TRUNCATION))
-        cosine = (normal * (poses[i].inverse().xyz - x_obj)).sum(-1) / CAMERA_DISTANCE
+        state = view.state.index_select(0, pixel)
+        behind = (x_cam[:, 2] - view.depth.index_select(0, pixel)) / cell
+        n_free += ~inside | (state < 0)
+        # The rest depends on the few points that are not far behind a surface.
+        index = torch.where(inside & (state > 0) & (behind < 3 * TRUNCATION))[0]
+        rows = view.planes.index_select(0, view.plane_index.index_select(0, pixel.index_select(0, index)))
+        x, behind, (normal, offset) = (
+            x_obj.index_select(0, index),
+            behind.index_select(0, index),
+            rows.split([3, 1], -1),
+        )
+        distance = ((normal * x).sum(-1) - offset[:, 0]) / cell
+        n_free.index_add_(0, index, ((behind < -3 * TRUNCATION) & (distance > TRUNCATION)).to(n_free))
+        cosine = (normal * (poses[i].inverse().xyz - x)).sum(-1) / CAMERA_DISTANCE
         # The weight fades to 0 two cells behind the surface, where a thin wall may have ended. With a wider fade, a
         # plate of three cells comes out four cells thick (test_a_thin_plate_keeps_both_sides).
         fade = (1 + (distance + 0.5).clamp(max=0) / 1.5).clamp(min=0)
-        near = inside & (state > 0) & (distance.abs() < TRUNCATION) & (behind.abs() < 3 * TRUNCATION)
-        weight = near * fade * cosine.clamp(min=0).square()
-        total, weights = total + weight * distance, weights + weight
-        outer, outer_weights = outer + weight * distance.clamp(min=0), outer_weights + weight * (distance > 0)
+        weight = (distance.abs() < TRUNCATION) * (behind > -3 * TRUNCATION) * fade * cosine.clamp(min=0).square()
+        total.index_add_(0, index, weight * distance)
+        weights.index_add_(0, index, weight)
+        outer.index_add_(0, index, weight * distance.clamp(min=0))
+        outer_weights.index_add_(0, index, weight * (distance > 0))
     free = n_free > FREE_FRACTION * len(maps)
     total, weights = torch.where(free, outer, total), torch.where(free, outer_weights, weights)
     far = torch.where(n_free >= 2, float(TRUNCATION), -float(TRUNCATION))
@@ -155,9 +164,10 @@ def _fuse(
 
 def _dilated(marked: Bool[Tensor, "a b c"], reach: int) -> Bool[Tensor, "a b c"]:
     """Marked voxels dilated by a cube of half side `reach` [voxels]."""
-    x = marked[None, None].float()
     for axis in range(3):
-        kernel, padding = [1, 1, 1], [0, 0, 0]
-        kernel[axis], padding[axis] = 2 * reach + 1, reach
-        x = max_pool3d(x, kernel, 1, padding)
-    return x[0, 0] > 0
+        grown = marked.movedim(axis, 0).clone()
+        for step in range(1, reach + 1):
+            grown[step:] |= marked.movedim(axis, 0)[:-step]
+            grown[:-step] |= marked.movedim(axis, 0)[step:]
+        marked = grown.movedim(0, axis)
+    return marked

@@ -6,7 +6,7 @@ Every file is written atomically. Every reader raises `BadFile` with the rule th
 
 from tumble.io import files, limits, outputs, progress, tree, video, weights
 from tumble.io.checked_tensors import read_tensors, write_tensors
-from tumble.io.errors import BadFile
+from tumble.io.errors import BadFile, one_line
 from tumble.io.plugins import load_plugin, plugin_names
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "files",
     "limits",
     "load_plugin",
+    "one_line",
     "outputs",
     "plugin_names",
     "progress",

@@ -8,13 +8,13 @@ class BadFile(ValueError):
 
     def __init__(self, path: Path, rule: str, fix: str = "") -> None:
         self.rule, self.fix = rule, fix
-        super().__init__(_one_line(f"{path}: {rule}" + (f" ({fix})" if fix else "")))
+        super().__init__(one_line(f"{path}: {rule}" + (f" ({fix})" if fix else "")))
 
 
 class WriteError(OSError):
     """Error for a file that could not be written; the message holds the file, the reason and the fix."""
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
     """A text with line breaks and other control characters, which file names may hold, as escape sequences."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

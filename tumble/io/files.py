@@ -133,19 +133,22 @@ def remove_partial_files(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def read_json(path: Path, kind: type[T] | Any = Any) -> T:
+def read_json(path: Path, kind: type[T] | Any = Any, fix: str = "") -> T:
     """The JSON document in a file, as `kind`: a record of msgspec, a dict or list of them, or any type that it knows.
 
     Keys that a record does not have are ignored.
+
+    Args:
+        fix: What the user should do about a damaged document that a command wrote, for the error message.
 
     Raises:
         BadFile: The file is missing, too large, no valid JSON, or does not match `kind`; the message names the key.
     """
     limits.require_file(path, limits.MAX_DOCUMENT_BYTES)
-    return parse_json(path, path.read_bytes(), kind)
+    return parse_json(path, path.read_bytes(), kind, fix)
 
 
-def parse_json(path: Path, content: bytes | str, kind: type[T] | Any = Any) -> T:
+def parse_json(path: Path, content: bytes | str, kind: type[T] | Any = Any, fix: str = "") -> T:
     """A JSON document that was read from `path`, as `kind`; see `read_json`.
 
     Raises:
@@ -154,10 +157,11 @@ def parse_json(path: Path, content: bytes | str, kind: type[T] | Any = Any) -> T
     try:
         return msgspec.json.decode(content, type=kind)
     except msgspec.ValidationError as error:
-        raise BadFile(path, violated_rule(error)) from None
+        raise BadFile(path, violated_rule(error), fix) from None
     except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
         reason = str(error).removeprefix("JSON is malformed: ")
-        raise BadFile(path, f"is not valid JSON: {reason}", "JSON has no NaN, no Infinity, no comments") from None
+        fix = fix or "JSON has no NaN, no Infinity, no comments"
+        raise BadFile(path, f"is not valid JSON: {reason}", fix) from None
 
 
 def violated_rule(error: msgspec.ValidationError) -> str:
@@ -168,9 +172,19 @@ def violated_rule(error: msgspec.ValidationError) -> str:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write an indented JSON document; NaN and infinities, which JSON does not define, become null."""
-    text = json.dumps(_without_nan(document), indent=1, allow_nan=False)
-    write_atomically(path, lambda partial: partial.write_text(text + "\n", "utf-8"))
+    """Write an indented JSON document; NaN and infinities, which JSON does not define, become null.
+
+    Raises:
+        BadFile: The document names a file whose name is not valid UTF-8, as JSON is.
+        WriteError: See `write_atomically`.
+    """
+    text = json.dumps(_without_nan(document), indent=1, allow_nan=False, ensure_ascii=False)
+    try:
+        content = text.encode()
+    except UnicodeEncodeError as error:  # Python represents other bytes of file names by halves of characters
+        name = text[max(0, error.start - 20) : error.end + 20]
+        raise BadFile(path, f"would name a file whose name is not valid UTF-8: ...{name}...", "rename it") from None
+    write_atomically(path, lambda partial: partial.write_bytes(content + b"\n"))
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -15,10 +15,15 @@ MAX_SIDE = 1 << 15
 MAX_DECODED_BYTES = 1 << 29
 """Maximum size of one file after decoding, with all its channels, layers, textures and vertices: 512 MiB. An
 environment map of 8k x 4k pixels has 384 MiB."""
+MAX_LIGHT_ROWS = 2048
+"""Rows of an environment map; larger maps are averaged when they are read. A texel has 0.09 degrees, a sixth of the
+sun's diameter, and each operation on a map takes 100 MiB instead of 400."""
 MAX_CAPTURE_BYTES = 1 << 32
 """Maximum size of all decoded images and masks of a capture: 4 GiB, or 3400 frames of 640 x 480 pixels."""
 MAX_DOCUMENT_BYTES = 1 << 25
 """Maximum size of a JSON document: 32 MiB; ten thousand frames have 6."""
+MAX_LOG_BYTES = 1 << 24
+"""Size of the part at the end of a run's log that is read: 16 MiB; a run of a day writes 7."""
 MAX_MODEL_BYTES = 1 << 30
 """Maximum size of a file of a COLMAP model: 1 GiB; a model of a thousand images has a tenth of it."""
 
@@ -48,7 +53,8 @@ def require_bytes(path: Path, size: int, what: str, limit: int | None = None) ->
     """
     limit = MAX_DECODED_BYTES if limit is None else limit
     if size > limit:
-        raise BadFile(path, f"holds {what}: {size >> 20} MiB when decoded, over the limit of {limit >> 20} MiB")
+        rule = f"holds {what}: {size >> 20} MiB when decoded, over the limit of {limit >> 20} MiB"
+        raise BadFile(path, rule, "make it smaller, or leave out channels, layers or textures that are not needed")
 
 
 def require_file(path: Path, limit: int | None = None) -> None:
@@ -60,4 +66,4 @@ def require_file(path: Path, limit: int | None = None) -> None:
     if not path.is_file():
         raise BadFile(path, "is missing" if not path.exists() else "is not a file")
     if limit is not None and path.stat().st_size > limit:
-        raise BadFile(path, f"has {path.stat().st_size} bytes, over the limit of {limit}")
+        raise BadFile(path, f"has {path.stat().st_size} bytes, over the limit of {limit}", "make it smaller")

@@ -4,6 +4,7 @@ A command writes into a folder that is new, empty, or holds its own earlier outp
 the command always writes first, its *mark*. It writes a file only where none is. Anything else takes `--overwrite`.
 """
 
+import os
 from collections.abc import Collection
 from pathlib import Path
 
@@ -22,15 +23,33 @@ def claim_folder(folder: Path, mark: str, *, overwrite: bool = False, fix: str =
         fix: What the error suggests for a folder with other files.
 
     Raises:
-        BadFile: The path or a part of it is a file, or the folder holds something other than the command's output.
+        BadFile: The path or a part of it is a file, or the folder holds something other than the command's output, or
+            a link out of it.
     """
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise BadFile(existing, "is a file, where a folder is to be written", "choose another folder with -o")
+    if (folder / mark).is_file():
+        require_no_links(folder)
     if overwrite or existing != folder or (folder / mark).is_file():
         return
     if any(not path.name.startswith(PARTIAL_PREFIX) for path in folder.iterdir()):
         raise BadFile(folder, f"holds other files, and no {mark} of an earlier output of this command", fix)
+
+
+def require_no_links(folder: Path) -> None:
+    """Check that no link in an earlier output leads out of it: it may come from somebody else, and is written into.
+
+    Raises:
+        BadFile: One does.
+    """
+    root = os.path.realpath(folder)
+    for place, folders, names in os.walk(folder):
+        for path in (Path(place, name) for name in (*folders, *names)):
+            target = os.path.realpath(path)
+            if path.is_symlink() and not Path(target).is_relative_to(root):
+                reason = "what is written through a link could replace any file of yours"
+                raise BadFile(path, f"is a link to {target}, outside of {folder}", f"remove it; {reason}")
 
 
 def claim_file(path: Path, suffixes: Collection[str], *, overwrite: bool = False) -> None:

@@ -15,6 +15,8 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from tumble.io.errors import one_line
+
 T = TypeVar("T")
 
 LOG = logging.getLogger("tumble")
@@ -37,7 +39,7 @@ def task(name: str, total: int | None = None) -> Iterator[Update]:
         name: What is done, for display.
         total: Number of steps, if it is known.
     """
-    console = Console(stderr=True)
+    console, name = Console(stderr=True), one_line(name)
     with _bar(name, total, console) if console.is_terminal else _log_lines(name, total) as update:
         yield update
 
@@ -53,7 +55,10 @@ def track(items: Iterable[T], name: str, total: int) -> Iterator[T]:
 @contextlib.contextmanager
 def _bar(name: str, total: int | None, console: Console) -> Iterator[Update]:
     steps = () if total is None else (MofNCompleteColumn(), TimeRemainingColumn())
-    columns = (TextColumn("{task.description}"), BarColumn(), *steps, TextColumn("{task.fields[text]}"))
+    name_column, text_column = (
+        TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[text]}")
+    )
+    columns = (name_column, BarColumn(), *steps, text_column)
     columns = columns if total is not None else (*columns, TimeElapsedColumn())
     # A thread that draws would compete with training; it is only used where no step causes a drawing.
     bar = Progress(*columns, console=console, auto_refresh=total is None, transient=True)

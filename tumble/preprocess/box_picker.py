@@ -20,7 +20,7 @@ import numpy as np
 
 from tumble.io import BadFile, files
 from tumble.preprocess import footage
-from tumble.preprocess.footage import PROVENANCE, FootageFrame
+from tumble.preprocess.footage import PROVENANCE, WRONG_PROVENANCE, FootageFrame
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import lens_of, undistort_frame
@@ -66,7 +66,7 @@ def pick_box(
     if input_kind(path) not in ("video", "images"):
         raise BadFile(path, "is neither a video nor a folder of images", "--pick works only for those: leave it out")
     if (capture / PROVENANCE).is_file():
-        saved = files.read_json(capture / PROVENANCE, _Marked).options
+        saved = files.read_json(capture / PROVENANCE, _Marked, WRONG_PROVENANCE).options
         return replace(options, box=saved.box, at=saved.at)
     frame = sharpest_frame(path, options)
     box = request_box(frame, output)

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from tumble.datasets import MAX_DISTORTION, plausible_focal
 from tumble.io import BadFile, limits
 from tumble.maths import SO3
 
+T = TypeVar("T")
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -41,6 +43,12 @@ MAX_POSITION = 1e9
 """Maximum entry of a translation [unit of the model]."""
 QUATERNION_TOLERANCE = 1e-3
 """Maximum deviation of a quaternion's length from 1."""
+MAX_IMAGES = 100_000
+"""Maximum number of cameras and of images of a model; each takes a kilobyte of memory."""
+MAX_POINTS = 10_000_000
+"""Maximum number of points of a model; reconstructions of a thousand images have a million."""
+MAX_LINE_BYTES = 1 << 24
+"""Maximum length of a line, for text files: 16 MiB; the line with the keypoints of an image has one."""
 
 
 @dataclass(frozen=True)
@@ -126,19 +134,28 @@ def _read(folder: Path) -> SparseModel:
     cameras, images, points = (_file(folder, name) for name in ("cameras", "images", "points3D"))
     assert cameras is not None, "checked by _model_folders"
     assert images is not None, "checked by _model_folders"
-    optics = dict(_cameras(cameras))
-    views = sorted(_views(images, optics), key=lambda view: view.name)
+    optics = dict(_at_most(MAX_IMAGES, _cameras(cameras), cameras))
+    views = sorted(_at_most(MAX_IMAGES, _views(images, optics), images), key=lambda view: view.name)
     if not views:
         raise BadFile(images, "lists no image")
     if len({view.name for view in views}) < len(views):
         raise BadFile(images, "lists two images of the same name")
-    rows = np.fromiter(_points(points) if points is not None else (), np.dtype((np.float64, 4)))
+    listed = _at_most(MAX_POINTS, _points(points), points) if points is not None else ()
+    rows = np.fromiter(listed, np.dtype((np.float64, 4)))
     if points is not None and not np.isfinite(rows).all():
         raise BadFile(points, "contains NaN or infinity")
     return SparseModel(folder, tuple(views), rows[:, :3], rows[:, 3])
 
 
 # The same for both file formats ---------------------------------------------------------------------------------------
+
+
+def _at_most(count: int, entries: Iterator[T], path: Path) -> Iterator[T]:
+    """The entries of a file, which may not be more than `count`."""
+    for number, entry in enumerate(entries):
+        if number >= count:
+            raise BadFile(path, f"lists more than {count} entries", "make a model of fewer images")
+        yield entry
 
 
 def _cameras(path: Path) -> Iterator[tuple[int, Optics]]:
@@ -247,10 +264,15 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 # Text -----------------------------------------------------------------------------------------------------------------
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(path: Path) -> Iterator[str]:
     """Lines that are no comments, including empty ones, which occur as the keypoints of images."""
-    lines = _content(path).decode("utf-8", errors="replace").splitlines()
-    return [line for line in lines if not line.startswith("#")]
+    limits.require_file(path, limits.MAX_MODEL_BYTES)
+    with path.open("rb") as file:
+        while line := file.readline(MAX_LINE_BYTES + 1):
+            if len(line) > MAX_LINE_BYTES:
+                raise BadFile(path, f"has a line of more than {MAX_LINE_BYTES} bytes", "no image has as many keypoints")
+            if not line.startswith(b"#"):
+                yield line.decode("utf-8", errors="replace")
 
 
 def _numbers(path: Path, words: list[str]) -> tuple[float, ...]:
@@ -280,11 +302,14 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float,
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, tuple[float, ...], int]]:
-    lines = _lines(path)
-    while lines and not lines[-1].strip():
-        lines.pop()
-    for line in lines[::2]:
+    ended = False
+    for number, line in enumerate(_lines(path)):
         words = line.split(maxsplit=9)
+        ended = ended or (number % 2 == 0 and not words)
+        if ended and (words or number > 2 * MAX_IMAGES):
+            raise BadFile(path, "has an empty line where an image is expected", "there must be two lines per image")
+        if ended or number % 2 == 1:
+            continue
         if len(words) < 10:
             raise BadFile(path, f"has {line[:60]!r} where an image is expected", "there must be two lines per image")
         _, *pose, camera = _numbers(path, words[:9])

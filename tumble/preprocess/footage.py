@@ -45,6 +45,8 @@ ORIENTATIONS = ((0, False), (0, False), (0, True), (2, False), (2, True), (3, Tr
 right after them."""
 PROVENANCE = "ingest.json"
 """File name, in a capture, of the record of how it was made."""
+WRONG_PROVENANCE = "remove the folder that holds it, and convert the footage again"
+"""Fix for a damaged record of how a capture was made."""
 
 
 @dataclass(frozen=True)
@@ -291,4 +293,4 @@ def read_provenance(capture: Path) -> Provenance | None:
         BadFile: The record is damaged.
     """
     path = capture / PROVENANCE
-    return files.read_json(path, Provenance) if path.is_file() else None
+    return files.read_json(path, Provenance, WRONG_PROVENANCE) if path.is_file() else None

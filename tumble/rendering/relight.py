@@ -40,9 +40,32 @@ class Config:
     """Number of directions over which a preview integrates the light."""
 
 
+@dataclass(frozen=True)
+class TracedGeometry:
+    """What relighting needs of an asset's geometry, whatever its light and material."""
+
+    tracer: Tracer
+    transfer: Float[Tensor, "n 9"]
+    """Transfer vectors of the Gaussians."""
+
+
+@torch.no_grad()
+def trace_geometry(asset: Asset) -> TracedGeometry:
+    """Tracer of the Gaussians, and their transfer vectors, traced from the frames of the capture."""
+    tracer = build_tracer(asset.gaussians, asset.gamma)
+    return TracedGeometry(tracer, _transfer(asset, tracer))
+
+
 @torch.no_grad()
 def relight(
-    cfg: Config, asset: Asset, environment: Environment, trajectory: Trajectory, camera: Camera, *, seed: int = 0
+    cfg: Config,
+    asset: Asset,
+    environment: Environment,
+    trajectory: Trajectory,
+    camera: Camera,
+    *,
+    geometry: TracedGeometry | None = None,
+    seed: int = 0,
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """Images of the object along a trajectory, under a light: linear radiance over black, one view at a time.
 
@@ -52,12 +75,13 @@ def relight(
         environment: Light in the env frame of `trajectory`.
         trajectory: Poses; its field `light` defines whether the light is fixed to the camera or to the object.
         camera: Intrinsics and image size.
+        geometry: That of the asset, if it is known from an earlier call.
         seed: Seed of the random samples.
     """
     material = asset.material
-    tracer = build_tracer(asset.gaussians, asset.gamma)
+    geometry = geometry or trace_geometry(asset)
     sampler = light_sampler(environment)
-    diffuse = Bounce(material.albedo.mean(1), _transfer(asset, tracer))
+    diffuse = Bounce(material.albedo.mean(1), geometry.transfer)
     bounce = GlossyBounce(diffuse, material.roughness.mean(1, keepdim=True), prefilter(environment))
     generator = torch.Generator().manual_seed(seed)
     for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
@@ -67,7 +91,7 @@ def relight(
             points.sample(view.features["roughness"]),
             sampler,
             R_env_obj,
-            tracer,
+            geometry.tracer,
             f0=float(material.f0),
             generator=generator,
             n_brdf=cfg.brdf_samples,

@@ -249,9 +249,13 @@ def _duration(seconds: float) -> str:
 def _timings(records: Sequence[dict[str, Any]]) -> list[tuple[str, str, str, Markup]]:
     """Name, number of steps, duration and loss curve of every finished stage, and their sum; empty without any."""
     done = _seconds(records)
+    steps_of: dict[str, list[dict[str, Any]]] = {name: [] for name in done}
+    for record in records:
+        if record.get("metrics") and record.get("name") in done:
+            steps_of[record["name"]].append(record)
     lines = []
     for name, seconds in done.items():
-        steps = [record for record in records if record.get("name") == name and record.get("metrics")]
+        steps = steps_of[name]
         values = [record["metrics"]["render"] for record in steps if record["metrics"].get("render") is not None]
         lines.append((name, str(steps[-1].get("of", "-")) if steps else "-", _duration(seconds), svg.curve(values)))
     return [*lines, ("all", "", _duration(sum(done.values())), Markup(""))] if lines else []

@@ -12,6 +12,8 @@ from markupsafe import Markup
 
 RADIUS = 100
 """Radius of a globe [SVG units]."""
+MAX_VALUE = float(np.finfo(np.float32).max)
+"""Largest value of a curve, beyond that of any loss."""
 
 
 def bars(values: Sequence[float], marks: Sequence[str]) -> Markup:
@@ -33,7 +35,11 @@ def bars(values: Sequence[float], marks: Sequence[str]) -> Markup:
 
 
 def curve(values: Sequence[float]) -> Markup:
-    """Line chart of equally spaced values, on a logarithmic scale if all are positive; "" for less than two values."""
+    """Line chart of equally spaced values, on a logarithmic scale if all are positive; "" for less than two values.
+
+    Values that no loss has are left out: NaN, infinities, and those beyond the range of 32-bit floats.
+    """
+    values = [value for value in values if abs(value) <= MAX_VALUE]
     if len(values) < 2:
         return Markup("")
     y = np.log(values) if min(values) > 0 else np.asarray(values)

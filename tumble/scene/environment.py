@@ -8,11 +8,12 @@ Texel centres lie at +0.5. Radiance is linear RGB.
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.io import BadFile, files
+from tumble.io import BadFile, files, limits
 from tumble.maths import equirect_from_direction, texel_directions, texel_solid_angles
 
 MIN_RADIANCE = 1e-6
@@ -33,7 +34,7 @@ class Environment:
 
     @staticmethod
     def read(path: Path | str) -> "Environment":
-        """The environment in an equirectangular .exr or .hdr image.
+        """The environment in an equirectangular .exr or .hdr image; of more than `MAX_LIGHT_ROWS` rows, averaged.
 
         Raises:
             BadFile: The image is not finite, non-negative RGB and twice as wide as high.
@@ -47,6 +48,9 @@ class Environment:
         if pixels.min() < 0:
             rule = f"an environment map must have no negative values, but the least is {pixels.min():.3g}"
             raise BadFile(path, rule, "clamp at 0")
+        if pixels.shape[0] > limits.MAX_LIGHT_ROWS:
+            size = 2 * limits.MAX_LIGHT_ROWS, limits.MAX_LIGHT_ROWS
+            pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
         return Environment.from_radiance(torch.from_numpy(pixels))
 
     def write(self, path: Path) -> None:
@@ -111,16 +115,20 @@ class Environment:
 
 def bilinear(texels: Float[Tensor, "h w c"], uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b c"]:
     """Bilinear lookup in an equirectangular map at coordinates in [0, 1]^2, continuous across seam and poles."""
-    h, w, _ = texels.shape
+    h, w, c = texels.shape
     x, y = uv[..., 0] * w - 0.5, uv[..., 1] * h - 0.5
     left, top = x.detach().floor(), y.detach().floor()
     fx, fy = (x - left)[..., None], (y - top)[..., None]
-    left, top = left.long(), top.long()
+    left, top = left.int(), top.int()
 
     def at(row: Tensor, column: Tensor) -> Tensor:
         # The neighbour across a pole is the same row, half a revolution away.
         across_pole = (row < 0) | (row >= h)
-        return texels[row.clamp(0, h - 1), torch.where(across_pole, column + w // 2, column) % w]
+        row, column = row.clamp(0, h - 1), torch.where(across_pole, column + w // 2, column) % w
+        if texels.requires_grad:
+            return texels[row, column]
+        # The same in a tenth of the time; its gradient would be summed in another order.
+        return texels.reshape(-1, c).index_select(0, (row * w + column).flatten()).reshape(*row.shape, c)
 
     upper = at(top, left) * (1 - fx) + at(top, left + 1) * fx
     lower = at(top + 1, left) * (1 - fx) + at(top + 1, left + 1) * fx
