@@ -1,6 +1,7 @@
 """Every backend against the reference, and the reference against closed forms, brute force and finite differences."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from torch.nn.functional import normalize
 from tests.backends import cases
 from tumble import backends
 from tumble.backends import _brute, reference
+from tumble.maths import images
+from tumble.scene import capture
 
 CPU = torch.device("cpu")
 RELATIVE = 1e-4
@@ -388,6 +391,180 @@ def _integrated_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0:
         F += f0 / 0.08 * ((inside - 1.5 * vh) / (inside + 1.5 * vh)) ** 2
         result.append((D * F * G / (4 * mu * nv) * mu).mean() * 2 * math.pi)
     return np.array(result)
+
+
+# ------------------------------------------------------------------------------- kernels of the steps of stage 2
+
+
+def _compare(backend: backends.Backend, run: Callable[..., list[torch.Tensor]], limit: float = RELATIVE) -> None:
+    """`run(backend, dtype)` of a backend in float32 against the reference in float64."""
+    worst = [
+        cases.difference(a, b) for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True)
+    ]
+    assert max(worst) < limit, worst
+
+
+def _lit_gaussians(n: int, d: int) -> list[torch.Tensor]:
+    """Arguments of `sh_shade`, rounded to float32; the matrix is no rotation, as its entries are independent."""
+    rng = torch.Generator().manual_seed(n)
+    shapes = (n, 3), (n, 4), (n, 3), (2, 16, 3), (), (n, 9), (n, 9), (3, 3)
+    means, quats, logits, light, scale, occluded, unoccluded, R = (torch.randn(x, generator=rng) for x in shapes)
+    reflectance = 0.04 * torch.tensor([0.937, -0.296, 5.535, -11.654, 20.113, -9.978])
+    transfer = [0.3 * occluded + 0.5, unoccluded.abs() + 0.3, cases.fibonacci(d).float()]
+    return [
+        means,
+        quats,
+        2 * logits,
+        0.5 * light,
+        scale.exp(),
+        *transfer,
+        reflectance,
+        R,
+        torch.tensor([0.1, 0.2, 3.0]),
+    ]
+
+
+@pytest.mark.parametrize("n", [0, 1, 133])
+@pytest.mark.parametrize("shadowed", [False, True])
+def test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference(
+    backend: backends.Backend, n: int, shadowed: bool
+) -> None:
+    inputs, rng = _lit_gaussians(n, 75), torch.Generator().manual_seed(1)
+    seed = torch.randn(n, 3, generator=rng)
+    if not shadowed:
+        inputs[5:7] = [torch.zeros(0, 9)] * 2
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        shaded = by.sh_shade(*x)
+        return [shaded, *torch.autograd.grad(shaded, [*x[:5], *x[9:]], seed.to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_shading_by_harmonics_are_finite_differences() -> None:
+    """Without self-shadowing, which counts as a constant; the gradient of the rotations is scaled."""
+    inputs = [x.double() for x in _lit_gaussians(5, 9)]
+    quats, rest = inputs[1], (torch.zeros(0, 9).double(), torch.zeros(0, 9).double(), *inputs[7:9])
+    others = [x.requires_grad_() for x in (inputs[0], *inputs[2:5], *inputs[9:])]
+
+    def render(means: torch.Tensor, *x: torch.Tensor) -> torch.Tensor:
+        return reference.sh_shade(means, quats, *x[:3], *rest, *x[3:])
+
+    assert torch.autograd.gradcheck(render, others, fast_mode=True)
+
+    def of_quats(q: torch.Tensor) -> torch.Tensor:
+        return reference.sh_shade(others[0].detach(), q, *(x.detach() for x in others[1:4]), *rest, *inputs[9:]).sum()
+
+    analytic = torch.autograd.grad(of_quats(quats.requires_grad_()), quats)[0]
+    step = 1e-6 * torch.randn(quats.shape, generator=torch.Generator().manual_seed(0)).double()
+    change = (of_quats(quats + step) - of_quats(quats - step)) / 2
+    assert (analytic * step).sum().item() == pytest.approx(backends.NORMAL_GRADIENT * change.item(), rel=1e-5)
+
+
+def _pictures(height: int, width: int, box: tuple[slice, slice]) -> list[torch.Tensor]:
+    """Arguments of `image_terms` up to the mask: an object within a box, with saturated and unknown pixels."""
+    rng = torch.Generator().manual_seed(height)
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.rand(height, width, *shape, generator=rng)
+
+    inside = torch.zeros(height, width)
+    inside[box] = 1
+    alpha, rgb = inside * (0.4 + 0.6 * noise()), inside[..., None] * (1.5 * noise(3) - 0.1)
+    depth, variance = inside * (3 + 0.1 * noise()), inside * (0.01 * noise() - 1e-5)
+    photo = (inside[..., None] * 280 * noise(3)).clamp(max=255).to(torch.uint8)
+    mask = (inside * torch.tensor([0.0, 128.0, 255.0, 255.0])[(4 * noise()).long()]).to(torch.uint8)
+    return [rgb, alpha, depth, variance, inside[..., None] * (noise(3) - 0.3), photo, mask]
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "box"),
+    [
+        (40, 50, (slice(8, 30), slice(12, 40))),
+        (37, 51, (slice(None), slice(None))),
+        (64, 33, (slice(50, None), slice(20, None))),
+        (11, 11, (slice(2, 5), slice(2, 5))),
+        (13, 90, (slice(6, 7), slice(3, 4))),
+        (20, 21, (slice(0, 0), slice(0, 0))),
+    ],
+)
+@pytest.mark.parametrize(("ssim_weight", "crease"), [(0.2, 25.0), (1.0, 0.0)])
+def test_terms_of_images_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, height: int, width: int, box: tuple[slice, slice], ssim_weight: float, crease: float
+) -> None:
+    *images, photo, mask = _pictures(height, width, box)
+    R, _, focal = (x.float() for x in cases.camera(height, width))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (*images, R)]
+        terms = by.image_terms(*x[:5], photo, mask, x[5], focal.to(dtype), ssim_weight, crease)
+        return [terms, *torch.autograd.grad(terms, x, torch.tensor([1.0, 2.0, 3.0, 4.0]).to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_image_terms_are_finite_differences() -> None:
+    *images, photo, mask = _pictures(13, 12, (slice(1, 12), slice(1, 11)))
+    R, _, focal = cases.camera(13, 12)
+    photo = photo.clamp(max=250)  # a rendering equal to a saturated photo has a kink
+    inputs = [x.double().requires_grad_() for x in (*images, R)]
+    # Where alpha is 0 the variance does not count, and a change of alpha would make it count.
+    inside = (images[1] > 0).double()
+
+    def on_the_object(*x: torch.Tensor) -> torch.Tensor:
+        view = (x[0] * inside[..., None], x[1] * inside, x[2], x[3] * inside, x[4])
+        return reference.image_terms(*view, photo, mask, x[5], focal, 0.3, 5.0)
+
+    assert torch.autograd.gradcheck(on_the_object, inputs, eps=1e-7, atol=1e-5, fast_mode=True)
+
+
+def _measured_gaussians(n: int) -> list[torch.Tensor]:
+    """Arguments of `gaussian_terms` up to the depth: some needles, some Gaussians outside of the image or unseen."""
+    rng = torch.Generator().manual_seed(n)
+    means, quats, log_scales, sdf = (torch.randn(n, *x, generator=rng) for x in ((3,), (4,), (3,), ()))
+    log_scales[: n // 8] *= 0.01
+    weight = (torch.rand(n, generator=rng) - 0.3).clamp(min=0)
+    depth = 3 + 0.3 * torch.rand(40, 50, generator=rng)
+    depth[:10] = 0
+    return [0.4 * means, quats, log_scales, 0.05 * sdf, torch.tensor(8.0), weight, depth]
+
+
+@pytest.mark.parametrize(("n", "gamma"), [(333, 8.0), (332, 100.0), (1, 8.0), (0, 8.0)])
+def test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, n: int, gamma: float
+) -> None:
+    *own, _, weight, depth = _measured_gaussians(n)
+    R, t, focal = (x.float() for x in cases.camera(40, 50))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (*own, torch.tensor(gamma), R, t)]
+        terms = by.gaussian_terms(*x[:5], weight.to(dtype), depth.to(dtype), *x[5:], focal.to(dtype), 0.01, 0.2)
+        gradients = torch.autograd.grad(terms, x, torch.tensor([1.0, 2.0, 3.0]).to(dtype), materialize_grads=True)
+        return [terms, *gradients]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_gaussian_terms_are_finite_differences() -> None:
+    """The median of the signed distances counts as a constant."""
+    means, quats, log_scales, sdf, _, weight, depth = (x.double() for x in _measured_gaussians(9))
+    camera = cases.camera(40, 50)
+    gamma, depth = torch.tensor(8.0).double(), depth * 0 + 3.1
+
+    def sharpness_apart(*x: torch.Tensor) -> torch.Tensor:
+        return reference.gaussian_terms(*x[:4], gamma, weight, depth, x[4], x[5], camera[2], 0.01, 2.0)[[0, 2]]
+
+    inputs = [x.requires_grad_() for x in (means, quats, log_scales, sdf, camera[0], camera[1])]
+    assert torch.autograd.gradcheck(sharpness_apart, inputs)
+
+
+def test_constants_that_the_kernels_repeat_are_those_of_the_package() -> None:
+    assert images.LINEAR_KNEE == backends.KNEE
+    assert tuple(k * k for k in images.STABILISERS) == backends.SSIM_STABILISERS
+    assert (capture.OBJECT, capture.UNKNOWN) == (backends.OBJECT, backends.UNKNOWN)
+    x, y = torch.rand(2, 20, 30, 3, generator=torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(reference.similarity(x, y).mean(), images.ssim(x, y))
 
 
 # --------------------------------------------------------------------------------------------------- choice

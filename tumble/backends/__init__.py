@@ -29,7 +29,7 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
 __all__ = [
@@ -40,12 +40,22 @@ __all__ = [
     "FACING",
     "Hits",
     "NEAR",
+    "IRRADIANCE_FLOOR",
+    "KNEE",
     "NEAR_SIGMAS",
+    "NORMAL_GRADIENT",
+    "OBJECT",
+    "RATIO_MAX",
     "ROUGHNESS_MIN",
     "Rendering",
+    "SATURATED",
+    "SSIM_SIGMA",
+    "SSIM_STABILISERS",
+    "SSIM_WINDOW",
     "TRACE_SIGMAS",
     "TRACE_T_MIN",
     "T_MIN",
+    "UNKNOWN",
     "VISIBLE",
     "choose",
     "load",
@@ -81,6 +91,27 @@ VISIBLE = 0.5
 """Minimum transmittance at which a direction is visible from a point."""
 ROUGHNESS_MIN = 0.05
 """Lower limit of the roughness used for shading; narrower lobes would fall between the sampled directions."""
+NORMAL_GRADIENT = 0.3
+"""Factor of the gradient from `sh_shade` to the normals: the low-order light causes errors in the full gradient."""
+IRRADIANCE_FLOOR = 0.03
+"""Fraction of the mean irradiance that is added to shadowed and unshadowed irradiance before their ratio is taken, as
+it is unstable where hardly any light arrives."""
+RATIO_MAX = 2.0
+"""Upper limit of the ratio of shadowed to unshadowed irradiance, which interreflection can raise above 1."""
+SATURATED = 254
+"""8-bit value of a photo from which a pixel counts as saturated."""
+KNEE = 0.0031308
+"""Linear value at which the sRGB curve (IEC 61966-2-1) changes from a line to a power."""
+SSIM_WINDOW = 11
+"""Width of the Gaussian window of SSIM [pixels]."""
+SSIM_SIGMA = 1.5
+"""Standard deviation of the Gaussian window of SSIM [pixels]."""
+SSIM_STABILISERS = (0.01**2, 0.03**2)
+"""Constants C1 and C2 of SSIM (Wang et al. 2004) for values in [0, 1]."""
+OBJECT = 255
+"""Mask value of pixels that show the object."""
+UNKNOWN = 128
+"""Mask value of pixels that `image_terms` ignores."""
 
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
@@ -314,6 +345,134 @@ class Backend(Protocol):
             blocker: Result of `blockers`, or `[1 1]` of -1 for black blockers.
             blocker_radiance: Linear radiance of the Gaussians that `blocker` indexes; m may be 0.
             f0: Reflectance at normal incidence.
+        """
+        ...
+
+    def sh_shade(
+        self,
+        means: Float[Tensor, "n 3"],
+        quats: Float[Tensor, "n 4"],
+        albedo_logits: Float[Tensor, "n 3"],
+        light: Float[Tensor, "2 16 3"],
+        specular_scale: Float[Tensor, ""],
+        occluded: Float[Tensor, "m 9"],
+        unoccluded: Float[Tensor, "m 9"],
+        directions: Float[Tensor, "d 3"],
+        reflectance: Float[Tensor, " k"],
+        R_env_obj: Float[Tensor, "3 3"],
+        position: Float[Tensor, "3"],
+    ) -> Float[Tensor, "n 3"]:
+        """Linear radiance of Gaussians towards the camera under a light of spherical harmonics.
+
+            c = sigmoid(albedo_logits) rho E(R n) + specular_scale F(n.v) S(R r),  r = 2 (n.v) n - v
+            E(d) = softplus(sum_k light_0k Y_k(d)),  S(d) = softplus(sum_k light_1k Y_k(d)),
+            F(x) = sum_k reflectance_k (1 - x)^k with x within [0, 1],  R = R_env_obj,  v = normalize(position - mean)
+
+        rho is the irradiance with self-shadowing divided by that without, `(H(occluded) + f) / (H(unoccluded) + f)` but
+        at most RATIO_MAX. H(t) = max(0, t . q) / max(1e-3, 1 - albedo (1 - min(1, max(0, t_0 sqrt(4 / pi))))) includes
+        all bounces, with q_k the mean over the directions w of 4 pi Y_k(w) S(R w), and f is IRRADIANCE_FLOOR pi times
+        the mean of S(R w). rho is 1 if m is 0.
+
+        Differentiable in means, quaternions, albedo, light, specular scale, R_env_obj (its nine numbers as independent
+        variables) and position, with rho as a constant and the gradient of the normals times NORMAL_GRADIENT.
+
+        Args:
+            means: Centres, object frame.
+            quats: Rotations from local to object frame, of which only the normal n (third axis) is used.
+            albedo_logits: Linear albedo before the sigmoid.
+            light: Coefficients of E and S, env frame.
+            specular_scale: Scale of the specular lobe.
+            occluded: Transfer vectors from light to irradiance with self-shadowing (m = n), or none (m = 0).
+            unoccluded: Transfer vectors without self-shadowing.
+            directions: Evenly distributed unit directions, object frame, for the integral of S.
+            reflectance: Coefficients of a polynomial in 1 - n.v.
+            R_env_obj: Rotation from the object frame to the env frame.
+            position: Camera centre, object frame.
+        """
+        ...
+
+    def image_terms(
+        self,
+        rgb: Float[Tensor, "h w 3"],
+        alpha: Float[Tensor, "h w"],
+        depth: Float[Tensor, "h w"],
+        depth_var: Float[Tensor, "h w"],
+        normal: Float[Tensor, "h w 3"],
+        photo: UInt8[Tensor, "h w 3"],
+        mask: UInt8[Tensor, "h w"],
+        R_cam_obj: Float[Tensor, "3 3"],
+        fx_fy_cx_cy: Float[Tensor, "4"],
+        ssim_weight: float,
+        crease: float,
+    ) -> Float[Tensor, "4"]:
+        """Loss terms of a rendered view (`Rendering`) against a photo, each a mean over the image.
+
+        0. `(1 - w) |x - y| + w (1 - SSIM(x, y))`, w = ssim_weight, with x the rendering in sRGB and y the photo, both
+           black where the mask is UNKNOWN; SSIM is averaged over windows within the image. Where the photo is SATURATED
+           and x larger, x = y. Differentiable in rgb.
+        1. `(alpha - [mask is OBJECT])^2`, 0 where the mask is UNKNOWN. Differentiable in alpha.
+        2. `u / (1 + crease u)`, u = 1 - cosine between the normal and the normal of the depth map by central
+           differences, where a pixel and its four neighbours have alpha > 1/2. The normal of the depth map is that of
+           the surface z (X, Y, 1) with z_x = (z_right - z_left) / 2 and z_y likewise, at the mean of both neighbours.
+           Differentiable in normal, depth and R_cam_obj.
+        3. `sqrt(max(0, depth_var) + 1e-6) - 1e-3`, 0 where alpha is 0. Differentiable in depth_var.
+
+        The images have at least SSIM_WINDOW rows and columns, and rgb is black where alpha is 0.
+
+        Args:
+            rgb: Linear radiance.
+            alpha: Coverage.
+            depth: Mean z-depth, camera frame.
+            depth_var: Variance of the z-depth.
+            normal: Outward normals of any length, object frame.
+            photo: Input image, sRGB.
+            mask: OBJECT, UNKNOWN, or other values beside the object.
+            R_cam_obj: Rotation from object to camera.
+            fx_fy_cx_cy: Focal lengths and principal point [pixels].
+            ssim_weight: Weight of SSIM in the first term, 0 to 1.
+            crease: Saturation of the third term.
+        """
+        ...
+
+    def gaussian_terms(
+        self,
+        means: Float[Tensor, "n 3"],
+        quats: Float[Tensor, "n 4"],
+        log_scales: Float[Tensor, "n 3"],
+        sdf: Float[Tensor, " n"],
+        gamma: Float[Tensor, ""],
+        weight: Float[Tensor, " n"],
+        depth: Float[Tensor, "h w"],
+        R_cam_obj: Float[Tensor, "3 3"],
+        t_cam_obj: Float[Tensor, "3"],
+        fx_fy_cx_cy: Float[Tensor, "4"],
+        floor: float,
+        reach: float,
+    ) -> Float[Tensor, "3"]:
+        """Loss terms of the Gaussians.
+
+        0. Mean of `max(0, -log(max(1e-4, exp(H) - 1)))`, with H the entropy of the squared scales divided by their sum,
+           plus the mean third scale. Differentiable in log_scales.
+        1. `max(0, 1.762747 / max(floor, m) - gamma)`, with m the lower median of |sdf|. Differentiable in gamma.
+        2. Mean of |z - depth(u)| over the Gaussians with weight > 0, where z is the z-depth of `mean - sdf normal` and
+           u its pixel; a difference of at least `reach`, or a depth of 0, counts as 0. depth is interpolated bilinearly
+           between pixel centres. Differentiable in means, quats, sdf, R_cam_obj and t_cam_obj, not in depth.
+
+        All terms are 0 if there are no Gaussians.
+
+        Args:
+            means: Centres, object frame.
+            quats: Rotations from local to object frame, of which only the normal (third axis) is used.
+            log_scales: Logarithms of the standard deviations.
+            sdf: Signed distances.
+            gamma: Sharpness of the opacity.
+            weight: Blending weight of every Gaussian in the view.
+            depth: Rendered depth of the view.
+            R_cam_obj: Rotation from object to camera.
+            t_cam_obj: Translation from object to camera.
+            fx_fy_cx_cy: Focal lengths and principal point [pixels].
+            floor: Lower limit of the median distance.
+            reach: Limit of the depth difference.
         """
         ...
 

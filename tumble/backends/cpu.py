@@ -4,7 +4,6 @@ This file wraps the kernels in `autograd.Function`s.
 """
 
 import ctypes
-import threading
 from typing import Any, NamedTuple
 
 import torch
@@ -28,7 +27,21 @@ from tumble.backends import (
     _native,
     threads,
 )
-from tumble.backends._structs import Bvh, Raster, Rays, Shade, set_pointers
+from tumble.backends._cpu_terms import gaussian_terms, image_terms, sh_shade
+from tumble.backends._structs import Bvh, Raster, Rays, Shade, scratch, set_pointers
+
+__all__ = [
+    "blockers",
+    "build",
+    "gaussian_terms",
+    "image_terms",
+    "rasterize",
+    "ready",
+    "sh_shade",
+    "shade",
+    "trace",
+    "visible",
+]
 
 TILE = 8
 """Side of a tile in `native/raster.h` [pixels]."""
@@ -52,8 +65,6 @@ FEATURES_PER_PASS = 16
 """Maximum number of features that the kernels blend in one pass; more are split into several passes."""
 MAX_GRADIENT_SCRATCH = 1 << 28
 """Maximum size of the gradient sums of all threads (1 GiB) [numbers]; with many Gaussians fewer threads are used."""
-MAX_KEPT_SCRATCH = 1 << 24
-"""Maximum size of the scratch memory kept from one backward pass to the next (64 MiB) [numbers]."""
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
@@ -147,7 +158,7 @@ class _Rasterize(torch.autograd.Function):
         kept += set_pointers(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
         kept += set_pointers(
             r,
-            parts=_scratch(r.threads * r.n * r.gradient_size),
+            parts=scratch(r.threads * r.n * r.gradient_size),
             camera_parts=torch.empty(r.threads * CAMERA),
         )
         _native.library().raster_adjoint(ctypes.byref(r))
@@ -189,21 +200,6 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
         corner_width=corner_width,
         mask_stride=int(masked),
     )
-
-
-def _scratch(n: int) -> Tensor:
-    """Uninitialised memory for n numbers, valid until the next call in this thread.
-
-    It is reused because allocating new pages takes as long as rendering a small image.
-    """
-    if n > MAX_KEPT_SCRATCH:
-        return torch.empty(n)
-    if len(getattr(_local, "scratch", ())) < n:
-        _local.scratch = torch.empty(n)
-    return _local.scratch
-
-
-_local = threading.local()
 
 
 def _int32(*shape: int) -> Int32[Tensor, "..."]:

@@ -3,6 +3,7 @@
 This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
 it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
 GPU differ by rounding errors. The kernels run on the device of the tensors; on the CPU they are slow and serve tests.
+Shading by spherical harmonics and the loss terms have no kernel yet and are those of the reference, on the GPU.
 """
 
 import importlib.util
@@ -14,6 +15,20 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Rendering
+from tumble.backends.reference import gaussian_terms, image_terms, sh_shade
+
+__all__ = [
+    "blockers",
+    "build",
+    "gaussian_terms",
+    "image_terms",
+    "rasterize",
+    "ready",
+    "sh_shade",
+    "shade",
+    "trace",
+    "visible",
+]
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:

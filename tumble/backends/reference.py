@@ -8,24 +8,45 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import conv2d, grid_sample, normalize, softplus
 
 from tumble.backends import (
     ALPHA_MAX,
     ALPHA_MIN,
     CORNER,
     FACING,
+    IRRADIANCE_FLOOR,
+    KNEE,
     NEAR,
     NEAR_SIGMAS,
+    NORMAL_GRADIENT,
+    OBJECT,
+    RATIO_MAX,
     ROUGHNESS_MIN,
+    SATURATED,
+    SSIM_SIGMA,
+    SSIM_STABILISERS,
+    SSIM_WINDOW,
     T_MIN,
+    UNKNOWN,
     Rendering,
 )
 from tumble.backends._brute import blockers, build, rotation, trace, unpack, visible
 
-__all__ = ["blockers", "build", "rasterize", "ready", "shade", "trace", "visible"]
+__all__ = [
+    "blockers",
+    "build",
+    "gaussian_terms",
+    "image_terms",
+    "rasterize",
+    "ready",
+    "sh_shade",
+    "shade",
+    "trace",
+    "visible",
+]
 
 TILE = 32
 """Side of the squares that are rendered at once [pixels]; limits memory and does not affect results."""
@@ -295,3 +316,143 @@ def shade(
     specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
     lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]
     return albedo / math.pi * lit.sum(1) + torch.einsum("pd,pdc->pc", specular, lit)
+
+
+def sh_shade(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    albedo_logits: Float[Tensor, "n 3"],
+    light: Float[Tensor, "2 16 3"],
+    specular_scale: Float[Tensor, ""],
+    occluded: Float[Tensor, "m 9"],
+    unoccluded: Float[Tensor, "m 9"],
+    directions: Float[Tensor, "d 3"],
+    reflectance: Float[Tensor, " k"],
+    R_env_obj: Float[Tensor, "3 3"],
+    position: Float[Tensor, "3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.sh_shade`."""
+
+    def at(lobe: int, d_obj: Tensor) -> Tensor:
+        return softplus(harmonics(d_obj @ R_env_obj.T, 16) @ light[lobe])
+
+    normals = rotation(quats)[:, :, 2]
+    normals = torch.lerp(normals.detach(), normals, NORMAL_GRADIENT)
+    view, albedo = normalize(position - means, dim=-1), torch.sigmoid(albedo_logits)
+    n_v = (normals * view).sum(-1, keepdim=True)
+    fresnel = sum(c * (1 - n_v.clamp(0, 1)) ** k for k, c in enumerate(reflectance))
+    specular = specular_scale * fresnel * at(1, 2 * n_v * normals - view)
+    if not len(occluded):
+        return albedo * at(0, normals) + specular
+    with torch.no_grad():
+        radiance = at(1, directions)
+        coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
+        floor = IRRADIANCE_FLOOR * math.pi * radiance.mean(0)
+
+        def irradiance(transfer: Tensor) -> Tensor:
+            visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+            bounces = (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
+            return (transfer @ coefficients).clamp(min=0) / bounces + floor
+
+        ratio = (irradiance(occluded) / irradiance(unoccluded).clamp(min=1e-12)).clamp(max=RATIO_MAX)
+    return albedo * ratio * at(0, normals) + specular
+
+
+def image_terms(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    depth_var: Float[Tensor, "h w"],
+    normal: Float[Tensor, "h w 3"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    ssim_weight: float,
+    crease: float,
+) -> Float[Tensor, "4"]:
+    """See `Backend.image_terms`."""
+    known, image = (mask != UNKNOWN).to(rgb), photo.to(rgb) / 255
+    power = 1.055 * rgb.clamp(min=KNEE) ** (1 / 2.4) - 0.055
+    srgb = torch.where(rgb <= KNEE, 12.92 * rgb.clamp(min=0), power)
+    srgb = torch.where((photo >= SATURATED) & (srgb > image), image, srgb)
+    x, y = srgb * known[..., None], image * known[..., None]
+    photometric = (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - similarity(x, y)).mean()
+    silhouette = ((alpha - (mask == OBJECT).to(rgb)) ** 2 * known).mean()
+    deviation = torch.where(alpha > 0, (depth_var.clamp(min=0) + 1e-6).sqrt() - 1e-3, 0).mean()
+    return torch.stack(
+        [photometric, silhouette, _normal_term(depth, alpha, normal, R_cam_obj, fx_fy_cx_cy, crease), deviation]
+    )
+
+
+def similarity(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 h-10 w-10"]:
+    """Structural similarity (Wang et al. 2004) at all windows within two images."""
+    offset = torch.arange(SSIM_WINDOW).to(x) - SSIM_WINDOW // 2
+    taps = torch.softmax(-0.5 * (offset / SSIM_SIGMA) ** 2, 0)
+
+    def mean(image: Tensor) -> Tensor:
+        return conv2d(image.movedim(-1, 0)[:, None], torch.outer(taps, taps)[None, None])[:, 0]
+
+    mean_x, mean_y, (c1, c2) = mean(x), mean(y), SSIM_STABILISERS
+    var_x, var_y, covariance = mean(x * x) - mean_x**2, mean(y * y) - mean_y**2, mean(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    return luminance * (2 * covariance + c2) / (var_x + var_y + c2)
+
+
+def _normal_term(
+    depth: Tensor, alpha: Tensor, normal: Tensor, R_cam_obj: Tensor, fx_fy_cx_cy: Tensor, crease: float
+) -> Float[Tensor, ""]:
+    """The third of `image_terms`. A surface z(x, y) (X, Y, 1) has the normal (p, q, -1 - p X - q Y), p = fx z_x / z."""
+    h, w = depth.shape
+    covered, center = alpha > 0.5, (slice(1, -1), slice(1, -1))
+    right, left, below, above = (1, 2), (1, 0), (2, 1), (0, 1)
+
+    def neighbour(image: Tensor, at: tuple[int, int]) -> Tensor:
+        return image[at[0] : h - 2 + at[0], at[1] : w - 2 + at[1]]
+
+    known = covered[center]
+    for at in (right, left, below, above):
+        known = known & neighbour(covered, at)
+    fx, fy, cx, cy = fx_fy_cx_cy
+    X, Y = (torch.arange(w).to(depth) + 0.5 - cx) / fx, (torch.arange(h).to(depth) + 0.5 - cy) / fy
+
+    def slope(focal: Tensor, after: tuple[int, int], before: tuple[int, int]) -> Tensor:
+        a, b = neighbour(depth, after), neighbour(depth, before)
+        return focal * (a - b) / torch.where(known, a + b, 1)
+
+    p, q = slope(fx, right, left), slope(fy, below, above)
+    from_depth = normalize(torch.stack([p, q, -1 - p * X[1:-1] - q * Y[1:-1, None]], -1), dim=-1) @ R_cam_obj
+    difference = 1 - (normalize(normal[center], dim=-1) * from_depth).sum(-1)
+    return (difference / (1 + crease * difference) * known).sum() / (h * w)
+
+
+def gaussian_terms(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+    sdf: Float[Tensor, " n"],
+    gamma: Float[Tensor, ""],
+    weight: Float[Tensor, " n"],
+    depth: Float[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    t_cam_obj: Float[Tensor, "3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    floor: float,
+    reach: float,
+) -> Float[Tensor, "3"]:
+    """See `Backend.gaussian_terms`."""
+    if not len(means):
+        return means.sum() + means.new_zeros(3)
+    log_fraction = (2 * log_scales).log_softmax(-1)
+    entropy = -(log_fraction.exp() * log_fraction).sum(-1)
+    needle = (-(entropy.exp() - 1).clamp(min=1e-4).log()).clamp(min=0)
+    sharpness = (1.762747 / sdf.detach().abs().median().clamp(min=floor) - gamma).clamp(min=0)
+    x_cam = (means - sdf[:, None] * rotation(quats)[:, :, 2]) @ R_cam_obj.T + t_cam_obj
+    z, visible = x_cam[:, 2], weight > 0
+    with torch.no_grad():
+        uv = x_cam[:, :2] / x_cam[:, 2:] * fx_fy_cx_cy[:2] + fx_fy_cx_cy[2:]
+        size = uv.new_tensor([depth.shape[1], depth.shape[0]])
+        surface = grid_sample(depth[None, None], (uv / size * 2 - 1)[None, None], align_corners=False)[0, 0, 0]
+        inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
+    difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)
+    return torch.stack([needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference])

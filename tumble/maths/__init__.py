@@ -17,7 +17,6 @@ from tumble.maths.directions import (
 )
 from tumble.maths.images import (
     Box,
-    channels_first,
     crop,
     crop_box,
     edge_aware,
@@ -26,7 +25,6 @@ from tumble.maths.images import (
     resize_area,
     srgb_from_linear,
     ssim,
-    ssim_map,
     to_srgb8,
 )
 from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, select_rows
@@ -55,7 +53,6 @@ __all__ = [
     "minimise",
     "nearest",
     "to_srgb8",
-    "channels_first",
     "random_rotation",
     "reflect",
     "resize_area",
@@ -64,7 +61,6 @@ __all__ = [
     "spherical_harmonics",
     "srgb_from_linear",
     "ssim",
-    "ssim_map",
     "texel_directions",
     "texel_solid_angles",
     "umeyama",

@@ -2,8 +2,11 @@
 #include "bin.h"
 #include "bvh.h"
 #include "composite.h"
+#include "gaussian_terms.h"
+#include "image.h"
 #include "parallel.h"
 #include "project.h"
+#include "sh_shade.h"
 #include "shade.h"
 
 #define API extern "C" __attribute__((visibility("default")))
@@ -12,7 +15,8 @@ API int lanes() { return LANES; }
 
 // Sizes of the structures, which the caller compares with its own.
 API int sizes(int which) {
-    const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(Leaf), sizeof(Node)};
+    const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
+                       sizeof(GaussianTerms), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -94,3 +98,17 @@ API void shade_adjoint(const Shade* s) {
     add_parts(s->v_radiance, s->radiance_parts, (i64)3 * s->stride, s->threads);
     add_parts(s->v_blocker_radiance, s->blocker_parts, (i64)3 * s->n_blockers, s->threads);
 }
+
+API void sh_shade_forward(const ShShade* s) {
+    ShLight light;
+    sh_light(*s, light);
+    parallel(s->threads, [=, &light](int share) { sh_shade_share(*s, light, share); });
+}
+API void sh_shade_adjoint(const ShShade* s) {
+    ShLight light;
+    sh_light(*s, light);
+    parallel(s->threads, [=, &light](int share) { sh_shade_adjoint_share(*s, light, share); });
+}
+
+API void image_loss(const Image* m) { image_terms(*m); }
+API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
