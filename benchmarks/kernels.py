@@ -131,16 +131,17 @@ def shade_rows(backend: Backend, name: str, threads: int, *, device: torch.devic
     rng = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 0.3 * torch.randn(p, 3, generator=rng), dim=-1)
-    tensors = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
+    tensors = [normal, 0.2 + 0.7 * torch.rand(p), view]
     surface = [x.to(device).requires_grad_() for x in tensors]
     light, directions = torch.rand(DIRECTIONS, 3).to(device).requires_grad_(), fibonacci(DIRECTIONS).to(device)
     visibility = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
     no_blockers = visibility.new_full((1, 1), -1), light.new_zeros(0, 3)
-    arguments: Any = [*surface, directions, light, visibility, *no_blockers, 0.04]
+    arguments: Any = [*surface, directions, light, visibility, *no_blockers]
     with torch.no_grad():
         forward = median_seconds(lambda: backend.shade(*arguments), threads, RUNS, device)
-    shaded = backend.shade(*arguments)
-    adjoint = partial(torch.autograd.grad, shaded, [*surface, light], torch.randn_like(shaded), retain_graph=True)
+    lobes = backend.shade(*arguments)[:2]
+    seeds = [torch.randn_like(x) for x in lobes]
+    adjoint = partial(torch.autograd.grad, lobes, [*surface, light], seeds, retain_graph=True)
     backward = median_seconds(adjoint, threads, RUNS, device)
     million = p * DIRECTIONS / 1e6
     return [

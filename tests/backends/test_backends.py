@@ -28,6 +28,14 @@ def backend(request: pytest.FixtureRequest) -> backends.Backend:
     return module
 
 
+def _compare(backend: backends.Backend, run: Callable[..., list[torch.Tensor]], limit: float = RELATIVE) -> None:
+    """`run(backend, dtype)` of a backend in float32 against the reference in float64."""
+    worst = [
+        cases.difference(a, b) for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True)
+    ]
+    assert max(worst) < limit, worst
+
+
 # ------------------------------------------------------------------------------------------------ rasterize
 
 
@@ -296,12 +304,11 @@ def test_a_convex_object_hardly_shadows_itself(backend: backends.Backend) -> Non
 
 
 def _surface(p: int, rough: tuple[float, float]) -> list[torch.Tensor]:
-    """Normals, albedo, roughness and view directions; some views are behind the surface."""
+    """Normals, roughness and view directions; some views are behind the surface."""
     rng = torch.Generator().manual_seed(11)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 1.1 * normalize(torch.randn(p, 3, generator=rng), dim=-1), dim=-1)
-    roughness = rough[0] + (rough[1] - rough[0]) * torch.rand(p, generator=rng)
-    return [normal, torch.rand(p, 3, generator=rng), roughness, view]
+    return [normal, rough[0] + (rough[1] - rough[0]) * torch.rand(p, generator=rng), view]
 
 
 @pytest.mark.parametrize(("d", "m", "rough"), [(100, 0, (0.3, 1.0)), (256, 7, (0.03, 0.6)), (1, 3, (0.5, 0.5))])
@@ -314,17 +321,16 @@ def test_shading_and_its_gradients_are_those_of_the_reference(
     directions = cases.fibonacci(d).float()
     visibility = _brute.pack(torch.rand(p, d, generator=rng) > 0.3)
     blocker = torch.randint(-1, m, (p, d), generator=rng).int() if m else torch.full((1, 1), -1).int()
-    seed = torch.randn(p, 3, generator=rng)
+    seeds = torch.randn(2, p, 3, generator=rng)
 
-    def run(by: backends.Backend, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
         x = [y.to(dtype).requires_grad_() for y in inputs]
-        rest = visibility, blocker, x[5], 0.04
-        shaded = by.shade(*x[:4], directions.to(dtype), x[4], *rest)
-        used = x if m else x[:5]
-        return shaded, *torch.autograd.grad(shaded, used, seed.to(dtype))
+        lobes = by.shade(*x[:3], directions.to(dtype), x[3], visibility, blocker, x[4])
+        used = x if m else x[:4]
+        assert not lobes.specular_visibility.requires_grad
+        return [*lobes, *torch.autograd.grad(lobes[:2], used, [*seeds.to(dtype)])]
 
-    for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True):
-        assert cases.difference(a, b) < RELATIVE
+    _compare(backend, run)
 
 
 def test_gradients_of_reference_shading_are_finite_differences() -> None:
@@ -334,38 +340,72 @@ def test_gradients_of_reference_shading_are_finite_differences() -> None:
     visibility = _brute.pack(torch.rand(4, 9, generator=rng) > 0.3)
     blocker = torch.randint(-1, 9, (4, 9), generator=rng).int()
 
-    def render(*x: torch.Tensor) -> torch.Tensor:
-        return reference.shade(*x[:4], cases.fibonacci(9), x[4], visibility, blocker, x[5], 0.04)
+    def render(*x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(reference.shade(*x[:3], cases.fibonacci(9), x[3], visibility, blocker, x[4])[:2])
 
     assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
 def test_a_sphere_in_uniform_light_matches_the_integrated_brdf(backend: backends.Backend, roughness: float) -> None:
-    """The Lambertian part equals the albedo; GGX is D F G / (4 n.l n.v), integrated on another grid."""
+    """The Lambertian lobe is the light; GGX is D F G / (4 n.l n.v), integrated on another grid."""
     normal = cases.fibonacci(40)
     view = torch.tensor([0.0, 0.0, 1.0]).double()
     front = normal @ view > 0.2
     normal, p = normal[front], int(front.sum())
-    albedo = torch.tensor([0.2, 0.5, 0.8]).expand(p, 3)
     d = 1 << 14
     light = torch.full((d, 3), 1.5)
     visibility = torch.full((p, d // 32), -1, dtype=torch.int32)
     black = torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3)
-    shaded = backend.shade(
-        normal.float(),
-        albedo,
-        torch.full((p,), roughness),
-        view.float().expand(p, 3),
-        cases.fibonacci(d).float(),
-        light,
-        visibility,
-        *black,
-        0.04,
-    )
-    expected = 1.5 * (albedo.numpy() + _integrated_ggx(normal.numpy(), view.numpy(), roughness)[:, None])
+    point = normal.float(), torch.full((p,), roughness), view.float().expand(p, 3)
+    lobes = backend.shade(*point, cases.fibonacci(d).float(), light, visibility, *black)
     # Both grids resolve the narrowest of these lobes to about 1e-3.
-    np.testing.assert_allclose(shaded.numpy(), expected, rtol=3e-3)
+    np.testing.assert_allclose(lobes.diffuse.numpy(), np.full((p, 3), 1.5), rtol=3e-3)
+    expected = 1.5 * _integrated_ggx(normal.numpy(), view.numpy(), roughness)[:, None].repeat(3, 1)
+    np.testing.assert_allclose(0.04 * lobes.specular.numpy(), expected, rtol=6e-3)
+    torch.testing.assert_close(lobes.specular_visibility, torch.ones(p))
+
+
+def _stack(levels: int, height: int, n: int) -> list[torch.Tensor]:
+    """Maps, directions of any length all around and at the seam, and roughness beyond both ends."""
+    rng = torch.Generator().manual_seed(levels)
+    directions = torch.randn(n, 3, generator=rng)
+    directions[: n // 3, 0] *= 1e-2
+    directions[n // 3 : n // 2, 1] *= 30
+    return [
+        torch.rand(levels, height, 2 * height, 3, generator=rng),
+        directions,
+        1.4 * torch.rand(n, generator=rng) - 0.2,
+    ]
+
+
+@pytest.mark.parametrize(("levels", "height", "n"), [(9, 16, 200), (1, 1, 20), (2, 5, 0)])
+def test_lookups_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, levels: int, height: int, n: int
+) -> None:
+    inputs, seed = _stack(levels, height, n), torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        values = by.lookup(*x)
+        return [values, *torch.autograd.grad(values, x, seed.to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_lookups_at_the_poles_are_means_of_their_rows_and_have_no_gradient(backend: backends.Backend) -> None:
+    stack = _stack(2, 4, 1)[0]
+    poles = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], requires_grad=True)
+    values = backend.lookup(stack, poles, torch.zeros(2))
+    # At u = 1/2: two neighbouring columns of the row and their opposites.
+    expected = [stack[0, row][[3, 4, 7, 0]].mean(0) for row in (0, -1)]
+    torch.testing.assert_close(values, torch.stack(expected))
+    assert not torch.autograd.grad(values.sum(), poles)[0].any()
+
+
+def test_gradients_of_reference_lookups_are_finite_differences() -> None:
+    inputs = [x.double().requires_grad_() for x in _stack(3, 4, 9)]
+    assert torch.autograd.gradcheck(reference.lookup, inputs)
 
 
 def _integrated_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: float = 0.04) -> np.ndarray:
@@ -394,14 +434,6 @@ def _integrated_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0:
 
 
 # ------------------------------------------------------------------------------- kernels of the steps of stage 2
-
-
-def _compare(backend: backends.Backend, run: Callable[..., list[torch.Tensor]], limit: float = RELATIVE) -> None:
-    """`run(backend, dtype)` of a backend in float32 against the reference in float64."""
-    worst = [
-        cases.difference(a, b) for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True)
-    ]
-    assert max(worst) < limit, worst
 
 
 def _lit_gaussians(n: int, d: int) -> list[torch.Tensor]:

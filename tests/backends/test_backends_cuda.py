@@ -31,6 +31,7 @@ CONFORMANCE = [
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 256, 7, (0.03, 0.6)),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 1, 3, (0.5, 0.5)),
     (conformance.test_a_sphere_in_uniform_light_matches_the_integrated_brdf, 0.3),
+    (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, 9, 16, 200),
     (conformance.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference, 133, True),
     *[
         (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, 40, 50, box, 0.2, 25.0)

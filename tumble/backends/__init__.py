@@ -42,6 +42,7 @@ __all__ = [
     "NEAR",
     "IRRADIANCE_FLOOR",
     "KNEE",
+    "Lobes",
     "NEAR_SIGMAS",
     "NORMAL_GRADIENT",
     "OBJECT",
@@ -201,6 +202,17 @@ class Hits(NamedTuple):
     """Index of the Gaussian with the largest w_i, -1 if the ray hits none."""
 
 
+class Lobes(NamedTuple):
+    """Radiance reflected by surface points, by lobe."""
+
+    diffuse: Float[Tensor, "p 3"]
+    """Of a Lambertian lobe with albedo 1, which is irradiance / pi."""
+    specular: Float[Tensor, "p 3"]
+    """Of the specular lobe with reflectance 1 at normal incidence."""
+    specular_visibility: Float[Tensor, " p"]
+    """Visible fraction of the specular lobe. Not differentiable."""
+
+
 @runtime_checkable
 class Backend(Protocol):
     """Interface of a backend module. All float tensors of a call share one device and dtype; sizes may be zero."""
@@ -311,7 +323,6 @@ class Backend(Protocol):
     def shade(
         self,
         normal: Float[Tensor, "p 3"],
-        albedo: Float[Tensor, "p 3"],
         roughness: Float[Tensor, " p"],
         view: Float[Tensor, "p 3"],
         directions: Float[Tensor, "d 3"],
@@ -319,23 +330,27 @@ class Backend(Protocol):
         visibility: Int32[Tensor, "p words"],
         blocker: Int32[Tensor, "#p #d"],
         blocker_radiance: Float[Tensor, "m 3"],
-        f0: float,
-    ) -> Float[Tensor, "p 3"]:
-        """Reflected radiance (Lambert + GGX) under light from d directions w_j of equal solid angle over the sphere.
+    ) -> Lobes:
+        """Reflected radiance (Lambert and GGX) under light from d directions w_j of equal solid angle over the sphere.
 
-            L_o = 4 pi / d  sum_j (albedo / pi + f_j) L_j max(n.w_j, 0)
-            f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = f0 (1 + 24 q(1 - v.h))
+            diffuse = 4 / d  sum_j L_j max(n.w_j, 0),  specular = 4 pi / d  sum_j f_j L_j max(n.w_j, 0)
+            f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = 1 + 24 q(1 - v.h)
             q(m) = 0.9878 m^3 - 3.8886 m^4 + 9.1922 m^5 - 9.6217 m^6 + 4.3303 m^7  (Fresnel's equations, index 1.5)
             t = (|n x H|^2 + a^2 (n.H)^2) / |H|^2,  H = v + w_j,  |H|^2 = 2 (1 + v.w_j),  v.h = |H| / 2
             g(x) = (x + sqrt(a^2 + (1 - a^2) x^2)) / 2 for x > 0, else a / 2,  r = max(roughness, ROUGHNESS_MIN)
 
         (t is the usual (n.h)^2 (a^2 - 1) + 1 in a form without cancellation for narrow lobes in float32.)
-        Differentiable in normal, albedo, roughness, view and both radiances; normal and view count as independent
-        vectors in the formulas above. f is 0 for a camera below the horizon (n.v <= 0), and where |H| = 0 (v = -w).
+        specular_visibility is the mean of the visibility bits over the directions with n.w > 0, weighted by
+        c / ((1 - c) / 2 + b^2 (1 + c) / 2)^2 with c = max(0, m.w), m = 2 (n.v) n - v, and b = max(a, sqrt(pi / d) / 2):
+        neighbouring directions are sqrt(4 pi / d) apart, and GGX falls to a quarter at a distance of 2 a from its peak.
+        It is 0 if all weights are.
+
+        diffuse and specular are differentiable in normal, roughness, view and both radiances; normal and view count as
+        independent vectors in the formulas above. f is 0 for a camera below the horizon (n.v <= 0), and where |H| = 0
+        (v = -w).
 
         Args:
             normal: Unit normals.
-            albedo: Linear albedo.
             roughness: Perceptual roughness.
             view: Unit directions from surface to camera.
             directions: Unit directions shared by all points, in the frame of normal and view.
@@ -344,7 +359,24 @@ class Backend(Protocol):
                 blocker_radiance[blocker[p, j]], or 0 if blocker[p, j] is -1.
             blocker: Result of `blockers`, or `[1 1]` of -1 for black blockers.
             blocker_radiance: Linear radiance of the Gaussians that `blocker` indexes; m may be 0.
-            f0: Reflectance at normal incidence.
+        """
+        ...
+
+    def lookup(
+        self,
+        stack: Float[Tensor, "levels h w 3"],
+        directions: Float[Tensor, "p 3"],
+        roughness: Float[Tensor, " p"],
+    ) -> Float[Tensor, "p 3"]:
+        """Values of a stack of equirectangular maps in given directions, at level `roughness (levels - 1)`.
+
+        Linear between levels and bilinear between texels (convention of docs/format.md), continuous across the seam and
+        the poles. Differentiable in all arguments, except for the direction at a pole.
+
+        Args:
+            stack: Maps of levels 0 to `levels - 1`; w is even.
+            directions: Directions of any length except 0.
+            roughness: Clamped to [0, 1].
         """
         ...
 

@@ -72,11 +72,11 @@ class Shade(ctypes.Structure):
     """`Shade` of `native/shade.h`: arguments of shading."""
 
     _fields_ = [
-        *_pointers("normal albedo roughness view directions radiance visibility blocker blocker_radiance"),
+        *_pointers("normal roughness view directions radiance visibility blocker blocker_radiance"),
         *_ints("n_points n_directions stride words n_blockers threads blocker_point_stride blocker_direction_stride"),
-        *_floats("f0 roughness_min"),
-        *_pointers("out v_out radiance_parts blocker_parts"),
-        *_pointers("v_normal v_albedo v_roughness v_view v_radiance v_blocker_radiance"),
+        *_floats("roughness_min"),
+        *_pointers("diffuse specular specular_visibility v_diffuse v_specular radiance_parts blocker_parts"),
+        *_pointers("v_normal v_roughness v_view v_radiance v_blocker_radiance"),
     ]
 
 
@@ -114,7 +114,17 @@ class GaussianTerms(ctypes.Structure):
     ]
 
 
-STRUCTURES = (Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms)
+class Lookup(ctypes.Structure):
+    """`Lookup` of `native/lookup.h`: arguments of lookups in a stack of maps."""
+
+    _fields_ = [
+        *_pointers("stack directions roughness"),
+        *_ints("n levels height width"),
+        *_pointers("out v_out v_stack v_directions v_roughness"),
+    ]
+
+
+STRUCTURES = (Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms, Lookup)
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 
 

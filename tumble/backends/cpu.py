@@ -23,18 +23,20 @@ from tumble.backends import (
     TRACE_T_MIN,
     VISIBLE,
     Hits,
+    Lobes,
     Rendering,
     _native,
     threads,
 )
 from tumble.backends._cpu_terms import gaussian_terms, image_terms, sh_shade
-from tumble.backends._structs import Bvh, Raster, Rays, Shade, scratch, set_pointers
+from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Shade, scratch, set_pointers
 
 __all__ = [
     "blockers",
     "build",
     "gaussian_terms",
     "image_terms",
+    "lookup",
     "rasterize",
     "ready",
     "sh_shade",
@@ -318,7 +320,6 @@ def _rays(bvh: CpuBvh, origins: Tensor, directions: Tensor, **more: Tensor) -> _
 
 def shade(
     normal: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, " p"],
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -326,39 +327,37 @@ def shade(
     visibility: Int32[Tensor, "p words"],
     blocker: Int32[Tensor, "#p #d"],
     blocker_radiance: Float[Tensor, "m 3"],
-    f0: float,
-) -> Float[Tensor, "p 3"]:
+) -> Lobes:
     """See `Backend.shade`."""
-    surface = (normal, albedo, roughness, view)
-    return _ShadeFunction.apply(*surface, radiance, blocker_radiance, directions, visibility, blocker, f0)
+    rest = directions, visibility, blocker
+    return Lobes(*_ShadeFunction.apply(normal, roughness, view, radiance, blocker_radiance, *rest))
 
 
 class _ShadeFunction(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *args: Any) -> Tensor:
-        *tensors, f0 = args
-        tensors = [x.contiguous() for x in tensors]
-        out = torch.empty_like(tensors[0])
-        struct, kept = _shade_launch(tensors, f0)
-        set_pointers(struct, out=out)
+    def forward(ctx: Any, *args: Tensor) -> tuple[Tensor, ...]:
+        tensors = [x.contiguous() for x in args]
+        diffuse, specular = torch.empty_like(tensors[0]), torch.empty_like(tensors[0])
+        fraction = torch.empty_like(tensors[1])
+        struct, kept = _shade_launch(tensors)
+        set_pointers(struct, diffuse=diffuse, specular=specular, specular_visibility=fraction)
         _native.library().shade_forward(ctypes.byref(struct))
         del kept
-        ctx.f0 = f0
         ctx.save_for_backward(*tensors)
-        return out
+        ctx.mark_non_differentiable(fraction)
+        return diffuse, specular, fraction
 
     @staticmethod
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         tensors = ctx.saved_tensors
-        struct, kept = _shade_launch(tensors, ctx.f0)
-        *v_surface, v_radiance, v_blocker = (torch.empty_like(x) for x in tensors[:6])
+        struct, kept = _shade_launch(tensors)
+        *v_surface, v_radiance, v_blocker = (torch.empty_like(x) for x in tensors[:5])
         v_rows = torch.empty(3, struct.stride)
-        kept += set_pointers(
-            struct, dict(zip(("v_normal", "v_albedo", "v_roughness", "v_view"), v_surface, strict=True))
-        )
+        kept += set_pointers(struct, dict(zip(("v_normal", "v_roughness", "v_view"), v_surface, strict=True)))
         kept += set_pointers(
             struct,
-            v_out=v_out.contiguous(),
+            v_diffuse=v_results[0].contiguous(),
+            v_specular=v_results[1].contiguous(),
             v_radiance=v_rows,
             v_blocker_radiance=v_blocker,
             radiance_parts=torch.empty(struct.threads * v_rows.numel()),
@@ -366,12 +365,12 @@ class _ShadeFunction(torch.autograd.Function):
         )
         _native.library().shade_adjoint(ctypes.byref(struct))
         v_radiance = v_rows[:, : len(v_radiance)].T
-        return (*v_surface, v_radiance, v_blocker, None, None, None, None)
+        return (*v_surface, v_radiance, v_blocker, None, None, None)
 
 
-def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
+def _shade_launch(tensors: Any) -> tuple[Shade, list[Tensor]]:
     """Arguments of shading and the tensors that they point to; directions and radiance become padded rows."""
-    normal, albedo, roughness, view, radiance, blocker_radiance, directions, visibility, blocker = tensors
+    normal, roughness, view, radiance, blocker_radiance, directions, visibility, blocker = tensors
     lanes = _native.library().lanes()
     padding = -len(directions) % lanes
     rows = {"directions": directions, "radiance": radiance}
@@ -385,9 +384,47 @@ def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
         threads=threads(),
         blocker_point_stride=blocker.stride(0) if blocker.shape[0] > 1 else 0,
         blocker_direction_stride=blocker.stride(1) if blocker.shape[1] > 1 else 0,
-        f0=f0,
         roughness_min=ROUGHNESS_MIN,
     )
-    rest = {"normal": normal, "albedo": albedo, "roughness": roughness, "view": view, "visibility": visibility}
+    rest = {"normal": normal, "roughness": roughness, "view": view, "visibility": visibility}
     kept = set_pointers(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
     return struct, kept
+
+
+def lookup(
+    stack: Float[Tensor, "levels h w 3"],
+    directions: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+) -> Float[Tensor, "p 3"]:
+    """See `Backend.lookup`."""
+    return _LookupFunction.apply(stack, directions, roughness)
+
+
+class _LookupFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        out = torch.empty_like(tensors[1])
+        struct, kept = _lookup_launch(tensors, out=out)
+        _native.library().lookup_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*tensors)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        gradients = [torch.empty_like(x) for x in ctx.saved_tensors]
+        named = dict(zip(("v_stack", "v_directions", "v_roughness"), gradients, strict=True))
+        struct, kept = _lookup_launch(ctx.saved_tensors, v_out=v_out.contiguous(), **named)
+        _native.library().lookup_backward(ctypes.byref(struct))
+        del kept
+        return tuple(gradients)
+
+
+def _lookup_launch(tensors: Any, **more: Tensor) -> tuple[Lookup, list[Tensor]]:
+    """Arguments of lookups, and the tensors that they point to."""
+    stack, directions, roughness = tensors
+    levels, height, width, _ = stack.shape
+    struct = Lookup(n=len(directions), levels=levels, height=height, width=width)
+    named = {"stack": stack, "directions": directions, "roughness": roughness}
+    return struct, set_pointers(struct, named | more)

@@ -31,6 +31,7 @@ from tumble.backends import (
     SSIM_WINDOW,
     T_MIN,
     UNKNOWN,
+    Lobes,
     Rendering,
 )
 from tumble.backends._brute import blockers, build, rotation, trace, unpack, visible
@@ -40,6 +41,7 @@ __all__ = [
     "build",
     "gaussian_terms",
     "image_terms",
+    "lookup",
     "rasterize",
     "ready",
     "sh_shade",
@@ -285,7 +287,6 @@ def harmonics(d: Float[Tensor, "*b 3"], k: int) -> Float[Tensor, "*b k"]:
 
 def shade(
     normal: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, " p"],
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
@@ -293,14 +294,14 @@ def shade(
     visibility: Int32[Tensor, "p words"],
     blocker: Int32[Tensor, "#p #d"],
     blocker_radiance: Float[Tensor, "m 3"],
-    f0: float,
-) -> Float[Tensor, "p 3"]:
+) -> Lobes:
     """See `Backend.shade`."""
     d = directions.shape[0]
-    arriving = torch.where(unpack(visibility, d)[..., None], radiance, 0)
+    visible = unpack(visibility, d)
+    arriving = torch.where(visible[..., None], radiance, 0)
     if blocker_radiance.shape[0]:
         blocker = blocker.expand(len(normal), d)
-        is_blocked = ~unpack(visibility, d) & (blocker >= 0)
+        is_blocked = ~visible & (blocker >= 0)
         arriving = torch.where(is_blocked[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
     a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
     n_w = normal @ directions.T
@@ -311,11 +312,49 @@ def shade(
     H = view[:, None] + directions
     t = (torch.linalg.cross(normal[:, None], H).square().sum(-1) + a * a * (n_v + n_w) ** 2) / HH
     m = 1 - 0.5 * HH.sqrt()
-    fresnel = f0 * (1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
+    fresnel = 1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303))))
     g_v, g_w = (0.5 * (x + (a * a + (1 - a * a) * x * x).sqrt()) for x in (n_v.clamp(min=0), n_w.clamp(min=0)))
     specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
     lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]
-    return albedo / math.pi * lit.sum(1) + torch.einsum("pd,pdc->pc", specular, lit)
+    with torch.no_grad():
+        c = ((2 * n_v * normal - view) @ directions.T).clamp(min=0)
+        bb = a.clamp(min=math.sqrt(math.pi / d) / 2) ** 2
+        weight = torch.where(n_w > 0, c / (0.5 * (1 - c) + bb * 0.5 * (1 + c)) ** 2, 0)
+        fraction = (weight * visible).sum(-1) / weight.sum(-1).clamp(min=torch.finfo(weight.dtype).tiny)
+    return Lobes(lit.sum(1) / math.pi, torch.einsum("pd,pdc->pc", specular, lit), fraction)
+
+
+def lookup(
+    stack: Float[Tensor, "levels h w 3"],
+    directions: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+) -> Float[Tensor, "p 3"]:
+    """See `Backend.lookup`."""
+    levels, h, w, _ = stack.shape
+    x, y, z = directions.unbind(-1)
+    rho2 = x * x + z * z
+    # The gradient of atan2(0, 0) is infinite.
+    pole = rho2 == 0
+    rho = torch.where(pole, 0.0, torch.where(pole, 1.0, rho2).sqrt())
+    u = torch.atan2(torch.where(pole, 0.0, x), torch.where(pole, 1.0, -z)) / (2 * math.pi) + 0.5
+    column, row = u * w - 0.5, torch.atan2(rho, y) / math.pi * h - 0.5
+    level = roughness.clamp(0, 1) * (levels - 1)
+    left, top, low = (position.detach().floor() for position in (column, row, level))
+    values = torch.zeros_like(directions)
+    for k in range(8):
+        right, down, up = k & 1, k >> 1 & 1, k >> 2
+        at_level, at_row, at_column = (
+            (low + up).long().clamp(max=levels - 1),
+            (top + down).long(),
+            (left + right).long(),
+        )
+        # The neighbour across a pole is the same row, half a revolution away.
+        beyond = (at_row < 0) | (at_row >= h)
+        at_column = torch.where(beyond, at_column + w // 2, at_column) % w
+        x, y, z = column - left, row - top, level - low
+        weight = (x if right else 1 - x) * (y if down else 1 - y) * (z if up else 1 - z)
+        values = values + weight[:, None] * stack[at_level, at_row.clamp(0, h - 1), at_column]
+    return values
 
 
 def sh_shade(

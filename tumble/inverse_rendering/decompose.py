@@ -50,7 +50,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 14
+VERSION = 15
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2

@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 from tumble import backends
 from tumble.maths import SE3, reflect, spherical_harmonics
 from tumble.rendering import brdf
-from tumble.rendering.prefiltered_light import Prefiltered
+from tumble.rendering.prefiltered_light import Prefiltered, cell_roughness
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.trace import Visibility
 from tumble.scene import Camera, Environment
@@ -154,7 +154,8 @@ def shade(
         bounce: Indirect light, used if the visibility has blockers; occluded directions are black when None.
     """
     light = environment.lookup(visibility.directions @ R_env_obj.mT)
-    return _sum(surface.normals, albedo, roughness, surface.views, visibility, light, bounce, f0)
+    lobes = _lobes(surface, roughness, visibility, light, bounce)
+    return albedo * lobes.diffuse + f0 * lobes.specular
 
 
 def diffuse(
@@ -168,7 +169,7 @@ def diffuse(
 ) -> Float[Tensor, "p 3"]:
     """The diffuse lobe of `shade`."""
     light = environment.lookup(visibility.directions @ R_env_obj.mT)
-    return _diffuse(surface, albedo, visibility, light, bounce)
+    return albedo * _lobes(surface, torch.ones_like(albedo[:, :1]), visibility, light, bounce).diffuse
 
 
 def shade_split(
@@ -184,18 +185,22 @@ def shade_split(
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance with wide lobes summed over the directions, and narrow specular lobes by the split sum.
 
-    The split sum is multiplied by the visible fraction of the specular lobe. It is not used for wide lobes
-    (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the lobe
-    (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
+    The split sum is multiplied by the visible fraction of the specular lobe (`Backend.shade`). It is not used for wide
+    lobes (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the
+    lobe (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
     """
-    light = prefiltered.cell_radiance(visibility.directions @ R_env_obj.mT)
-    narrow = specular(surface.normals, surface.views, roughness, prefiltered, R_env_obj, f0)
-    narrow = lobe_visibility(surface, roughness, visibility) * narrow
-    black = torch.zeros_like(albedo)
-    # The lobe is linear in f0, and the kernel does not differentiate f0, which may be learnt.
-    wide = f0 * _sum(surface.normals, black, roughness, surface.views, visibility, light, bounce, 1.0)
+    # One lookup for both kinds of directions, since its gradient is an image of the size of all levels.
+    mirrored = reflect(surface.views, surface.normals)
+    in_env = torch.cat([visibility.directions, mirrored]) @ R_env_obj.mT
+    cell = torch.full_like(visibility.directions[:, :1], cell_roughness(len(visibility.directions)))
+    radiance = prefiltered.lookup(in_env, torch.cat([cell, roughness]))
+    light, of_mirrored = radiance.split([len(cell), len(mirrored)])
+    lobes = _lobes(surface, roughness, visibility, light, bounce)
+    narrow = of_mirrored * (
+        lobes.specular_visibility[:, None] * _reflectance(surface.normals, surface.views, roughness)
+    )
     wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
-    return _diffuse(surface, albedo, visibility, light, bounce) + torch.lerp(narrow, wide, wideness)
+    return albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wideness)
 
 
 def specular(
@@ -216,26 +221,16 @@ def specular(
         R_env_obj: Rotation from the object frame to the env frame.
         f0: Reflectance at normal incidence.
     """
+    reflected = prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness)
+    return f0 * reflected * _reflectance(normals, views, roughness)
+
+
+def _reflectance(
+    normals: Float[Tensor, "p 3"], views: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]
+) -> Float[Tensor, "p 1"]:
+    """Directional albedo of the specular lobe divided by f0."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
-    reflectance = f0 * brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
-    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * reflectance
-
-
-@torch.no_grad()
-def lobe_visibility(surface: Surface, roughness: Float[Tensor, "p 1"], visibility: Visibility) -> Float[Tensor, "p 1"]:
-    """Visible fraction of the specular lobe above the horizon; not differentiable.
-
-    Directions are weighted by the lobe of `prefilter`, widened to at least the distance between neighbouring
-    directions.
-    """
-    cosine = reflect(surface.views, surface.normals) @ visibility.directions.T
-    # GGX falls to a quarter at a distance of 2 a from its peak; neighbouring directions are sqrt(4 pi / D) apart.
-    a = roughness.square().clamp(min=math.sqrt(math.pi / len(visibility.directions)) / 2)
-    t = 0.5 * (1 - cosine) + a * a * 0.5 * (1 + cosine)
-    above = surface.normals @ visibility.directions.T > 0
-    weight = torch.where(above, cosine.clamp(min=0), 0.0) / t.square()
-    total = weight.sum(-1, keepdim=True)
-    return (weight * visibility.unpacked()).sum(-1, keepdim=True) / total.clamp(min=torch.finfo(total.dtype).tiny)
+    return brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
 
 
 @cache
@@ -244,34 +239,18 @@ def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size
     return brdf.split_sum_table().to(device, dtype)
 
 
-def _diffuse(
+def _lobes(
     surface: Surface,
-    albedo: Float[Tensor, "p 3"],
-    visibility: Visibility,
-    light: Float[Tensor, "D 3"],
-    bounce: Bounce | AveragedBounce | None,
-) -> Float[Tensor, "p 3"]:
-    """The diffuse lobe summed over the directions."""
-    # For a camera behind the surface the kernel's specular lobe is 0.
-    behind, unused = -surface.normals.detach(), torch.ones_like(albedo[:, :1])
-    return _sum(surface.normals, albedo, unused, behind, visibility, light, bounce, 0.0)
-
-
-def _sum(
-    normals: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, "p 1"],
-    views: Float[Tensor, "p 3"],
     visibility: Visibility,
     light: Float[Tensor, "D 3"],
     bounce: Bounce | AveragedBounce | None,
-    f0: float,
-) -> Float[Tensor, "p 3"]:
-    """Sum of both lobes over the directions, by the backend's kernel."""
+) -> backends.Lobes:
+    """Sums of both lobes over the directions, by the backend's kernel."""
     blocker, indirect = _blocker_radiance(visibility, light, bounce)
-    backend = backends.choose(normals.device, normals.dtype)
-    directions, bits = visibility.directions, visibility.bits
-    return backend.shade(normals, albedo, roughness[:, 0], views, directions, light, bits, blocker, indirect, f0)
+    backend = backends.choose(light.device, light.dtype)
+    point = (surface.normals, roughness[:, 0], surface.views)
+    return backend.shade(*point, visibility.directions, light, visibility.bits, blocker, indirect)
 
 
 def _blocker_radiance(

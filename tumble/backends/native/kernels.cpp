@@ -4,6 +4,7 @@
 #include "composite.h"
 #include "gaussian_terms.h"
 #include "image.h"
+#include "lookup.h"
 #include "parallel.h"
 #include "project.h"
 #include "sh_shade.h"
@@ -16,7 +17,7 @@ API int lanes() { return LANES; }
 // Sizes of the structures, which the caller compares with its own.
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
-                       sizeof(GaussianTerms), sizeof(Leaf), sizeof(Node)};
+                       sizeof(GaussianTerms), sizeof(Lookup), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -112,3 +113,6 @@ API void sh_shade_adjoint(const ShShade* s) {
 
 API void image_loss(const Image* m) { image_terms(*m); }
 API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
+
+API void lookup_forward(const Lookup* s) { lookup_values(*s); }
+API void lookup_backward(const Lookup* s) { lookup_adjoint(*s); }
