@@ -135,7 +135,7 @@ def shade_rows(backend: Backend, name: str, threads: int, *, device: torch.devic
     surface = [x.to(device).requires_grad_() for x in tensors]
     light, directions = torch.rand(DIRECTIONS, 3).to(device).requires_grad_(), fibonacci(DIRECTIONS).to(device)
     visibility = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
-    no_blockers = visibility.new_full((1, 1), -1), light.new_zeros(0, 3)
+    no_blockers = visibility.new_full((1, 1), -1), torch.arange(p, device=device), light.new_zeros(0, 3)
     arguments: Any = [*surface, directions, light, visibility, *no_blockers]
     with torch.no_grad():
         forward = median_seconds(lambda: backend.shade(*arguments), threads, RUNS, device)

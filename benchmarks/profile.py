@@ -40,9 +40,9 @@ PARTS: dict[str, dict[str, list[tuple[Any, str]]]] = {
         "optimizer": [(torch.optim.Adam, "step"), (torch.optim.Adam, "zero_grad")],
     },
     "decompose": {
-        "render": [(decompose, "render_gbuffer")],
-        "colour": [(decompose, "_shade")],
-        "losses": [(losses, "light_smoothness"), (losses, "silhouette"), (losses, "material_smoothness")],
+        "render": [(decompose, "corner_features"), (decompose, "rasterize_material")],
+        "colour": [(decompose, "_bounce"), (decompose, "_shade")],
+        "losses": [(losses, "light_smoothness"), (losses, "material_terms")],
         "backward": [(torch.Tensor, "backward")],
         "optimizer": [(torch.optim.Adam, "step"), (torch.optim.Adam, "zero_grad")],
     },

@@ -319,13 +319,13 @@ def test_shading_and_its_gradients_are_those_of_the_reference(
     p = 80
     inputs = [*_surface(p, rough), torch.rand(d, 3, generator=rng), torch.rand(m, 3, generator=rng)]
     directions = cases.fibonacci(d).float()
-    visibility = _brute.pack(torch.rand(p, d, generator=rng) > 0.3)
-    blocker = torch.randint(-1, m, (p, d), generator=rng).int() if m else torch.full((1, 1), -1).int()
+    visibility, rows = _brute.pack(torch.rand(50, d, generator=rng) > 0.3), torch.randint(0, 50, (p,), generator=rng)
+    blocker = torch.randint(-1, m, (50, d), generator=rng).int() if m else torch.full((1, 1), -1).int()
     seeds = torch.randn(2, p, 3, generator=rng)
 
     def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
         x = [y.to(dtype).requires_grad_() for y in inputs]
-        lobes = by.shade(*x[:3], directions.to(dtype), x[3], visibility, blocker, x[4])
+        lobes = by.shade(*x[:3], directions.to(dtype), x[3], visibility, blocker, rows, x[4])
         used = x if m else x[:4]
         assert not lobes.specular_visibility.requires_grad
         return [*lobes, *torch.autograd.grad(lobes[:2], used, [*seeds.to(dtype)])]
@@ -338,10 +338,10 @@ def test_gradients_of_reference_shading_are_finite_differences() -> None:
     rng = torch.Generator().manual_seed(1)
     inputs += [torch.rand(9, 3, generator=rng).double().requires_grad_() for _ in range(2)]
     visibility = _brute.pack(torch.rand(4, 9, generator=rng) > 0.3)
-    blocker = torch.randint(-1, 9, (4, 9), generator=rng).int()
+    blocker, rows = torch.randint(-1, 9, (4, 9), generator=rng).int(), torch.tensor([2, 0, 2, 3])
 
     def render(*x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return tuple(reference.shade(*x[:3], cases.fibonacci(9), x[3], visibility, blocker, x[4])[:2])
+        return tuple(reference.shade(*x[:3], cases.fibonacci(9), x[3], visibility, blocker, rows, x[4])[:2])
 
     assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
@@ -356,7 +356,7 @@ def test_a_sphere_in_uniform_light_matches_the_integrated_brdf(backend: backends
     d = 1 << 14
     light = torch.full((d, 3), 1.5)
     visibility = torch.full((p, d // 32), -1, dtype=torch.int32)
-    black = torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3)
+    black = torch.full((1, 1), -1, dtype=torch.int32), torch.arange(p), torch.zeros(0, 3)
     point = normal.float(), torch.full((p,), roughness), view.float().expand(p, 3)
     lobes = backend.shade(*point, cases.fibonacci(d).float(), light, visibility, *black)
     # Both grids resolve the narrowest of these lobes to about 1e-3.
@@ -589,6 +589,67 @@ def test_gradients_of_reference_gaussian_terms_are_finite_differences() -> None:
 
     inputs = [x.requires_grad_() for x in (means, quats, log_scales, sdf, camera[0], camera[1])]
     assert torch.autograd.gradcheck(sharpness_apart, inputs)
+
+
+def _material(n: int) -> list[torch.Tensor]:
+    """Albedo and roughness logits and normal offsets of the corners, and positive transfer vectors."""
+    rng = torch.Generator().manual_seed(n)
+    shapes = (n, 4, 3), (n, 4), (n, 4, 3), (n, 9)
+    *corners, transfer = (torch.randn(x, generator=rng) for x in shapes)
+    return [*(3 * x for x in corners), 0.5 * transfer + 0.3]
+
+
+@pytest.mark.parametrize("n", [0, 1, 75])
+def test_features_of_corners_and_their_gradients_are_those_of_the_reference(backend: backends.Backend, n: int) -> None:
+    inputs, rng = _material(n)[:3], torch.Generator().manual_seed(n)
+    seeds = torch.randn(n, 4, 7, generator=rng), torch.randn(n, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        corners, albedo = by.corner_features(*x, 2.0)
+        return [corners, albedo, *torch.autograd.grad([corners, albedo], x, [y.to(dtype) for y in seeds])]
+
+    _compare(backend, run)
+
+
+@pytest.mark.parametrize("n", [0, 1, 75])
+def test_bounces_and_their_gradients_are_those_of_the_reference(backend: backends.Backend, n: int) -> None:
+    rng = torch.Generator().manual_seed(n)
+    transfer, coefficients, seed = _material(n)[3], torch.randn(9, 3, generator=rng), torch.randn(n, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (torch.rand(n, 3, generator=rng.manual_seed(1)), coefficients)]
+        radiance = by.bounce(x[0], transfer.to(dtype), x[1])
+        return [radiance, *torch.autograd.grad(radiance, x, seed.to(dtype))]
+
+    _compare(backend, run)
+
+
+@pytest.mark.parametrize(("height", "width"), [(19, 37), (1, 5), (4, 1)])
+def test_terms_of_materials_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, height: int, width: int
+) -> None:
+    _, alpha, *_, photo, mask = _pictures(height, width, (slice(None), slice(None, 30)))
+    features = torch.rand(height, width, 7, generator=torch.Generator().manual_seed(0))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (features, alpha)]
+        terms = by.material_terms(*x, photo, mask)
+        return [terms, *torch.autograd.grad(terms, x, torch.tensor([1.0, 2.0]).to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_materials_are_finite_differences() -> None:
+    *corners, transfer = (x.double() for x in _material(5))
+    inputs = [x.requires_grad_() for x in corners]
+    assert torch.autograd.gradcheck(lambda *x: reference.corner_features(*x, 2.0), inputs)
+    rng = torch.Generator().manual_seed(0)
+    inputs = [torch.rand(x, generator=rng).double().requires_grad_() for x in ((5, 3), (9, 3))]
+    assert torch.autograd.gradcheck(lambda albedo, light: reference.bounce(albedo, transfer, light), inputs)
+    _, alpha, *_, photo, mask = _pictures(5, 6, (slice(None), slice(None, 4)))
+    inputs = [x.double().requires_grad_() for x in (torch.rand(5, 6, 7, generator=rng), alpha)]
+    assert torch.autograd.gradcheck(lambda *x: reference.material_terms(*x, photo, mask), inputs)
 
 
 def test_constants_that_the_kernels_repeat_are_those_of_the_package() -> None:

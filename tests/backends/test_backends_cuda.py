@@ -37,6 +37,9 @@ CONFORMANCE = [
         (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, 40, 50, box, 0.2, 25.0)
         for box in ((slice(8, 30), slice(12, 40)), (slice(None), slice(None)))
     ],
+    (conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, 75),
+    (conformance.test_bounces_and_their_gradients_are_those_of_the_reference, 75),
+    (conformance.test_terms_of_materials_and_their_gradients_are_those_of_the_reference, 19, 37),
     (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 333, 8.0),
 ]
 every_case = pytest.mark.parametrize(

@@ -270,13 +270,16 @@ def exercise() -> None:
     inputs = [x.requires_grad_() for x in (*surface, *light)]
     results = []
     for backend in (cpu, reference):
-        lobes = backend.shade(*inputs[:3], directions, inputs[3], bits, blockers, inputs[4])
+        lobes = backend.shade(*inputs[:3], directions, inputs[3], bits, blockers, torch.arange(40), inputs[4])
         results.append([*lobes, *torch.autograd.grad((lobes.diffuse + lobes.specular).sum(), inputs)])
     test_backends.test_lookups_and_their_gradients_are_those_of_the_reference(cpu, 3, 7, 37)
     test_backends.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference(cpu, 37, True)
     box = slice(2, 9), slice(3, 12)
     test_backends.test_terms_of_images_and_their_gradients_are_those_of_the_reference(cpu, 12, 13, box, 0.2, 9.0)
     test_backends.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference(cpu, 37, 8.0)
+    test_backends.test_features_of_corners_and_their_gradients_are_those_of_the_reference(cpu, 37)
+    test_backends.test_bounces_and_their_gradients_are_those_of_the_reference(cpu, 37)
+    test_backends.test_terms_of_materials_and_their_gradients_are_those_of_the_reference(cpu, 12, 13)
     # Both are computed in float32.
     assert max(cases.difference(a, b) for a, b in zip(*results, strict=True)) < 1e-3
 

@@ -20,13 +20,13 @@ CAMERA = Camera.from_fov(math.radians(40), 32, 40)
 FACING = SE3.from_rotation(SO3.identity(), torch.tensor([0.0, 0.0, 4.0]))
 
 
-def view_of(**images: torch.Tensor) -> Buffers:
+def view_of(*, features: dict[str, torch.Tensor] | None = None, **images: torch.Tensor) -> Buffers:
     """Buffers of a covered view with the given images; the others are flat."""
     flat = torch.ones(32, 40)
     given = {"alpha": flat, "depth": 4 * flat, "depth_var": 0 * flat, "normal": flat[..., None].expand(-1, -1, 3)}
     given |= {"rgb": torch.zeros(32, 40, 3), "weight": torch.ones(1)} | images
     touched, dominant = (given["weight"] > 0).int(), torch.zeros(32, 40).int()
-    return Buffers(**given, features={}, touched=touched, dominant=dominant)
+    return Buffers(**given, features=features or {}, touched=touched, dominant=dominant)
 
 
 def terms_of(view: Buffers, photo: torch.Tensor, mask: torch.Tensor, T_cam_obj: SE3 = FACING, **options: float) -> Any:
@@ -106,22 +106,33 @@ def test_the_normal_term_saturates_at_creases() -> None:
     assert term(2, 25.0) == pytest.approx(term(2, 0.0), rel=0.02)
 
 
-def test_the_silhouette_loss_uses_known_pixels_only() -> None:
-    mask, valid = torch.zeros(4, 4), torch.ones(4, 4, 1)
-    alpha = torch.zeros(4, 4)
+def test_the_mask_term_uses_known_pixels_only() -> None:
+    mask, alpha = torch.zeros(32, 40, dtype=torch.uint8), torch.zeros(32, 40)
     alpha[0, 0] = 1.0
-    assert losses.silhouette(alpha, mask, valid) == pytest.approx(1 / 16)
-    valid[0, 0] = 0
-    assert losses.silhouette(alpha, mask, valid) == 0
+    view = view_of(alpha=alpha, features={"material": torch.zeros(32, 40, 7)})
+
+    def terms() -> list[float]:
+        both = terms_of(view, random_photo(0), mask), losses.material_terms(view, random_photo(0), mask)
+        return [float(found["mask"]) for found in both]
+
+    assert terms() == pytest.approx([1 / 1280] * 2)
+    mask[0, 0] = UNKNOWN
+    assert terms() == [0, 0]
 
 
-def test_the_mask_term_is_the_silhouette_loss() -> None:
-    rng = torch.Generator().manual_seed(0)
-    alpha, mask = torch.rand(32, 40, generator=rng), torch.zeros(32, 40, dtype=torch.uint8)
-    mask[4:20], mask[20:25] = OBJECT, UNKNOWN
-    valid = (mask != UNKNOWN).float()[..., None]
-    term = terms_of(view_of(alpha=alpha), random_photo(0), mask)["mask"]
-    torch.testing.assert_close(term, losses.silhouette(alpha, (mask == OBJECT).float(), valid))
+def test_the_material_term_counts_edges_less_where_the_photo_has_edges() -> None:
+    """Albedo is 0.5 in the left half of the object; the silhouette is an edge, too."""
+    mask, material = torch.zeros(32, 40, dtype=torch.uint8), torch.zeros(32, 40, 7)
+    mask[:, :20] = OBJECT
+    material[:, :10, :3] = 0.5
+    flat, view = torch.full((32, 40, 3), 90, dtype=torch.uint8), view_of(features={"material": material})
+    plain = losses.material_terms(view, flat, mask)["material"]
+    assert plain == pytest.approx(0.5 * 3 * 32 / (4 * 32 * 39))
+    edge = flat.clone()
+    edge[:, :10] = 243  # 0.6 brighter
+    assert losses.material_terms(view, edge, mask)["material"] == pytest.approx(math.exp(-0.6) * float(plain))
+    material[:, :20, 3] = 0.2
+    assert losses.material_terms(view, flat, mask)["material"] == pytest.approx(float(plain) * (1 + 0.2 / 1.5))
 
 
 def gaussian_terms(

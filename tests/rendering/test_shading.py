@@ -1,6 +1,7 @@
 """Deferred shading against closed forms, the claims of the paper, and Mitsuba (slow)."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -165,7 +166,7 @@ def test_occluded_directions_dim_the_specular_lobe() -> None:
     occluded = directions[:, 0] < 0
     for j in torch.where(occluded)[0].tolist():
         bits[:, j // 32] &= ~(1 << (j % 32)) if j % 32 < 31 else 0x7FFFFFFF
-    half = Visibility(directions, bits, None)
+    half = replace(unoccluded(directions, 400), bits=bits)
     assert torch.equal(half.unpacked()[0], ~occluded)
     mirrored = 2 * (surface.normals * surface.views).sum(-1, keepdim=True) * surface.normals - surface.views
     fraction = lobe_visibility(surface, torch.full((400, 1), 0.2), half)[:, 0]

@@ -29,7 +29,7 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
 __all__ = [
@@ -327,8 +327,9 @@ class Backend(Protocol):
         view: Float[Tensor, "p 3"],
         directions: Float[Tensor, "d 3"],
         radiance: Float[Tensor, "d 3"],
-        visibility: Int32[Tensor, "p words"],
-        blocker: Int32[Tensor, "#p #d"],
+        visibility: Int32[Tensor, "q words"],
+        blocker: Int32[Tensor, "#q #d"],
+        rows: Int64[Tensor, " p"],
         blocker_radiance: Float[Tensor, "m 3"],
     ) -> Lobes:
         """Reflected radiance (Lambert and GGX) under light from d directions w_j of equal solid angle over the sphere.
@@ -356,8 +357,9 @@ class Backend(Protocol):
             directions: Unit directions shared by all points, in the frame of normal and view.
             radiance: Linear radiance arriving from each direction where it is visible.
             visibility: Bits of `visible`. L_j is radiance[j] where the bit is set; elsewhere it is
-                blocker_radiance[blocker[p, j]], or 0 if blocker[p, j] is -1.
+                blocker_radiance[blocker[q, j]], or 0 if blocker[q, j] is -1.
             blocker: Result of `blockers`, or `[1 1]` of -1 for black blockers.
+            rows: Row q of visibility and blocker that belongs to each point.
             blocker_radiance: Linear radiance of the Gaussians that `blocker` indexes; m may be 0.
         """
         ...
@@ -505,6 +507,53 @@ class Backend(Protocol):
             fx_fy_cx_cy: Focal lengths and principal point [pixels].
             floor: Lower limit of the median distance.
             reach: Limit of the depth difference.
+        """
+        ...
+
+    def corner_features(
+        self,
+        albedo_logits: Float[Tensor, "n 4 3"],
+        roughness_logits: Float[Tensor, "n 4"],
+        normal_offset: Float[Tensor, "n 4 3"],
+        temperature: float,
+    ) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+        """Features of all corners for `rasterize`, and the mean albedo of every Gaussian.
+
+        The features are albedo, roughness and normal offset, with sigmoid(x / temperature) of both logits.
+        Differentiable in all tensors.
+        """
+        ...
+
+    def bounce(
+        self,
+        albedo: Float[Tensor, "n 3"],
+        transfer: Float[Tensor, "n 9"],
+        coefficients: Float[Tensor, "9 3"],
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance `albedo / pi H(transfer)` of surfaces, with the irradiance H of `sh_shade` including all bounces.
+
+        Differentiable in albedo and coefficients.
+
+        Args:
+            albedo: Linear albedo.
+            transfer: Transfer vectors from light to shadowed irradiance.
+            coefficients: Light in harmonics up to degree 2.
+        """
+        ...
+
+    def material_terms(
+        self,
+        features: Float[Tensor, "h w c"],
+        alpha: Float[Tensor, "h w"],
+        photo: UInt8[Tensor, "h w 3"],
+        mask: UInt8[Tensor, "h w"],
+    ) -> Float[Tensor, "2"]:
+        """Loss terms of a rendered material.
+
+        0. The mask term of `image_terms`. Differentiable in alpha.
+        1. Mean of |x_b - x_a| e^-|y_b - y_a| over pairs of neighbours a and b along rows, plus that along columns. x
+           are the first four features where the mask is OBJECT and alpha > 1/2, and 0 elsewhere; y is the photo divided
+           by 255, and the exponential is averaged over its channels. Differentiable in features.
         """
         ...
 

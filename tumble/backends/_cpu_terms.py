@@ -1,4 +1,4 @@
-"""CPU kernels of the steps of stage 2: shading by spherical harmonics, and the loss terms (see `native/`)."""
+"""CPU kernels of the steps of stages 2 and 3 besides rendering: materials, colour and loss terms (see `native/`)."""
 
 import ctypes
 import math
@@ -21,7 +21,16 @@ from tumble.backends import (
     _native,
     threads,
 )
-from tumble.backends._structs import GaussianTerms, Image, ShShade, scratch, set_pointers
+from tumble.backends._structs import (
+    Activation,
+    GaussianTerms,
+    Image,
+    Indirect,
+    MaterialImage,
+    ShShade,
+    scratch,
+    set_pointers,
+)
 
 PLANES = 11
 """Planes of scratch memory in `native/image.h`."""
@@ -211,3 +220,106 @@ class _GaussianTermsFunction(torch.autograd.Function):
         v, needed = v_terms.unbind(), ctx.needs_input_grad
         gradients = zip(ctx.saved_tensors, _GAUSSIAN_TERM, needed[:7], strict=True)
         return (*(v[term] * x if need else None for x, term, need in gradients), *(None for _ in range(5)))
+
+
+def corner_features(
+    albedo_logits: Float[Tensor, "n 4 3"],
+    roughness_logits: Float[Tensor, "n 4"],
+    normal_offset: Float[Tensor, "n 4 3"],
+    temperature: float,
+) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+    """See `Backend.corner_features`."""
+    return _MaterialFunction.apply(albedo_logits, roughness_logits, normal_offset, temperature)
+
+
+class _MaterialFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor]:
+        *tensors, ctx.temperature = args
+        inputs = [x.contiguous() for x in tensors]
+        n = len(inputs[0])
+        corners, albedo = torch.empty(n, 4, 7), torch.empty(n, 3)
+        struct = Activation(n=n, threads=threads(), temperature=ctx.temperature)
+        named = dict(zip(("albedo_logits", "roughness_logits", "normal_offset"), inputs, strict=True))
+        kept = set_pointers(struct, {"corners": corners, "albedo": albedo, **named})
+        _native.library().material_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(corners)
+        return corners, albedo
+
+    @staticmethod
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        corners, n = ctx.saved_tensors[0], len(ctx.saved_tensors[0])
+        gradients = torch.empty(n, 4, 3), torch.empty(n, 4), torch.empty(n, 4, 3)
+        struct = Activation(n=n, threads=threads(), temperature=ctx.temperature)
+        v_corners, v_albedo = (v.contiguous() for v in v_results)
+        kept = set_pointers(struct, corners=corners, v_corners=v_corners, v_albedo=v_albedo)
+        names = ("v_albedo_logits", "v_roughness_logits", "v_normal_offset")
+        kept += set_pointers(struct, dict(zip(names, gradients, strict=True)))
+        _native.library().material_adjoint(ctypes.byref(struct))
+        return (*gradients, None)
+
+
+def bounce(
+    albedo: Float[Tensor, "n 3"],
+    transfer: Float[Tensor, "n 9"],
+    coefficients: Float[Tensor, "9 3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.bounce`."""
+    return _BounceFunction.apply(albedo, transfer, coefficients)
+
+
+class _BounceFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        albedo, transfer, coefficients = tensors = [x.contiguous() for x in args]
+        out, struct = torch.empty_like(albedo), Indirect(n=len(albedo))
+        set_pointers(struct, albedo=albedo, transfer=transfer, coefficients=coefficients, out=out)
+        _native.library().bounce_forward(ctypes.byref(struct))
+        ctx.save_for_backward(*tensors)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        albedo, transfer, coefficients = ctx.saved_tensors
+        v_albedo, v_coefficients, v_out = torch.empty_like(albedo), torch.empty_like(coefficients), v_out.contiguous()
+        struct = Indirect(n=len(albedo))
+        set_pointers(struct, albedo=albedo, transfer=transfer, coefficients=coefficients)
+        set_pointers(struct, v_out=v_out, v_albedo=v_albedo, v_coefficients=v_coefficients)
+        _native.library().bounce_adjoint(ctypes.byref(struct))
+        return v_albedo, None, v_coefficients
+
+
+def material_terms(
+    features: Float[Tensor, "h w c"],
+    alpha: Float[Tensor, "h w"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+) -> Float[Tensor, "2"]:
+    """See `Backend.material_terms`."""
+    return _MaterialTermsFunction.apply(features, alpha, photo, mask)
+
+
+class _MaterialTermsFunction(torch.autograd.Function):
+    """The kernel computes values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        features, alpha = tensors[:2]
+        height, width, n_features = features.shape
+        plane_size = (height + 1) * (width + 2 * _native.library().lanes())
+        struct = MaterialImage(height=height, width=width, n_features=n_features, plane_size=plane_size)
+        terms, g_features, g_alpha = torch.empty(2), torch.empty_like(features), torch.empty_like(alpha)
+        kept = set_pointers(struct, dict(zip(("features", "alpha", "photo", "mask"), tensors, strict=True)))
+        kept += set_pointers(struct, scratch=scratch(PLANES * plane_size), terms=terms)
+        set_pointers(struct, g_features=g_features, g_alpha=g_alpha)
+        _native.library().material_loss(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(g_features, g_alpha)
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        g_features, g_alpha = ctx.saved_tensors
+        return v_terms[1] * g_features, v_terms[0] * g_alpha, None, None

@@ -72,7 +72,7 @@ class Shade(ctypes.Structure):
     """`Shade` of `native/shade.h`: arguments of shading."""
 
     _fields_ = [
-        *_pointers("normal roughness view directions radiance visibility blocker blocker_radiance"),
+        *_pointers("normal roughness view directions radiance visibility blocker rows blocker_radiance"),
         *_ints("n_points n_directions stride words n_blockers threads blocker_point_stride blocker_direction_stride"),
         *_floats("roughness_min"),
         *_pointers("diffuse specular specular_visibility v_diffuse v_specular radiance_parts blocker_parts"),
@@ -124,7 +124,41 @@ class Lookup(ctypes.Structure):
     ]
 
 
-STRUCTURES = (Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms, Lookup)
+class Activation(ctypes.Structure):
+    """`Activation` of `native/material.h`: arguments of the activation of materials."""
+
+    _fields_ = [
+        *_pointers("albedo_logits roughness_logits normal_offset"),
+        *_ints("n threads"),
+        *_floats("temperature"),
+        *_pointers("corners albedo v_corners v_albedo v_albedo_logits v_roughness_logits v_normal_offset"),
+    ]
+
+
+class Indirect(ctypes.Structure):
+    """`Indirect` of `native/material.h`: arguments of indirect light."""
+
+    _fields_ = [
+        *_pointers("albedo transfer coefficients"),
+        *_ints("n"),
+        *_pointers("out v_out v_albedo v_coefficients"),
+    ]
+
+
+class MaterialImage(ctypes.Structure):
+    """`MaterialImage` of `native/material.h`: arguments of the loss terms of a rendered material."""
+
+    _fields_ = [
+        *_pointers("features alpha photo mask"),
+        *_ints("height width n_features plane_size"),
+        *_pointers("scratch terms g_features g_alpha"),
+    ]
+
+
+STRUCTURES = (
+    *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
+    *(Lookup, Activation, Indirect, MaterialImage),
+)
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 
 

@@ -7,7 +7,7 @@ import ctypes
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from tumble.backends import (
@@ -28,15 +28,25 @@ from tumble.backends import (
     _native,
     threads,
 )
-from tumble.backends._cpu_terms import gaussian_terms, image_terms, sh_shade
+from tumble.backends._cpu_terms import (
+    bounce,
+    corner_features,
+    gaussian_terms,
+    image_terms,
+    material_terms,
+    sh_shade,
+)
 from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Shade, scratch, set_pointers
 
 __all__ = [
     "blockers",
+    "bounce",
     "build",
+    "corner_features",
     "gaussian_terms",
     "image_terms",
     "lookup",
+    "material_terms",
     "rasterize",
     "ready",
     "sh_shade",
@@ -324,12 +334,13 @@ def shade(
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
     radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "p words"],
-    blocker: Int32[Tensor, "#p #d"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
     blocker_radiance: Float[Tensor, "m 3"],
 ) -> Lobes:
     """See `Backend.shade`."""
-    rest = directions, visibility, blocker
+    rest = directions, visibility, blocker, rows
     return Lobes(*_ShadeFunction.apply(normal, roughness, view, radiance, blocker_radiance, *rest))
 
 
@@ -365,12 +376,12 @@ class _ShadeFunction(torch.autograd.Function):
         )
         _native.library().shade_adjoint(ctypes.byref(struct))
         v_radiance = v_rows[:, : len(v_radiance)].T
-        return (*v_surface, v_radiance, v_blocker, None, None, None)
+        return (*v_surface, v_radiance, v_blocker, None, None, None, None)
 
 
 def _shade_launch(tensors: Any) -> tuple[Shade, list[Tensor]]:
     """Arguments of shading and the tensors that they point to; directions and radiance become padded rows."""
-    normal, roughness, view, radiance, blocker_radiance, directions, visibility, blocker = tensors
+    normal, roughness, view, radiance, blocker_radiance, directions, visibility, blocker, index = tensors
     lanes = _native.library().lanes()
     padding = -len(directions) % lanes
     rows = {"directions": directions, "radiance": radiance}
@@ -386,7 +397,7 @@ def _shade_launch(tensors: Any) -> tuple[Shade, list[Tensor]]:
         blocker_direction_stride=blocker.stride(1) if blocker.shape[1] > 1 else 0,
         roughness_min=ROUGHNESS_MIN,
     )
-    rest = {"normal": normal, "roughness": roughness, "view": view, "visibility": visibility}
+    rest = {"normal": normal, "roughness": roughness, "view": view, "visibility": visibility, "rows": index}
     kept = set_pointers(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
     return struct, kept
 

@@ -3,26 +3,37 @@
 This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
 it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
 GPU differ by rounding errors. The kernels run on the device of the tensors; on the CPU they are slow and serve tests.
-Shading by spherical harmonics, lookups and loss terms have no kernel yet and are those of the reference, on the GPU.
+Shading by spherical harmonics, lookups, materials and loss terms have no kernel yet: they are those of the reference.
 """
 
 import importlib.util
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Lobes, Rendering
-from tumble.backends.reference import gaussian_terms, image_terms, lookup, sh_shade
+from tumble.backends.reference import (
+    bounce,
+    corner_features,
+    gaussian_terms,
+    image_terms,
+    lookup,
+    material_terms,
+    sh_shade,
+)
 
 __all__ = [
     "blockers",
+    "bounce",
     "build",
+    "corner_features",
     "gaussian_terms",
     "image_terms",
     "lookup",
+    "material_terms",
     "rasterize",
     "ready",
     "sh_shade",
@@ -261,12 +272,14 @@ def shade(
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
     radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "p words"],
-    blocker: Int32[Tensor, "#p #d"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
     blocker_radiance: Float[Tensor, "m 3"],
 ) -> Lobes:
     """See `Backend.shade`."""
-    rest = directions, radiance, visibility, blocker, blocker_radiance
+    blocker = blocker[rows] if len(blocker) > 1 else blocker
+    rest = directions, radiance, visibility[rows], blocker, blocker_radiance
     values = _Shade.apply(normal, roughness, view, *rest)
     visible, total = values[:, 6:].detach().unbind(1)
     return Lobes(values[:, :3], values[:, 3:6], visible / total.clamp(min=torch.finfo(total.dtype).tiny))

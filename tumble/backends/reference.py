@@ -38,10 +38,13 @@ from tumble.backends._brute import blockers, build, rotation, trace, unpack, vis
 
 __all__ = [
     "blockers",
+    "bounce",
     "build",
+    "corner_features",
     "gaussian_terms",
     "image_terms",
     "lookup",
+    "material_terms",
     "rasterize",
     "ready",
     "sh_shade",
@@ -291,16 +294,17 @@ def shade(
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
     radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "p words"],
-    blocker: Int32[Tensor, "#p #d"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
     blocker_radiance: Float[Tensor, "m 3"],
 ) -> Lobes:
     """See `Backend.shade`."""
     d = directions.shape[0]
-    visible = unpack(visibility, d)
+    visible = unpack(visibility, d)[rows]
     arriving = torch.where(visible[..., None], radiance, 0)
     if blocker_radiance.shape[0]:
-        blocker = blocker.expand(len(normal), d)
+        blocker = blocker.expand(len(visibility), d)[rows]
         is_blocked = ~visible & (blocker >= 0)
         arriving = torch.where(is_blocked[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
     a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
@@ -388,13 +392,15 @@ def sh_shade(
         coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
         floor = IRRADIANCE_FLOOR * math.pi * radiance.mean(0)
 
-        def irradiance(transfer: Tensor) -> Tensor:
-            visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
-            bounces = (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
-            return (transfer @ coefficients).clamp(min=0) / bounces + floor
-
-        ratio = (irradiance(occluded) / irradiance(unoccluded).clamp(min=1e-12)).clamp(max=RATIO_MAX)
+        shadowed, full = (_irradiance(x, coefficients, albedo) + floor for x in (occluded, unoccluded))
+        ratio = (shadowed / full.clamp(min=1e-12)).clamp(max=RATIO_MAX)
     return albedo * ratio * at(0, normals) + specular
+
+
+def _irradiance(transfer: Tensor, coefficients: Tensor, albedo: Tensor) -> Tensor:
+    """H of `Backend.sh_shade`."""
+    visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+    return (transfer @ coefficients).clamp(min=0) / (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
 
 
 def image_terms(
@@ -495,3 +501,40 @@ def gaussian_terms(
         inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
     difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)
     return torch.stack([needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference])
+
+
+def corner_features(
+    albedo_logits: Float[Tensor, "n 4 3"],
+    roughness_logits: Float[Tensor, "n 4"],
+    normal_offset: Float[Tensor, "n 4 3"],
+    temperature: float,
+) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+    """See `Backend.corner_features`."""
+    albedo, roughness = (torch.sigmoid(x / temperature) for x in (albedo_logits, roughness_logits))
+    return torch.cat([albedo, roughness[..., None], normal_offset], -1), albedo.mean(1)
+
+
+def bounce(
+    albedo: Float[Tensor, "n 3"],
+    transfer: Float[Tensor, "n 9"],
+    coefficients: Float[Tensor, "9 3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.bounce`."""
+    return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
+
+
+def material_terms(
+    features: Float[Tensor, "h w c"],
+    alpha: Float[Tensor, "h w"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+) -> Float[Tensor, "2"]:
+    """See `Backend.material_terms`."""
+    error = (alpha - (mask == OBJECT).to(alpha)) * (mask != UNKNOWN)
+    x, y = features[..., :4] * ((mask == OBJECT) & (alpha > 0.5))[..., None], photo.to(alpha) / 255
+
+    def along(dim: int) -> Tensor:
+        weighted = x.diff(dim=dim).abs() * (-y.diff(dim=dim).abs()).exp().mean(-1, keepdim=True)
+        return weighted.sum() / max(1, weighted.numel())
+
+    return torch.stack([(error**2).mean(), along(1) + along(0)])

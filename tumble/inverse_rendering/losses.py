@@ -1,7 +1,7 @@
 """Terms of the paper's objectives (eq. 11, 14), each a scalar.
 
-Images are sRGB in [0, 1], channels last. `photo` is the input image. `valid` is 1 where the mask is known and 0
-elsewhere; pixels with an unknown mask do not contribute. The terms of stage 2 are kernels of the backends.
+Images are sRGB, channels last. `photo` is the input image. Pixels with an unknown mask do not contribute. Terms that
+are computed together are kernels of the backends.
 """
 
 import torch
@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from tumble import backends
-from tumble.maths import SE3, edge_aware, srgb_from_linear
+from tumble.maths import SE3, srgb_from_linear
 from tumble.rendering import Buffers
 from tumble.scene import Camera, Gaussians
 
@@ -96,23 +96,27 @@ def gaussian_terms(
     return dict(zip(("rank", "gamma", "proj"), terms.unbind(), strict=True))
 
 
-def silhouette(
-    alpha: Float[Tensor, "h w"], mask: Float[Tensor, "h w"], valid: Float[Tensor, "h w 1"]
-) -> Float[Tensor, ""]:
-    """Mean squared difference between coverage and mask, see `image_terms`."""
-    return ((alpha - mask) ** 2 * valid[..., 0]).mean()
-
-
 def light_smoothness(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Mean squared difference of neighbouring texels of an environment map, also across its seam (L_light, eq. 14)."""
     down, across = radiance[1:] - radiance[:-1], radiance.roll(-1, 1) - radiance
     return (down**2).mean() + (across**2).mean()
 
 
-def material_smoothness(view: Buffers, mask: Float[Tensor, "h w"], photo: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Edge-aware smoothness of albedo and roughness (L_material, eq. 14; Relightable 3D Gaussian).
+def material_terms(
+    view: Buffers, photo: UInt8[Tensor, "h w 3"], mask: UInt8[Tensor, "h w"]
+) -> dict[str, Float[Tensor, ""]]:
+    """Terms of a view of stage 3 by name (eq. 14; exact in `Backend.material_terms`).
 
-    Outside of the silhouette both are 0, as published, so that the term also acts at the contour.
+    mask: as in `image_terms`.
+    material: edge-aware smoothness of albedo and roughness (L_material; Relightable 3D Gaussian): their gradients count
+    less at edges of the input image. Outside of the silhouette both are 0, as published, so that the term also acts at
+    the contour.
+
+    Args:
+        view: View with the feature "material", whose first channels are albedo and roughness.
+        photo: Input image, sRGB.
+        mask: Mask of the capture.
     """
-    inside = (mask * (view.alpha > 0.5))[..., None]
-    return edge_aware(torch.cat([view.features["albedo"], view.features["roughness"]], -1) * inside, photo)
+    backend = backends.choose(view.alpha.device, view.alpha.dtype)
+    terms = backend.material_terms(view.features["material"], view.alpha, photo, mask)
+    return dict(zip(("mask", "material"), terms.unbind(), strict=True))

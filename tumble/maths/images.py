@@ -122,21 +122,6 @@ def channels_first(x: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "c h w"]:
     return x.movedim(-1, 0).contiguous()
 
 
-def gradients(x: Float[Tensor, "h w c"]) -> tuple[Float[Tensor, "h w-1 c"], Float[Tensor, "h-1 w c"]]:
-    """Forward differences to the right neighbour and to the lower neighbour."""
-    return x[:, 1:] - x[:, :-1], x[1:] - x[:-1]
-
-
-def edge_aware(x: Float[Tensor, "h w c"], guide: Float[Tensor, "h w g"]) -> Float[Tensor, ""]:
-    """Edge-aware smoothness loss: mean |gradient of x| weighted by exp(-|gradient of guide|), summed over both axes.
-
-    The weight is averaged over the channels of the guide, so that edges of `x` cost less at edges of the guide.
-    """
-    pairs = zip(gradients(x), gradients(guide), strict=True)
-    horizontal, vertical = ((dx.abs() * (-dg.abs()).exp().mean(-1, keepdim=True)).mean() for dx, dg in pairs)
-    return horizontal + vertical
-
-
 def resize(x: Float[Tensor, "h w c"], height: int, width: int) -> Float[Tensor, "{height} {width} c"]:
     """The image resampled bilinearly; when shrinking, with a triangle filter two new pixels wide against aliasing."""
     resized = functional.interpolate(

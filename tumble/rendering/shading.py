@@ -96,24 +96,12 @@ class Bounce:
         """Radiance of every Gaussian under a light given in evenly distributed directions.
 
         The light is projected onto harmonics up to degree 2, which is accurate to 1 % of the irradiance for most lights
-        (Ramamoorthi and Hanrahan 2001). Shadows and all bounces are included, see `self_shadowed_irradiance`.
+        (Ramamoorthi and Hanrahan 2001). Shadows and all bounces are included: the occluding surface is assumed to be as
+        bright as the occluded point, which makes the bounces a geometric series (Jimenez et al. 2016).
         """
         coefficients = 4 * math.pi / len(directions) * (spherical_harmonics.basis(directions, 2).mT @ light)
-        return self.albedo / math.pi * self_shadowed_irradiance(self.transfer, coefficients, self.albedo)
-
-
-def self_shadowed_irradiance(
-    transfer: Float[Tensor, "n 9"], coefficients: Float[Tensor, "9 3"], albedo: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """Shadowed irradiance of surfaces, with all bounces, under light in harmonics up to degree 2.
-
-    The occluding surface is assumed to be as bright as the occluded point, which makes the bounces a geometric series
-    (Jimenez et al. 2016).
-    """
-    # Under a single small light the truncated series is negative on the opposite side.
-    irradiance = (transfer @ coefficients).clamp(min=0)
-    visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
-    return irradiance / (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
+        backend = backends.choose(self.albedo.device, self.albedo.dtype)
+        return backend.bounce(self.albedo, self.transfer, coefficients)
 
 
 @dataclass(frozen=True)
@@ -250,12 +238,13 @@ def _lobes(
     blocker, indirect = _blocker_radiance(visibility, light, bounce)
     backend = backends.choose(light.device, light.dtype)
     point = (surface.normals, roughness[:, 0], surface.views)
-    return backend.shade(*point, visibility.directions, light, visibility.bits, blocker, indirect)
+    seen = (visibility.bits, blocker, visibility.rows())
+    return backend.shade(*point, visibility.directions, light, *seen, indirect)
 
 
 def _blocker_radiance(
     visibility: Visibility, light: Float[Tensor, "D 3"], bounce: Bounce | AveragedBounce | None
-) -> tuple[Int32[Tensor, "#p #D"], Float[Tensor, "n 3"]]:
+) -> tuple[Int32[Tensor, "#q #D"], Float[Tensor, "n 3"]]:
     """Index of the Gaussian that occludes each direction, -1 for none, and the radiance of every Gaussian."""
     if bounce is None or visibility.blocker is None:
         return torch.full((1, 1), -1, dtype=torch.int32, device=light.device), light.new_zeros(0, 3)

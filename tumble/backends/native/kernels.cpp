@@ -5,6 +5,7 @@
 #include "gaussian_terms.h"
 #include "image.h"
 #include "lookup.h"
+#include "material.h"
 #include "parallel.h"
 #include "project.h"
 #include "sh_shade.h"
@@ -17,7 +18,8 @@ API int lanes() { return LANES; }
 // Sizes of the structures, which the caller compares with its own.
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
-                       sizeof(GaussianTerms), sizeof(Lookup), sizeof(Leaf), sizeof(Node)};
+                       sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
+                       sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -116,3 +118,13 @@ API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
 
 API void lookup_forward(const Lookup* s) { lookup_values(*s); }
 API void lookup_backward(const Lookup* s) { lookup_adjoint(*s); }
+
+API void material_forward(const Activation* m) {
+    parallel(m->threads, [=](int share) { activate_share(*m, share); });
+}
+API void material_adjoint(const Activation* m) {
+    parallel(m->threads, [=](int share) { activate_adjoint_share(*m, share); });
+}
+API void bounce_forward(const Indirect* s) { bounce_values(*s, false); }
+API void bounce_adjoint(const Indirect* s) { bounce_values(*s, true); }
+API void material_loss(const MaterialImage* m) { material_terms(*m); }

@@ -8,6 +8,7 @@
 struct Shade {
     const float *normal, *roughness, *view, *directions, *radiance;
     const int *visibility, *blocker;
+    const i64* rows;   // row of visibility and blocker of each point
     const float* blocker_radiance;
     int n_points, n_directions, stride, words, n_blockers, threads;   // stride: n_directions padded
     int blocker_point_stride, blocker_direction_stride;
@@ -83,7 +84,7 @@ INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
     for (int ch = 0; ch < 3; ch++) store(lanes[ch], L[ch]);
     for (; blocked; blocked &= blocked - 1) {
         int l = __builtin_ctz(blocked);
-        int b = s.blocker[p * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
+        int b = s.blocker[s.rows[p] * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
         for (int ch = 0; ch < 3 && b >= 0; ch++) lanes[ch][l] = s.blocker_radiance[3 * (i64)b + ch];
     }
     for (int ch = 0; ch < 3; ch++) L[ch] = load(lanes[ch]);
@@ -91,7 +92,7 @@ INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
 
 // Visibility bits of LANES directions from j on; they never straddle two words.
 INLINE u32 seen_at(const Shade& s, i64 p, int j) {
-    return (u32)s.visibility[p * s.words + j / 32] >> j % 32 & ((1ull << LANES) - 1);
+    return (u32)s.visibility[s.rows[p] * s.words + j / 32] >> j % 32 & ((1ull << LANES) - 1);
 }
 
 // Weight of LANES directions above the horizon in `specular_visibility`.
@@ -189,7 +190,7 @@ static void shade_adjoint_share(const Shade& s, int share) {
             for (int ch = 0; ch < 3; ch++) store(lanes[ch], v_L[ch]);
             for (; blocked; blocked &= blocked - 1) {
                 int l = __builtin_ctz(blocked);
-                int at = s.blocker[p * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
+                int at = s.blocker[s.rows[p] * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
                 for (int ch = 0; ch < 3 && at >= 0; ch++) v_blocker[3 * (i64)at + ch] += lanes[ch][l];
             }
         }
