@@ -615,11 +615,12 @@ def test_features_of_corners_and_their_gradients_are_those_of_the_reference(back
 @pytest.mark.parametrize("n", [0, 1, 75])
 def test_bounces_and_their_gradients_are_those_of_the_reference(backend: backends.Backend, n: int) -> None:
     rng = torch.Generator().manual_seed(n)
-    transfer, coefficients, seed = _material(n)[3], torch.randn(9, 3, generator=rng), torch.randn(n, 3, generator=rng)
+    transfer, directions = _material(n)[3], cases.fibonacci(45).float()
+    inputs, seed = [torch.rand(x, 3, generator=rng) for x in (n, 45)], torch.randn(n, 3, generator=rng)
 
     def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
-        x = [y.to(dtype).requires_grad_() for y in (torch.rand(n, 3, generator=rng.manual_seed(1)), coefficients)]
-        radiance = by.bounce(x[0], transfer.to(dtype), x[1])
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        radiance = by.bounce(x[0], transfer.to(dtype), directions.to(dtype), x[1])
         return [radiance, *torch.autograd.grad(radiance, x, seed.to(dtype))]
 
     _compare(backend, run)
@@ -645,8 +646,9 @@ def test_gradients_of_reference_materials_are_finite_differences() -> None:
     inputs = [x.requires_grad_() for x in corners]
     assert torch.autograd.gradcheck(lambda *x: reference.corner_features(*x, 2.0), inputs)
     rng = torch.Generator().manual_seed(0)
-    inputs = [torch.rand(x, generator=rng).double().requires_grad_() for x in ((5, 3), (9, 3))]
-    assert torch.autograd.gradcheck(lambda albedo, light: reference.bounce(albedo, transfer, light), inputs)
+    inputs = [torch.rand(x, 3, generator=rng).double().requires_grad_() for x in (5, 12)]
+    around = transfer, cases.fibonacci(12)
+    assert torch.autograd.gradcheck(lambda albedo, light: reference.bounce(albedo, *around, light), inputs)
     _, alpha, *_, photo, mask = _pictures(5, 6, (slice(None), slice(None, 4)))
     inputs = [x.double().requires_grad_() for x in (torch.rand(5, 6, 7, generator=rng), alpha)]
     assert torch.autograd.gradcheck(lambda *x: reference.material_terms(*x, photo, mask), inputs)

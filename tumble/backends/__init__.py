@@ -528,16 +528,19 @@ class Backend(Protocol):
         self,
         albedo: Float[Tensor, "n 3"],
         transfer: Float[Tensor, "n 9"],
-        coefficients: Float[Tensor, "9 3"],
+        directions: Float[Tensor, "d 3"],
+        radiance: Float[Tensor, "d 3"],
     ) -> Float[Tensor, "n 3"]:
         """Radiance `albedo / pi H(transfer)` of surfaces, with the irradiance H of `sh_shade` including all bounces.
 
-        Differentiable in albedo and coefficients.
+        Its q_k is the mean over the directions w of 4 pi Y_k(w) times their radiance. Differentiable in albedo and
+        radiance.
 
         Args:
             albedo: Linear albedo.
             transfer: Transfer vectors from light to shadowed irradiance.
-            coefficients: Light in harmonics up to degree 2.
+            directions: Evenly distributed unit directions.
+            radiance: Light from these directions.
         """
         ...
 

@@ -263,31 +263,39 @@ class _MaterialFunction(torch.autograd.Function):
 def bounce(
     albedo: Float[Tensor, "n 3"],
     transfer: Float[Tensor, "n 9"],
-    coefficients: Float[Tensor, "9 3"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
 ) -> Float[Tensor, "n 3"]:
     """See `Backend.bounce`."""
-    return _BounceFunction.apply(albedo, transfer, coefficients)
+    return _BounceFunction.apply(albedo, transfer, directions, radiance)
 
 
 class _BounceFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *args: Tensor) -> Tensor:
-        albedo, transfer, coefficients = tensors = [x.contiguous() for x in args]
-        out, struct = torch.empty_like(albedo), Indirect(n=len(albedo))
-        set_pointers(struct, albedo=albedo, transfer=transfer, coefficients=coefficients, out=out)
+        tensors = [x.contiguous() for x in args]
+        out = torch.empty_like(tensors[0])
+        struct, kept = _bounce_launch(tensors, out=out)
         _native.library().bounce_forward(ctypes.byref(struct))
+        del kept
         ctx.save_for_backward(*tensors)
         return out
 
     @staticmethod
     def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        albedo, transfer, coefficients = ctx.saved_tensors
-        v_albedo, v_coefficients, v_out = torch.empty_like(albedo), torch.empty_like(coefficients), v_out.contiguous()
-        struct = Indirect(n=len(albedo))
-        set_pointers(struct, albedo=albedo, transfer=transfer, coefficients=coefficients)
-        set_pointers(struct, v_out=v_out, v_albedo=v_albedo, v_coefficients=v_coefficients)
+        v_albedo, _, _, v_radiance = (torch.empty_like(x) for x in ctx.saved_tensors)
+        gradients = {"v_out": v_out.contiguous(), "v_albedo": v_albedo, "v_radiance": v_radiance}
+        struct, kept = _bounce_launch(ctx.saved_tensors, **gradients)
         _native.library().bounce_adjoint(ctypes.byref(struct))
-        return v_albedo, None, v_coefficients
+        del kept
+        return v_albedo, None, None, v_radiance
+
+
+def _bounce_launch(tensors: Any, **more: Tensor) -> tuple[Indirect, list[Tensor]]:
+    """Arguments of indirect light, and the tensors that they point to."""
+    struct = Indirect(n=len(tensors[0]), n_directions=len(tensors[2]))
+    named = dict(zip(("albedo", "transfer", "directions", "radiance"), tensors, strict=True))
+    return struct, set_pointers(struct, named | more)
 
 
 def material_terms(

@@ -139,9 +139,9 @@ class Indirect(ctypes.Structure):
     """`Indirect` of `native/material.h`: arguments of indirect light."""
 
     _fields_ = [
-        *_pointers("albedo transfer coefficients"),
-        *_ints("n"),
-        *_pointers("out v_out v_albedo v_coefficients"),
+        *_pointers("albedo transfer directions radiance"),
+        *_ints("n n_directions"),
+        *_pointers("out v_out v_albedo v_radiance"),
     ]
 
 

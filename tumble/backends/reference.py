@@ -517,9 +517,11 @@ def corner_features(
 def bounce(
     albedo: Float[Tensor, "n 3"],
     transfer: Float[Tensor, "n 9"],
-    coefficients: Float[Tensor, "9 3"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
 ) -> Float[Tensor, "n 3"]:
     """See `Backend.bounce`."""
+    coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
     return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
 
 

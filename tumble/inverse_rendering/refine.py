@@ -252,7 +252,7 @@ def render(
     gaussians = points.gaussians
     if gaussians.sh.shape[1] == 1:
         R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
-        lit = (visibility, R_env_obj, T_cam_obj.inverse().xyz)
+        lit = (visibility, R_env_obj, -(T_cam_obj.translation @ T_cam_obj.rotation.matrix()))
         colour = sh_lighting.radiance(light, gaussians, points.albedo_logits, *lit)
         gaussians = replace(gaussians, sh=constant_sh(colour))
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)

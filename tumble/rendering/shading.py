@@ -10,7 +10,6 @@ wide specular lobes, and takes narrow specular lobes (`NARROW_ROUGHNESS`) from a
 images use `importance_sampling.relight_surface` instead.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -20,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble import backends
-from tumble.maths import SE3, reflect, spherical_harmonics
+from tumble.maths import SE3, reflect
 from tumble.rendering import brdf
 from tumble.rendering.prefiltered_light import Prefiltered, cell_roughness
 from tumble.rendering.rasterizer import Buffers
@@ -77,10 +76,10 @@ def surface(
     column, row = pixels % camera.width, pixels // camera.width
     uv = torch.stack([column, row], -1).to(buffers.depth) + 0.5
     ray_cam = camera.unproject(uv, torch.ones_like(uv[:, 0])).to(buffers.depth)
-    T_obj_cam = T_cam_obj.inverse()
-    points = T_obj_cam @ (buffers.depth.flatten()[pixels][:, None] * ray_cam)
+    R_cam_obj = T_cam_obj.rotation.matrix()
+    points = (buffers.depth.flatten()[pixels][:, None] * ray_cam - T_cam_obj.translation) @ R_cam_obj
     normals = normalize(buffers.normal.flatten(0, 1)[pixels], dim=-1)
-    return Surface(pixels, points, normals, normalize(T_obj_cam.rotation @ -ray_cam, dim=-1))
+    return Surface(pixels, points, normals, normalize(-ray_cam @ R_cam_obj, dim=-1))
 
 
 @dataclass(frozen=True)
@@ -99,9 +98,8 @@ class Bounce:
         (Ramamoorthi and Hanrahan 2001). Shadows and all bounces are included: the occluding surface is assumed to be as
         bright as the occluded point, which makes the bounces a geometric series (Jimenez et al. 2016).
         """
-        coefficients = 4 * math.pi / len(directions) * (spherical_harmonics.basis(directions, 2).mT @ light)
         backend = backends.choose(self.albedo.device, self.albedo.dtype)
-        return backend.bounce(self.albedo, self.transfer, coefficients)
+        return backend.bounce(self.albedo, self.transfer, directions, light)
 
 
 @dataclass(frozen=True)

@@ -54,15 +54,27 @@ static void activate_adjoint_share(const Activation& m, int share) {
 }
 
 struct Indirect {
-    const float *albedo, *transfer, *coefficients;
-    int n;
+    const float *albedo, *transfer, *directions, *radiance;
+    int n, n_directions;
     float* out;
     const float* v_out;
-    float *v_albedo, *v_coefficients;
+    float *v_albedo, *v_radiance;
 };
 
 static void bounce_values(const Indirect& s, bool adjoint) {
-    vf sums[9][3] = {};
+    float coefficients[9][3], per_direction = 12.566370614f / s.n_directions;
+    vf sums[9][3] = {}, projected[9][3] = {};
+    for (int first = 0; first < s.n_directions; first += LANES) {
+        int count = imin2(LANES, s.n_directions - first);
+        vf Y[16];
+        harmonics(9, gather3(s.directions, first, count), Y);
+        for (int ch = 0; ch < 3; ch++) {
+            vf radiance = keep(lane_index() < count, gather(s.radiance, 3, ch, first, count));
+            for (int k = 0; k < 9; k++) projected[k][ch] += Y[k] * radiance;
+        }
+    }
+    for (int k = 0; k < 9; k++)
+        for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(projected[k][ch]);
     for (int first = 0; first < s.n; first += LANES) {
         int count = imin2(LANES, s.n - first);
         vi inside = lane_index() < count;
@@ -71,7 +83,7 @@ static void bounce_values(const Indirect& s, bool adjoint) {
         vf hidden = 1.0f - vmin(vmax(t[0] * 1.12837917f, vf{}), splat(1.0f));
         for (int ch = 0; ch < 3; ch++) {
             vf irradiance = {}, a = gather(s.albedo, 3, ch, first, count);
-            for (int k = 0; k < 9; k++) irradiance += t[k] * s.coefficients[3 * k + ch];
+            for (int k = 0; k < 9; k++) irradiance += t[k] * coefficients[k][ch];
             vf rest = 1.0f - a * hidden, inverse = 1.0f / vmax(rest, splat(1e-3f)), lit = vmax(irradiance, vf{});
             if (!adjoint) {
                 scatter(s.out, 3, ch, first, count, 0.318309886f * a * lit * inverse);
@@ -86,7 +98,13 @@ static void bounce_values(const Indirect& s, bool adjoint) {
     }
     if (!adjoint) return;
     for (int k = 0; k < 9; k++)
-        for (int ch = 0; ch < 3; ch++) s.v_coefficients[3 * k + ch] = sum_of(sums[k][ch]);
+        for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(sums[k][ch]);
+    for (int first = 0; first < s.n_directions; first += LANES) {
+        int count = imin2(LANES, s.n_directions - first);
+        vf Y[16];
+        harmonics(9, gather3(s.directions, first, count), Y);
+        for (int ch = 0; ch < 3; ch++) scatter(s.v_radiance, 3, ch, first, count, series(coefficients, Y, ch, 9));
+    }
 }
 
 struct MaterialImage {
