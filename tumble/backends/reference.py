@@ -383,10 +383,11 @@ def sh_shade(
     normals = torch.lerp(normals.detach(), normals, NORMAL_GRADIENT)
     view, albedo = normalize(position - means, dim=-1), torch.sigmoid(albedo_logits)
     n_v = (normals * view).sum(-1, keepdim=True)
-    fresnel = sum(c * (1 - n_v.clamp(0, 1)) ** k for k, c in enumerate(reflectance))
+    facing = n_v > 0
+    fresnel = sum(c * (1 - n_v.clamp(max=1)) ** k for k, c in enumerate(reflectance))
     specular = specular_scale * fresnel * at(1, 2 * n_v * normals - view)
     if not len(occluded):
-        return albedo * at(0, normals) + specular
+        return torch.where(facing, albedo * at(0, normals) + specular, 0)
     with torch.no_grad():
         radiance = at(1, directions)
         coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
@@ -394,7 +395,7 @@ def sh_shade(
 
         shadowed, full = (_irradiance(x, coefficients, albedo) + floor for x in (occluded, unoccluded))
         ratio = (shadowed / full.clamp(min=1e-12)).clamp(max=RATIO_MAX)
-    return albedo * ratio * at(0, normals) + specular
+    return torch.where(facing, albedo * ratio * at(0, normals) + specular, 0)
 
 
 def _irradiance(transfer: Tensor, coefficients: Tensor, albedo: Tensor) -> Tensor:

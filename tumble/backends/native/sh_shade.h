@@ -60,9 +60,9 @@ static void sh_light(const ShShade& s, ShLight& o) {
 }
 
 // Irradiance from transfer vectors, with all bounces.
-INLINE vf irradiance(const float* transfer, const ShLight& light, int ch, vf albedo, int first, int count) {
-    vf sum = {}, visible = gather(transfer, 9, 0, first, count) * 1.12837917f;
-    for (int k = 0; k < 9; k++) sum += gather(transfer, 9, k, first, count) * light.irradiance[k][ch];
+INLINE vf irradiance(const vf* transfer, const ShLight& light, int ch, vf albedo) {
+    vf sum = {}, visible = transfer[0] * 1.12837917f;
+    for (int k = 0; k < 9; k++) sum += transfer[k] * light.irradiance[k][ch];
     visible = vmin(vmax(visible, vf{}), splat(1.0f));
     return vmax(sum, vf{}) / vmax(1.0f - albedo * (1.0f - visible), splat(1e-3f)) + light.floor[ch];
 }
@@ -74,13 +74,13 @@ struct ShPoint {
     vf Y[2][16], albedo[3], ratio[3], at[2][3], lobe[2][3];   // `at` before, `lobe` after the softplus
 };
 
-INLINE void sh_point(const ShShade& s, const ShLight& light, int first, int count, ShPoint& o) {
-    for (int j = 0; j < 4; j++) o.q[j] = gather(s.quats, 4, j, first, count);
+INLINE void sh_point(const ShShade& s, const ShLight& light, const Batch& b, ShPoint& o) {
+    for (int j = 0; j < 4; j++) o.q[j] = gather(s.quats, 4, j, b);
     o.q_scale = 1.0f / vsqrt(o.q[0] * o.q[0] + o.q[1] * o.q[1] + o.q[2] * o.q[2] + o.q[3] * o.q[3]);
     for (int j = 0; j < 4; j++) o.q[j] *= o.q_scale;
     M3 R = rotation(o.q);
     o.normal = {R(0, 2), R(1, 2), R(2, 2)};
-    V3 away = light.position + gather3(s.means, first, count) * splat(-1.0f);
+    V3 away = light.position + gather3(s.means, b) * splat(-1.0f);
     o.length = vmax(vsqrt(dot(away, away)), splat(1e-12f));
     o.view = away * (1.0f / o.length);
     o.n_v = dot(o.normal, o.view);
@@ -92,12 +92,14 @@ INLINE void sh_point(const ShShade& s, const ShLight& light, int first, int coun
     o.reflectance = splat(s.reflectance[s.n_terms - 1]);
     for (int k = s.n_terms - 2; k >= 0; k--)
         slope = slope * o.m + o.reflectance, o.reflectance = o.reflectance * o.m + s.reflectance[k];
-    o.slope = keep((o.n_v >= 0.0f) & (o.n_v <= 1.0f), -slope);
+    o.slope = keep(o.n_v <= 1.0f, -slope);
+    vf occluded[9], unoccluded[9];
+    for (int k = 0; k < 9 && s.shadowed; k++)
+        occluded[k] = gather(s.occluded, 9, k, b), unoccluded[k] = gather(s.unoccluded, 9, k, b);
     for (int ch = 0; ch < 3; ch++) {
-        o.albedo[ch] = sigmoid(gather(s.albedo_logits, 3, ch, first, count)), o.ratio[ch] = splat(1.0f);
+        o.albedo[ch] = sigmoid(gather(s.albedo_logits, 3, ch, b)), o.ratio[ch] = splat(1.0f);
         if (s.shadowed) {
-            vf shadowed = irradiance(s.occluded, light, ch, o.albedo[ch], first, count);
-            vf full = irradiance(s.unoccluded, light, ch, o.albedo[ch], first, count);
+            vf shadowed = irradiance(occluded, light, ch, o.albedo[ch]), full = irradiance(unoccluded, light, ch, o.albedo[ch]);
             o.ratio[ch] = vmin(shadowed / vmax(full, splat(1e-12f)), splat(s.ratio_max));
         }
         for (int i = 0; i < 2; i++) {
@@ -107,31 +109,54 @@ INLINE void sh_point(const ShShade& s, const ShLight& light, int first, int coun
     }
 }
 
-static void sh_shade_share(const ShShade& s, const ShLight& light, int share) {
+// Calls visit for batches of the Gaussians of a share that face the camera and, if given, have a gradient.
+template <class F>
+INLINE void for_facing(const ShShade& s, const ShLight& light, int share, const float* v_out, F visit) {
+    Batch b;
+    b.count = 0;
     int end = share_start(s.n, share + 1, s.threads);
     for (int first = share_start(s.n, share, s.threads); first < end; first += LANES) {
         int count = imin2(LANES, end - first);
-        ShPoint o;
-        sh_point(s, light, first, count, o);
-        for (int ch = 0; ch < 3; ch++)
-            scatter(s.out, 3, ch, first, count, o.albedo[ch] * o.ratio[ch] * o.lobe[0][ch] +
-                                                    light.specular_scale * o.reflectance * o.lobe[1][ch]);
+        vf w = gather(s.quats, 4, 0, first, count), x = gather(s.quats, 4, 1, first, count);
+        vf y = gather(s.quats, 4, 2, first, count), z = gather(s.quats, 4, 3, first, count);
+        V3 n = {2.0f * (x * z + w * y), 2.0f * (y * z - w * x), w * w + z * z - x * x - y * y};
+        V3 away = light.position + gather3(s.means, first, count) * splat(-1.0f);
+        u32 some = bits((dot(n, away) > 0.0f) & (lane_index() < count));
+        for (; some; some &= some - 1) {
+            i64 g = first + __builtin_ctz(some);
+            if (v_out && v_out[3 * g] == 0 && v_out[3 * g + 1] == 0 && v_out[3 * g + 2] == 0) continue;
+            if (b.add(g)) b.pad(), visit(b), b.count = 0;
+        }
     }
+    if (b.count) b.pad(), visit(b);
+}
+
+static void sh_shade_share(const ShShade& s, const ShLight& light, int share) {
+    i64 start = share_start(s.n, share, s.threads), end = share_start(s.n, share + 1, s.threads);
+    clear(s.out + 3 * start, 12 * (end - start));
+    for_facing(s, light, share, nullptr, [&](const Batch& b) {
+        ShPoint o;
+        sh_point(s, light, b, o);
+        for (int ch = 0; ch < 3; ch++)
+            scatter(s.out, 3, ch, b, o.albedo[ch] * o.ratio[ch] * o.lobe[0][ch] +
+                                         light.specular_scale * o.reflectance * o.lobe[1][ch]);
+    });
 }
 
 static void sh_shade_adjoint_share(const ShShade& s, const ShLight& light, int share) {
     vf sums[LIGHT_SUMS] = {};
-    int end = share_start(s.n, share + 1, s.threads);
-    for (int first = share_start(s.n, share, s.threads); first < end; first += LANES) {
-        int count = imin2(LANES, end - first);
-        vi inside = lane_index() < count;
+    i64 start = share_start(s.n, share, s.threads), size = share_start(s.n, share + 1, s.threads) - start;
+    clear(s.v_means + 3 * start, 12 * size), clear(s.v_quats + 4 * start, 16 * size);
+    clear(s.v_albedo_logits + 3 * start, 12 * size);
+    for_facing(s, light, share, s.v_out, [&](const Batch& batch) {
+        vi inside = lane_index() < batch.count;
         ShPoint o;
-        sh_point(s, light, first, count, o);
+        sh_point(s, light, batch, o);
         vf v_reflectance = {}, v_series[2][3], v_Y[2][16] = {};
         for (int ch = 0; ch < 3; ch++) {
-            vf v = keep(inside, gather(s.v_out, 3, ch, first, count)), v_lobe = v * light.specular_scale;
+            vf v = keep(inside, gather(s.v_out, 3, ch, batch)), v_lobe = v * light.specular_scale;
             vf a = o.albedo[ch], shaded = a * o.ratio[ch];
-            scatter(s.v_albedo_logits, 3, ch, first, count, v * o.lobe[0][ch] * shaded * (1.0f - a));
+            scatter(s.v_albedo_logits, 3, ch, batch, v * o.lobe[0][ch] * shaded * (1.0f - a));
             v_reflectance += v_lobe * o.lobe[1][ch];
             sums[96] += v * o.lobe[1][ch] * o.reflectance;
             v_series[0][ch] = v * shaded * sigmoid(o.at[0][ch]);
@@ -154,14 +179,14 @@ static void sh_shade_adjoint_share(const ShShade& s, const ShLight& light, int s
             for (int j = 0; j < 3; j++) sums[97 + 3 * i + j] += a[i] * n[j] + b[i] * m[j];
         V3 v_away = (v_view + o.view * (-dot(v_view, o.view))) * (1.0f / o.length);
         sums[106] += v_away.x, sums[107] += v_away.y, sums[108] += v_away.z;
-        scatter3(s.v_means, first, count, v_away * splat(-1.0f));
+        scatter3(s.v_means, batch, v_away * splat(-1.0f));
         M3 v_R = {};
         v_R.m[2] = v_normal.x * s.normal_gradient, v_R.m[5] = v_normal.y * s.normal_gradient;
         v_R.m[8] = v_normal.z * s.normal_gradient;
         vf v_q[4];
         rotation_adjoint(o.q, v_R, v_q);
         vf radial = v_q[0] * o.q[0] + v_q[1] * o.q[1] + v_q[2] * o.q[2] + v_q[3] * o.q[3];
-        for (int j = 0; j < 4; j++) scatter(s.v_quats, 4, j, first, count, (v_q[j] - radial * o.q[j]) * o.q_scale);
-    }
+        for (int j = 0; j < 4; j++) scatter(s.v_quats, 4, j, batch, (v_q[j] - radial * o.q[j]) * o.q_scale);
+    });
     for (int i = 0; i < LIGHT_SUMS; i++) s.parts[share * LIGHT_SUMS + i] = sum_of(sums[i]);
 }
