@@ -654,6 +654,20 @@ def test_gradients_of_reference_materials_are_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda *x: reference.material_terms(*x, photo, mask), inputs)
 
 
+def test_kernels_of_the_steps_conform_with_two_threads(backend: backends.Backend) -> None:
+    """More than a vector of Gaussians per thread, and more jobs than threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference(backend, 133, shadowed=True)
+        test_features_of_corners_and_their_gradients_are_those_of_the_reference(backend, 75)
+        test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference(backend, 333, 8.0)
+        box = slice(8, 30), slice(12, 40)
+        test_terms_of_images_and_their_gradients_are_those_of_the_reference(backend, 40, 50, box, 0.2, 25.0)
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_constants_that_the_kernels_repeat_are_those_of_the_package() -> None:
     assert images.LINEAR_KNEE == backends.KNEE
     assert tuple(k * k for k in images.STABILISERS) == backends.SSIM_STABILISERS

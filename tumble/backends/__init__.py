@@ -402,7 +402,7 @@ class Backend(Protocol):
             E(d) = softplus(sum_k light_0k Y_k(d)),  S(d) = softplus(sum_k light_1k Y_k(d)),
             F(x) = sum_k reflectance_k (1 - min(1, x))^k,  R = R_env_obj,  v = normalize(position - mean)
 
-        c is 0 where n.v <= 0, since `rasterize` culls these Gaussians. rho is the irradiance with self-shadowing divided
+        c is 0 where n.v <= 0, since `rasterize` culls these Gaussians. rho is irradiance with self-shadowing divided
         by that without, `(H(occluded) + f) / (H(unoccluded) + f)` but at most RATIO_MAX, and 1 if m is 0.
         H(t) = max(0, t . q) / max(1e-3, 1 - albedo (1 - min(1, max(0, t_0 sqrt(4 / pi))))) includes all bounces, with
         q_k the mean over the directions w of 4 pi Y_k(w) S(R w), and f is IRRADIANCE_FLOOR pi times the mean of S(R w).

@@ -33,7 +33,7 @@ from tumble.backends._structs import (
 )
 
 PLANES = 11
-"""Planes of scratch memory in `native/image.h`."""
+"""Planes of scratch memory in `native/image.h` (per channel) and `native/material.h`."""
 LIGHT_SUMS = 109
 """Numbers of the gradient of light, specular scale, rotation and position in `native/sh_shade.h`."""
 
@@ -140,6 +140,7 @@ class _ImageTermsFunction(torch.autograd.Function):
             height=height,
             width=width,
             plane_size=plane_size,
+            threads=threads(),
             ssim_weight=ssim_weight,
             crease=crease,
             saturated=SATURATED,
@@ -149,7 +150,7 @@ class _ImageTermsFunction(torch.autograd.Function):
         )
         terms, gradients = torch.empty(4), [torch.empty_like(x) for x in tensors[:6]]
         named = dict(zip((*_IMAGE_INPUTS, "photo", "mask", "focal"), tensors, strict=True))
-        kept = set_pointers(struct, named, taps=_taps(), terms=terms, scratch=scratch(PLANES * plane_size))
+        kept = set_pointers(struct, named, taps=_taps(), terms=terms, scratch=scratch(3 * PLANES * plane_size))
         set_pointers(struct, dict(zip((f"g_{name}" for name in _IMAGE_INPUTS), gradients, strict=True)))
         _native.library().image_loss(ctypes.byref(struct))
         del kept
@@ -204,7 +205,7 @@ class _GaussianTermsFunction(torch.autograd.Function):
         tensors = [x.detach().contiguous() for x in tensors]
         named = dict(zip((*_GAUSSIAN_INPUTS, "weight", "depth", "focal"), tensors, strict=True))
         n, (height, width) = len(named["means"]), named["depth"].shape
-        struct = GaussianTerms(n=n, height=height, width=width, floor=floor, reach=reach)
+        struct = GaussianTerms(n=n, height=height, width=width, threads=threads(), floor=floor, reach=reach)
         terms, gradients = torch.empty(3), [torch.empty_like(x) for x in tensors[:5]]
         gradients += [torch.zeros(3, 3), torch.zeros(3)]
         kept = set_pointers(struct, named, terms=terms, magnitudes=torch.empty(n, dtype=torch.int32))

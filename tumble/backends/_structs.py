@@ -97,7 +97,7 @@ class Image(ctypes.Structure):
 
     _fields_ = [
         *_pointers("rgb alpha depth depth_var normal photo mask R focal taps"),
-        *_ints("height width plane_size"),
+        *_ints("height width plane_size threads"),
         *_floats("ssim_weight crease saturated knee c1 c2"),
         *_pointers("scratch terms g_rgb g_alpha g_depth g_depth_var g_normal g_R"),
     ]
@@ -108,7 +108,7 @@ class GaussianTerms(ctypes.Structure):
 
     _fields_ = [
         *_pointers("means quats log_scales sdf gamma weight depth R t focal"),
-        *_ints("n height width"),
+        *_ints("n height width threads"),
         *_floats("floor reach"),
         *_pointers("magnitudes terms g_means g_quats g_log_scales g_sdf g_gamma g_R g_t"),
     ]

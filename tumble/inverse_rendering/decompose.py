@@ -331,7 +331,10 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
     gaussian, bounce = _dominant_gaussian(view, points), _bounce(cfg, state, params, mean_albedo)
     shaded = _shade(cfg, state, params, points, gaussian, R_env_obj, albedo, rough, f0, bounce)
-    rendered, wanted = (shaded * points.sample(view.alpha[..., None]))[None], points.sample(photo)[None] / 255
+    rendered, wanted = (
+        (shaded * points.sample(view.alpha[..., None]))[None],
+        points.sample(photo)[None].to(albedo) / 255,
+    )
     difference = (losses.srgb_as_captured(rendered, wanted) - wanted).abs().sum()
     of_view = losses.material_terms(view, photo, mask)
     terms = {

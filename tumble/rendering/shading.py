@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int32, Int64, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -44,7 +44,7 @@ class Surface:
     views: Float[Tensor, "p 3"]
     """Unit directions to the camera."""
 
-    def sample(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "p c"]:
+    def sample(self, image: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "p c"]:
         """Values of an image of the same view at the points."""
         return image.flatten(0, 1)[self.pixels]
 

@@ -1,11 +1,12 @@
 // Loss terms of the Gaussians themselves and their gradients (`Backend.gaussian_terms`), LANES at a time. Every term is
 // differentiated at once, since each input belongs to one term only.
 #pragma once
+#include "parallel.h"
 #include "project.h"
 
 struct GaussianTerms {
     const float *means, *quats, *log_scales, *sdf, *gamma, *weight, *depth, *R, *t, *focal;
-    int n, height, width;
+    int n, height, width, threads;
     float floor, reach;
     u32* magnitudes;   // one per Gaussian
     float *terms, *g_means, *g_quats, *g_log_scales, *g_sdf, *g_gamma, *g_R, *g_t;   // g_R and g_t: the third row
@@ -129,5 +130,8 @@ static void gaussian_terms(const GaussianTerms& s) {
         clear(s.g_gamma, 4), clear(s.g_R, 12), clear(s.g_t, 4);
         return;
     }
-    rank_term(s), sharpness_term(s), projection_term(s);
+    parallel(imin2(s.threads, 2), [&](int share) {
+        if (share == 0) projection_term(s);
+        if (share == 1 || s.threads == 1) rank_term(s), sharpness_term(s);
+    });
 }

@@ -5,6 +5,7 @@
 // padding. Every term is differentiated at once: each input belongs to one term only, so that the gradients for other
 // seeds are multiples.
 #pragma once
+#include "parallel.h"
 #include "simd.h"
 
 enum { TAPS = 11, MARGIN = TAPS - 1, PLANES = 11 };
@@ -13,9 +14,9 @@ struct Image {
     const float *rgb, *alpha, *depth, *depth_var, *normal;
     const u8 *photo, *mask;
     const float *R, *focal, *taps;   // taps: the weights of SSIM's window along one axis
-    int height, width, plane_size;   // plane_size: floats of a plane of the whole image
+    int height, width, plane_size, threads;   // plane_size: floats of a plane of the whole image
     float ssim_weight, crease, saturated, knee, c1, c2;
-    float* scratch;                  // PLANES planes
+    float* scratch;                  // PLANES planes per channel
     float *terms, *g_rgb, *g_alpha, *g_depth, *g_depth_var, *g_normal, *g_R;
 };
 
@@ -138,10 +139,10 @@ static void blur_maps(const Image& m, const Window& w, float** maps, float** row
             }
 }
 
-// The photometric term of one channel, added to `terms[0]`, and its gradient.
-static void photometric(const Image& m, const Window& w, int ch) {
+// The photometric term of one channel, and its gradient.
+static float photometric(const Image& m, const Window& w, int ch) {
     float* plane[PLANES];
-    for (int i = 0; i < PLANES; i++) plane[i] = m.scratch + (i64)i * m.plane_size;
+    for (int i = 0; i < PLANES; i++) plane[i] = m.scratch + (i64)(PLANES * ch + i) * m.plane_size;
     float *x = plane[0], *y = plane[1], *slope = plane[2], **rows = plane + 3, **maps = plane + 7;
     i64 size = (i64)(w.height + MARGIN) * w.stride;
     for (int i = 0; i < 3; i++) clear(maps[i], 4 * size);
@@ -149,7 +150,6 @@ static void photometric(const Image& m, const Window& w, int ch) {
     float unlike = similarity(m, w, x, y, rows, maps);
     float of_l1 = (1 - m.ssim_weight) / (3.0f * m.height * m.width);
     float of_ssim = m.ssim_weight / (3.0f * (m.height - MARGIN) * (m.width - MARGIN));
-    m.terms[0] += of_l1 * l1 + of_ssim * unlike;
     blur_maps(m, w, maps, rows);
     for (int r = 0; r < w.height; r++)
         for (int c = 0; c < w.width; c += LANES) {
@@ -163,6 +163,7 @@ static void photometric(const Image& m, const Window& w, int ch) {
             float* to = m.g_rgb + 3 * ((i64)(w.top + r) * m.width + w.left + c) + ch;
             for (int l = 0; l < imin2(LANES, w.width - c); l++) to[3 * l] = g[l];
         }
+    return of_l1 * l1 + of_ssim * unlike;
 }
 
 // Terms of mask and depth variance, which concern single pixels.
@@ -241,7 +242,13 @@ static void image_terms(const Image& m) {
     clear(m.g_depth_var, 4 * pixels), clear(m.g_normal, 12 * pixels), clear(m.g_R, 36), clear(m.terms, 16);
     Window w = window_of(m);
     if (!w.height) return;
-    for (int ch = 0; ch < 3; ch++) photometric(m, w, ch);
-    pixel_terms(m, w);
-    normal_term(m, w);
+    float of_channel[3];
+    parallel(m.threads, [&](int share) {
+        for (int job = share; job < 4; job += m.threads)
+            if (job < 3)
+                of_channel[job] = photometric(m, w, job);
+            else
+                pixel_terms(m, w), normal_term(m, w);
+    });
+    m.terms[0] = of_channel[0] + of_channel[1] + of_channel[2];
 }
