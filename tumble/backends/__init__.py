@@ -1,9 +1,11 @@
-"""Rendering backends: the interface of rasterization, ray tracing and shading, and the choice of an implementation.
+"""Backends: the interface of rendering and other kernels of a training step, and the choice of an implementation.
 
 This file defines the interface; every other module of this folder without a leading underscore implements it. Three
-kernels are needed: **rasterize** (splatting of Gaussians), **trace** (rays against Gaussians) and **shade** (reflected
-light). `reference.py` defines the correct result; the others compute the same, faster. There are no options: rules
-for culling, depth and interpolation are part of the method, and other rules need another module.
+kernels render: **rasterize** (splatting of Gaussians), **trace** (rays against Gaussians) and **shade** (reflected
+light). The others replace hundreds of small operations per step: colour (**sh_shade**), materials
+(**corner_features**), light (**lookup**, **bounce**) and loss terms (**image_terms**, **gaussian_terms**,
+**material_terms**). `reference.py` defines the correct result; the others compute the same, faster. There are no
+options: rules for culling, depth and interpolation are part of the method, and other rules need another module.
 
 Vocabulary
     *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third axis
