@@ -500,6 +500,7 @@ def gaussian_terms(
         size = uv.new_tensor([depth.shape[1], depth.shape[0]])
         surface = grid_sample(depth[None, None], (uv / size * 2 - 1)[None, None], align_corners=False)[0, 0, 0]
         inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
+        surface = torch.where(inlier, surface, 0)  # NaN behind the camera would reach the gradients
     difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)
     return torch.stack([needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference])
 
