@@ -563,9 +563,10 @@ class Backend(Protocol):
         ...
 
 
-def names() -> list[str]:
-    """Names of all backends, which are their file names."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
+@cache
+def names() -> tuple[str, ...]:
+    """Names of all backends, which are their file names; the folder is read once."""
+    return tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")))
 
 
 def load(name: str) -> Backend:
