@@ -104,7 +104,7 @@ def kernel_times(arguments: argparse.Namespace) -> dict[str, Any]:
     rows = kernels.measure(backends.load("cuda"), "cuda", 1, SIZES, device=GPU)
     # Plain torch stores every pair of a pixel and a nearby Gaussian, hence the single size.
     rows += kernels.rasterize_rows(backends.load("reference"), "reference", 1, [(10_000, 256)], runs=3, device=GPU)
-    rows += kernels.image_loss_rows(1, device=GPU)
+    rows += kernels.image_loss_rows(backends.load("cuda"), "cuda", 1, device=GPU)
     threads = os.cpu_count() or 1
     rows += kernels.measure(backends.load("cpu"), "cpu", threads, SIZES)
     return {"rows": rows}

@@ -23,7 +23,6 @@ from torch.nn.functional import normalize
 
 from tumble import backends
 from tumble.backends import Backend
-from tumble.inverse_rendering import losses
 
 RUNS = 9
 """Timed calls per figure, of which the median is taken."""
@@ -45,7 +44,7 @@ def main() -> None:
     for threads in arguments.threads:
         torch.set_num_threads(threads)
         rows += measure(backends.load("cpu"), "cpu", threads, SIZES)
-        rows += image_loss_rows(threads)
+        rows += image_loss_rows(backends.load("cpu"), "cpu", threads)
     machine_info = machine()  # Peak memory is read before the reference runs, which needs gigabytes.
     if not arguments.no_reference:
         torch.set_num_threads(1)
@@ -132,16 +131,17 @@ def shade_rows(backend: Backend, name: str, threads: int, *, device: torch.devic
     rng = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 0.3 * torch.randn(p, 3, generator=rng), dim=-1)
-    tensors = [normal, torch.rand(p, 3), 0.2 + 0.7 * torch.rand(p), view]
+    tensors = [normal, 0.2 + 0.7 * torch.rand(p), view]
     surface = [x.to(device).requires_grad_() for x in tensors]
     light, directions = torch.rand(DIRECTIONS, 3).to(device).requires_grad_(), fibonacci(DIRECTIONS).to(device)
     visibility = torch.full((p, DIRECTIONS // 32), -1, dtype=torch.int32, device=device)
-    no_blockers = visibility.new_full((1, 1), -1), light.new_zeros(0, 3)
-    arguments: Any = [*surface, directions, light, visibility, *no_blockers, 0.04]
+    no_blockers = visibility.new_full((1, 1), -1), torch.arange(p, device=device), light.new_zeros(0, 3)
+    arguments: Any = [*surface, directions, light, visibility, *no_blockers]
     with torch.no_grad():
         forward = median_seconds(lambda: backend.shade(*arguments), threads, RUNS, device)
-    shaded = backend.shade(*arguments)
-    adjoint = partial(torch.autograd.grad, shaded, [*surface, light], torch.randn_like(shaded), retain_graph=True)
+    lobes = backend.shade(*arguments)[:2]
+    seeds = [torch.randn_like(x) for x in lobes]
+    adjoint = partial(torch.autograd.grad, lobes, [*surface, light], seeds, retain_graph=True)
     backward = median_seconds(adjoint, threads, RUNS, device)
     million = p * DIRECTIONS / 1e6
     return [
@@ -150,18 +150,19 @@ def shade_rows(backend: Backend, name: str, threads: int, *, device: torch.devic
     ]
 
 
-def image_loss_rows(threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
-    """Milliseconds of the L1 + SSIM loss and its gradient in plain torch, the other large cost of a training step."""
+def image_loss_rows(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
+    """Milliseconds of the image terms of stage 2 and their gradients."""
     rows = []
     for size in (128, 256):
-        rendered, image = torch.rand(2, size, size, 3, device=device)
-        rendered.requires_grad_()
-        valid = torch.ones(size, size, 1, device=device)
-        loss = partial(losses.photometric, rendered, image, valid, ssim_weight=0.2)
+        images = [torch.rand(size, size, *more, device=device).requires_grad_() for more in ((3,), (), (), (), (3,))]
+        photo = torch.randint(0, 256, (size, size, 3), dtype=torch.uint8, device=device)
+        mask = torch.full((size, size), backends.OBJECT, dtype=torch.uint8, device=device)
+        camera = torch.eye(3, device=device), torch.tensor([1.5 * size, 1.5 * size, size / 2, size / 2], device=device)
+        loss = partial(backend.image_terms, *images, photo, mask, *camera, 0.2, 25.0)
         forward = median_seconds(loss, threads, RUNS, device)
-        adjoint = partial(torch.autograd.grad, loss(), [rendered], retain_graph=True)
+        adjoint = partial(torch.autograd.grad, loss().sum(), images, retain_graph=True)
         backward = median_seconds(adjoint, threads, RUNS, device)
-        rows.append(row(f"L1 + SSIM, {size} px", "torch", threads, "ms", forward * 1e3, backward * 1e3))
+        rows.append(row(f"image terms, {size} px", name, threads, "ms", forward * 1e3, backward * 1e3))
     return rows
 
 

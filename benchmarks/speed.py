@@ -44,7 +44,7 @@ PARTS = {
     },
     "decompose": {
         "visibility": (decompose, "_trace_visibility"),
-        "rendering": (decompose, "render_gbuffer"),
+        "rendering": (decompose, "rasterize_material"),
         "shading": (decompose, "_shade"),
         "backward pass and Adam": (optim, "descend"),
     },

@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "preprocess": {"io", "maths", "scene", "datasets"},
     "synthetic": {"io", "maths", "scene", "datasets"},
     "poses": {"io", "maths", "scene", "engine", "matching"},
-    "inverse_rendering": {"io", "maths", "scene", "rendering", "engine"},
+    "inverse_rendering": {"io", "maths", "backends", "scene", "rendering", "engine"},
     "evaluation": {"io", "maths", "scene", "rendering", "datasets"},
     "export": {"io", "maths", "scene", "rendering"},
     "report": {"io", "maths", "scene", "rendering", "engine", "datasets", "poses", "evaluation", "export"},
@@ -49,7 +49,7 @@ INNER_ROOMS = {
 """Rooms within a room, with the one that they do not know."""
 PLUGINS = ("backends", "matching")
 """Rooms of plugins: their `__init__` is the contract, and files of them are found by name."""
-MANY_PARAMETERS = {"rasterize"}
+MANY_PARAMETERS = {"rasterize", "gaussian_terms"}
 """Functions over 12 parameters: the backends' contract hands tensors over one by one."""
 STAGE_WORDS = {"Config", "Inputs", "Params", "Weights", "Rates"}
 """Classes that every stage names alike."""

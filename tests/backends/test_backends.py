@@ -1,6 +1,7 @@
 """Every backend against the reference, and the reference against closed forms, brute force and finite differences."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from torch.nn.functional import normalize
 from tests.backends import cases
 from tumble import backends
 from tumble.backends import _brute, reference
+from tumble.maths import images
+from tumble.scene import capture
 
 CPU = torch.device("cpu")
 RELATIVE = 1e-4
@@ -23,6 +26,14 @@ def backend(request: pytest.FixtureRequest) -> backends.Backend:
     if reason := module.ready(device, torch.float32):
         pytest.skip(reason)
     return module
+
+
+def _compare(backend: backends.Backend, run: Callable[..., list[torch.Tensor]], limit: float = RELATIVE) -> None:
+    """`run(backend, dtype)` of a backend in float32 against the reference in float64."""
+    worst = [
+        cases.difference(a, b) for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True)
+    ]
+    assert max(worst) < limit, worst
 
 
 # ------------------------------------------------------------------------------------------------ rasterize
@@ -293,12 +304,11 @@ def test_a_convex_object_hardly_shadows_itself(backend: backends.Backend) -> Non
 
 
 def _surface(p: int, rough: tuple[float, float]) -> list[torch.Tensor]:
-    """Normals, albedo, roughness and view directions; some views are behind the surface."""
+    """Normals, roughness and view directions; some views are behind the surface."""
     rng = torch.Generator().manual_seed(11)
     normal = normalize(torch.randn(p, 3, generator=rng), dim=-1)
     view = normalize(normal + 1.1 * normalize(torch.randn(p, 3, generator=rng), dim=-1), dim=-1)
-    roughness = rough[0] + (rough[1] - rough[0]) * torch.rand(p, generator=rng)
-    return [normal, torch.rand(p, 3, generator=rng), roughness, view]
+    return [normal, rough[0] + (rough[1] - rough[0]) * torch.rand(p, generator=rng), view]
 
 
 @pytest.mark.parametrize(("d", "m", "rough"), [(100, 0, (0.3, 1.0)), (256, 7, (0.03, 0.6)), (1, 3, (0.5, 0.5))])
@@ -309,19 +319,18 @@ def test_shading_and_its_gradients_are_those_of_the_reference(
     p = 80
     inputs = [*_surface(p, rough), torch.rand(d, 3, generator=rng), torch.rand(m, 3, generator=rng)]
     directions = cases.fibonacci(d).float()
-    visibility = _brute.pack(torch.rand(p, d, generator=rng) > 0.3)
-    blocker = torch.randint(-1, m, (p, d), generator=rng).int() if m else torch.full((1, 1), -1).int()
-    seed = torch.randn(p, 3, generator=rng)
+    visibility, rows = _brute.pack(torch.rand(50, d, generator=rng) > 0.3), torch.randint(0, 50, (p,), generator=rng)
+    blocker = torch.randint(-1, m, (50, d), generator=rng).int() if m else torch.full((1, 1), -1).int()
+    seeds = torch.randn(2, p, 3, generator=rng)
 
-    def run(by: backends.Backend, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
         x = [y.to(dtype).requires_grad_() for y in inputs]
-        rest = visibility, blocker, x[5], 0.04
-        shaded = by.shade(*x[:4], directions.to(dtype), x[4], *rest)
-        used = x if m else x[:5]
-        return shaded, *torch.autograd.grad(shaded, used, seed.to(dtype))
+        lobes = by.shade(*x[:3], directions.to(dtype), x[3], visibility, blocker, rows, x[4])
+        used = x if m else x[:4]
+        assert not lobes.specular_visibility.requires_grad
+        return [*lobes, *torch.autograd.grad(lobes[:2], used, [*seeds.to(dtype)])]
 
-    for a, b in zip(run(backend, torch.float32), run(reference, torch.float64), strict=True):
-        assert cases.difference(a, b) < RELATIVE
+    _compare(backend, run)
 
 
 def test_gradients_of_reference_shading_are_finite_differences() -> None:
@@ -329,40 +338,74 @@ def test_gradients_of_reference_shading_are_finite_differences() -> None:
     rng = torch.Generator().manual_seed(1)
     inputs += [torch.rand(9, 3, generator=rng).double().requires_grad_() for _ in range(2)]
     visibility = _brute.pack(torch.rand(4, 9, generator=rng) > 0.3)
-    blocker = torch.randint(-1, 9, (4, 9), generator=rng).int()
+    blocker, rows = torch.randint(-1, 9, (4, 9), generator=rng).int(), torch.tensor([2, 0, 2, 3])
 
-    def render(*x: torch.Tensor) -> torch.Tensor:
-        return reference.shade(*x[:4], cases.fibonacci(9), x[4], visibility, blocker, x[5], 0.04)
+    def render(*x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(reference.shade(*x[:3], cases.fibonacci(9), x[3], visibility, blocker, rows, x[4])[:2])
 
     assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
 def test_a_sphere_in_uniform_light_matches_the_integrated_brdf(backend: backends.Backend, roughness: float) -> None:
-    """The Lambertian part equals the albedo; GGX is D F G / (4 n.l n.v), integrated on another grid."""
+    """The Lambertian lobe is the light; GGX is D F G / (4 n.l n.v), integrated on another grid."""
     normal = cases.fibonacci(40)
     view = torch.tensor([0.0, 0.0, 1.0]).double()
     front = normal @ view > 0.2
     normal, p = normal[front], int(front.sum())
-    albedo = torch.tensor([0.2, 0.5, 0.8]).expand(p, 3)
     d = 1 << 14
     light = torch.full((d, 3), 1.5)
     visibility = torch.full((p, d // 32), -1, dtype=torch.int32)
-    black = torch.full((1, 1), -1, dtype=torch.int32), torch.zeros(0, 3)
-    shaded = backend.shade(
-        normal.float(),
-        albedo,
-        torch.full((p,), roughness),
-        view.float().expand(p, 3),
-        cases.fibonacci(d).float(),
-        light,
-        visibility,
-        *black,
-        0.04,
-    )
-    expected = 1.5 * (albedo.numpy() + _integrated_ggx(normal.numpy(), view.numpy(), roughness)[:, None])
+    black = torch.full((1, 1), -1, dtype=torch.int32), torch.arange(p), torch.zeros(0, 3)
+    point = normal.float(), torch.full((p,), roughness), view.float().expand(p, 3)
+    lobes = backend.shade(*point, cases.fibonacci(d).float(), light, visibility, *black)
     # Both grids resolve the narrowest of these lobes to about 1e-3.
-    np.testing.assert_allclose(shaded.numpy(), expected, rtol=3e-3)
+    np.testing.assert_allclose(lobes.diffuse.numpy(), np.full((p, 3), 1.5), rtol=3e-3)
+    expected = 1.5 * _integrated_ggx(normal.numpy(), view.numpy(), roughness)[:, None].repeat(3, 1)
+    np.testing.assert_allclose(0.04 * lobes.specular.numpy(), expected, rtol=6e-3)
+    torch.testing.assert_close(lobes.specular_visibility, torch.ones(p))
+
+
+def _stack(levels: int, height: int, n: int) -> list[torch.Tensor]:
+    """Maps, directions of any length all around and at the seam, and roughness beyond both ends."""
+    rng = torch.Generator().manual_seed(levels)
+    directions = torch.randn(n, 3, generator=rng)
+    directions[: n // 3, 0] *= 1e-2
+    directions[n // 3 : n // 2, 1] *= 30
+    return [
+        torch.rand(levels, height, 2 * height, 3, generator=rng),
+        directions,
+        1.4 * torch.rand(n, generator=rng) - 0.2,
+    ]
+
+
+@pytest.mark.parametrize(("levels", "height", "n"), [(9, 16, 200), (1, 1, 20), (2, 5, 0)])
+def test_lookups_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, levels: int, height: int, n: int
+) -> None:
+    inputs, seed = _stack(levels, height, n), torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        values = by.lookup(*x)
+        return [values, *torch.autograd.grad(values, x, seed.to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_lookups_at_the_poles_are_means_of_their_rows_and_have_no_gradient(backend: backends.Backend) -> None:
+    stack = _stack(2, 4, 1)[0]
+    poles = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], requires_grad=True)
+    values = backend.lookup(stack, poles, torch.zeros(2))
+    # At u = 1/2: two neighbouring columns of the row and their opposites.
+    expected = [stack[0, row][[3, 4, 7, 0]].mean(0) for row in (0, -1)]
+    torch.testing.assert_close(values, torch.stack(expected))
+    assert not torch.autograd.grad(values.sum(), poles)[0].any()
+
+
+def test_gradients_of_reference_lookups_are_finite_differences() -> None:
+    inputs = [x.double().requires_grad_() for x in _stack(3, 4, 9)]
+    assert torch.autograd.gradcheck(reference.lookup, inputs)
 
 
 def _integrated_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0: float = 0.04) -> np.ndarray:
@@ -388,6 +431,249 @@ def _integrated_ggx(normals: np.ndarray, view: np.ndarray, roughness: float, f0:
         F += f0 / 0.08 * ((inside - 1.5 * vh) / (inside + 1.5 * vh)) ** 2
         result.append((D * F * G / (4 * mu * nv) * mu).mean() * 2 * math.pi)
     return np.array(result)
+
+
+# ------------------------------------------------------------------------------- kernels of the steps of stage 2
+
+
+def _lit_gaussians(n: int, d: int) -> list[torch.Tensor]:
+    """Arguments of `sh_shade`, rounded to float32; the matrix is no rotation, as its entries are independent."""
+    rng = torch.Generator().manual_seed(n)
+    shapes = (n, 3), (n, 4), (n, 3), (2, 16, 3), (), (n, 9), (n, 9), (3, 3)
+    means, quats, logits, light, scale, occluded, unoccluded, R = (torch.randn(x, generator=rng) for x in shapes)
+    reflectance = 0.04 * torch.tensor([0.937, -0.296, 5.535, -11.654, 20.113, -9.978])
+    transfer = [0.3 * occluded + 0.5, unoccluded.abs() + 0.3, cases.fibonacci(d).float()]
+    return [
+        means,
+        quats,
+        2 * logits,
+        0.5 * light,
+        scale.exp(),
+        *transfer,
+        reflectance,
+        R,
+        torch.tensor([0.1, 0.2, 3.0]),
+    ]
+
+
+@pytest.mark.parametrize("n", [0, 1, 133])
+@pytest.mark.parametrize("shadowed", [False, True])
+def test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference(
+    backend: backends.Backend, n: int, shadowed: bool
+) -> None:
+    inputs, rng = _lit_gaussians(n, 75), torch.Generator().manual_seed(1)
+    seed = torch.randn(n, 3, generator=rng)
+    if not shadowed:
+        inputs[5:7] = [torch.zeros(0, 9)] * 2
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        shaded = by.sh_shade(*x)
+        return [shaded, *torch.autograd.grad(shaded, [*x[:5], *x[9:]], seed.to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_shading_by_harmonics_are_finite_differences() -> None:
+    """Without self-shadowing, which counts as a constant; the gradient of the rotations is scaled."""
+    inputs = [x.double() for x in _lit_gaussians(5, 9)]
+    quats, rest = inputs[1], (torch.zeros(0, 9).double(), torch.zeros(0, 9).double(), *inputs[7:9])
+    others = [x.requires_grad_() for x in (inputs[0], *inputs[2:5], *inputs[9:])]
+
+    def render(means: torch.Tensor, *x: torch.Tensor) -> torch.Tensor:
+        return reference.sh_shade(means, quats, *x[:3], *rest, *x[3:])
+
+    assert torch.autograd.gradcheck(render, others, fast_mode=True)
+
+    def of_quats(q: torch.Tensor) -> torch.Tensor:
+        return reference.sh_shade(others[0].detach(), q, *(x.detach() for x in others[1:4]), *rest, *inputs[9:]).sum()
+
+    analytic = torch.autograd.grad(of_quats(quats.requires_grad_()), quats)[0]
+    step = 1e-6 * torch.randn(quats.shape, generator=torch.Generator().manual_seed(0)).double()
+    change = (of_quats(quats + step) - of_quats(quats - step)) / 2
+    assert (analytic * step).sum().item() == pytest.approx(backends.NORMAL_GRADIENT * change.item(), rel=1e-5)
+
+
+def _pictures(height: int, width: int, box: tuple[slice, slice]) -> list[torch.Tensor]:
+    """Arguments of `image_terms` up to the mask: an object within a box, with saturated and unknown pixels."""
+    rng = torch.Generator().manual_seed(height)
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.rand(height, width, *shape, generator=rng)
+
+    inside = torch.zeros(height, width)
+    inside[box] = 1
+    alpha, rgb = inside * (0.4 + 0.6 * noise()), inside[..., None] * (1.5 * noise(3) - 0.1)
+    depth, variance = inside * (3 + 0.1 * noise()), inside * (0.01 * noise() - 1e-5)
+    photo = (inside[..., None] * 280 * noise(3)).clamp(max=255).to(torch.uint8)
+    mask = (inside * torch.tensor([0.0, 128.0, 255.0, 255.0])[(4 * noise()).long()]).to(torch.uint8)
+    return [rgb, alpha, depth, variance, inside[..., None] * (noise(3) - 0.3), photo, mask]
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "box"),
+    [
+        (40, 50, (slice(8, 30), slice(12, 40))),
+        (37, 51, (slice(None), slice(None))),
+        (64, 33, (slice(50, None), slice(20, None))),
+        (11, 11, (slice(2, 5), slice(2, 5))),
+        (13, 90, (slice(6, 7), slice(3, 4))),
+        (20, 21, (slice(0, 0), slice(0, 0))),
+    ],
+)
+@pytest.mark.parametrize(("ssim_weight", "crease"), [(0.2, 25.0), (1.0, 0.0)])
+def test_terms_of_images_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, height: int, width: int, box: tuple[slice, slice], ssim_weight: float, crease: float
+) -> None:
+    *images, photo, mask = _pictures(height, width, box)
+    R, _, focal = (x.float() for x in cases.camera(height, width))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (*images, R)]
+        terms = by.image_terms(*x[:5], photo, mask, x[5], focal.to(dtype), ssim_weight, crease)
+        return [terms, *torch.autograd.grad(terms, x, torch.tensor([1.0, 2.0, 3.0, 4.0]).to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_image_terms_are_finite_differences() -> None:
+    *images, photo, mask = _pictures(13, 12, (slice(1, 12), slice(1, 11)))
+    R, _, focal = cases.camera(13, 12)
+    photo = photo.clamp(max=250)  # a rendering equal to a saturated photo has a kink
+    inputs = [x.double().requires_grad_() for x in (*images, R)]
+    # Where alpha is 0 the variance does not count, and a change of alpha would make it count.
+    inside = (images[1] > 0).double()
+
+    def on_the_object(*x: torch.Tensor) -> torch.Tensor:
+        view = (x[0] * inside[..., None], x[1] * inside, x[2], x[3] * inside, x[4])
+        return reference.image_terms(*view, photo, mask, x[5], focal, 0.3, 5.0)
+
+    assert torch.autograd.gradcheck(on_the_object, inputs, eps=1e-7, atol=1e-5, fast_mode=True)
+
+
+def _measured_gaussians(n: int) -> list[torch.Tensor]:
+    """Arguments of `gaussian_terms` up to the depth: some needles, some Gaussians outside of the image or unseen."""
+    rng = torch.Generator().manual_seed(n)
+    means, quats, log_scales, sdf = (torch.randn(n, *x, generator=rng) for x in ((3,), (4,), (3,), ()))
+    log_scales[: n // 8] *= 0.01
+    weight = (torch.rand(n, generator=rng) - 0.3).clamp(min=0)
+    depth = 3 + 0.3 * torch.rand(40, 50, generator=rng)
+    depth[:10] = 0
+    return [0.4 * means, quats, log_scales, 0.05 * sdf, torch.tensor(8.0), weight, depth]
+
+
+@pytest.mark.parametrize(("n", "gamma"), [(333, 8.0), (332, 100.0), (1, 8.0), (0, 8.0)])
+def test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, n: int, gamma: float
+) -> None:
+    *own, _, weight, depth = _measured_gaussians(n)
+    R, t, focal = (x.float() for x in cases.camera(40, 50))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (*own, torch.tensor(gamma), R, t)]
+        terms = by.gaussian_terms(*x[:5], weight.to(dtype), depth.to(dtype), *x[5:], focal.to(dtype), 0.01, 0.2)
+        gradients = torch.autograd.grad(terms, x, torch.tensor([1.0, 2.0, 3.0]).to(dtype), materialize_grads=True)
+        return [terms, *gradients]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_gaussian_terms_are_finite_differences() -> None:
+    """The median of the signed distances counts as a constant."""
+    means, quats, log_scales, sdf, _, weight, depth = (x.double() for x in _measured_gaussians(9))
+    camera = cases.camera(40, 50)
+    gamma, depth = torch.tensor(8.0).double(), depth * 0 + 3.1
+
+    def sharpness_apart(*x: torch.Tensor) -> torch.Tensor:
+        return reference.gaussian_terms(*x[:4], gamma, weight, depth, x[4], x[5], camera[2], 0.01, 2.0)[[0, 2]]
+
+    inputs = [x.requires_grad_() for x in (means, quats, log_scales, sdf, camera[0], camera[1])]
+    assert torch.autograd.gradcheck(sharpness_apart, inputs)
+
+
+def _material(n: int) -> list[torch.Tensor]:
+    """Albedo and roughness logits and normal offsets of the corners, and positive transfer vectors."""
+    rng = torch.Generator().manual_seed(n)
+    shapes = (n, 4, 3), (n, 4), (n, 4, 3), (n, 9)
+    *corners, transfer = (torch.randn(x, generator=rng) for x in shapes)
+    return [*(3 * x for x in corners), 0.5 * transfer + 0.3]
+
+
+@pytest.mark.parametrize("n", [0, 1, 75])
+def test_features_of_corners_and_their_gradients_are_those_of_the_reference(backend: backends.Backend, n: int) -> None:
+    inputs, rng = _material(n)[:3], torch.Generator().manual_seed(n)
+    seeds = torch.randn(n, 4, 7, generator=rng), torch.randn(n, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        corners, albedo = by.corner_features(*x, 2.0)
+        return [corners, albedo, *torch.autograd.grad([corners, albedo], x, [y.to(dtype) for y in seeds])]
+
+    _compare(backend, run)
+
+
+@pytest.mark.parametrize("n", [0, 1, 75])
+def test_bounces_and_their_gradients_are_those_of_the_reference(backend: backends.Backend, n: int) -> None:
+    rng = torch.Generator().manual_seed(n)
+    transfer, directions = _material(n)[3], cases.fibonacci(45).float()
+    inputs, seed = [torch.rand(x, 3, generator=rng) for x in (n, 45)], torch.randn(n, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        radiance = by.bounce(x[0], transfer.to(dtype), directions.to(dtype), x[1])
+        return [radiance, *torch.autograd.grad(radiance, x, seed.to(dtype))]
+
+    _compare(backend, run)
+
+
+@pytest.mark.parametrize(("height", "width"), [(19, 37), (1, 5), (4, 1)])
+def test_terms_of_materials_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, height: int, width: int
+) -> None:
+    _, alpha, *_, photo, mask = _pictures(height, width, (slice(None), slice(None, 30)))
+    features = torch.rand(height, width, 7, generator=torch.Generator().manual_seed(0))
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in (features, alpha)]
+        terms = by.material_terms(*x, photo, mask)
+        return [terms, *torch.autograd.grad(terms, x, torch.tensor([1.0, 2.0]).to(dtype))]
+
+    _compare(backend, run)
+
+
+def test_gradients_of_reference_materials_are_finite_differences() -> None:
+    *corners, transfer = (x.double() for x in _material(5))
+    inputs = [x.requires_grad_() for x in corners]
+    assert torch.autograd.gradcheck(lambda *x: reference.corner_features(*x, 2.0), inputs)
+    rng = torch.Generator().manual_seed(0)
+    inputs = [torch.rand(x, 3, generator=rng).double().requires_grad_() for x in (5, 12)]
+    around = transfer, cases.fibonacci(12)
+    assert torch.autograd.gradcheck(lambda albedo, light: reference.bounce(albedo, *around, light), inputs)
+    _, alpha, *_, photo, mask = _pictures(5, 6, (slice(None), slice(None, 4)))
+    inputs = [x.double().requires_grad_() for x in (torch.rand(5, 6, 7, generator=rng), alpha)]
+    assert torch.autograd.gradcheck(lambda *x: reference.material_terms(*x, photo, mask), inputs)
+
+
+def test_kernels_of_the_steps_conform_with_two_threads(backend: backends.Backend) -> None:
+    """More than a vector of Gaussians per thread, and more jobs than threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference(backend, 133, shadowed=True)
+        test_features_of_corners_and_their_gradients_are_those_of_the_reference(backend, 75)
+        test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference(backend, 333, 8.0)
+        box = slice(8, 30), slice(12, 40)
+        test_terms_of_images_and_their_gradients_are_those_of_the_reference(backend, 40, 50, box, 0.2, 25.0)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_constants_that_the_kernels_repeat_are_those_of_the_package() -> None:
+    assert images.LINEAR_KNEE == backends.KNEE
+    assert tuple(k * k for k in images.STABILISERS) == backends.SSIM_STABILISERS
+    assert (capture.OBJECT, capture.UNKNOWN) == (backends.OBJECT, backends.UNKNOWN)
+    x, y = torch.rand(2, 20, 30, 3, generator=torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(reference.similarity(x, y).mean(), images.ssim(x, y))
 
 
 # --------------------------------------------------------------------------------------------------- choice

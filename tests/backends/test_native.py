@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.backends import cases
+from tests.backends import cases, test_backends
 from tumble import backends
 from tumble.backends import _cache, _native, reference
 
@@ -279,13 +279,21 @@ def exercise() -> None:
     assert (blockers != reference.blockers(bvh, points, normals, directions, bits)).float().mean() < 0.02
     hits = cpu.trace(tree, points, normals, torch.rand(len(cloud[0]), 3, generator=rng))
     assert cases.difference(hits.transmittance, reference.trace(bvh, points, normals, points[:0]).transmittance) < 1e-4
-    surface = [normals, torch.rand(40, 3, generator=rng), torch.rand(40, generator=rng), normals.roll(1, 0)]
+    surface = [normals, torch.rand(40, generator=rng), normals.roll(1, 0)]
     light = [torch.rand(45, 3, generator=rng), torch.rand(len(cloud[0]), 3, generator=rng)]
     inputs = [x.requires_grad_() for x in (*surface, *light)]
     results = []
     for backend in (cpu, reference):
-        shaded = backend.shade(*inputs[:4], directions, inputs[4], bits, blockers, inputs[5], 0.04)
-        results.append([shaded, *torch.autograd.grad(shaded.sum(), inputs)])
+        lobes = backend.shade(*inputs[:3], directions, inputs[3], bits, blockers, torch.arange(40), inputs[4])
+        results.append([*lobes, *torch.autograd.grad((lobes.diffuse + lobes.specular).sum(), inputs)])
+    test_backends.test_lookups_and_their_gradients_are_those_of_the_reference(cpu, 3, 7, 37)
+    test_backends.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference(cpu, 37, True)
+    box = slice(2, 9), slice(3, 12)
+    test_backends.test_terms_of_images_and_their_gradients_are_those_of_the_reference(cpu, 12, 13, box, 0.2, 9.0)
+    test_backends.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference(cpu, 37, 8.0)
+    test_backends.test_features_of_corners_and_their_gradients_are_those_of_the_reference(cpu, 37)
+    test_backends.test_bounces_and_their_gradients_are_those_of_the_reference(cpu, 37)
+    test_backends.test_terms_of_materials_and_their_gradients_are_those_of_the_reference(cpu, 12, 13)
     # Both are computed in float32.
     assert max(cases.difference(a, b) for a, b in zip(*results, strict=True)) < 1e-3
 

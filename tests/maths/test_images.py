@@ -1,7 +1,5 @@
 """Colour curves against published values, similarity against scikit-image, resampling against slow loops."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -11,8 +9,6 @@ from torch import Tensor
 from tumble.maths.images import (
     crop,
     crop_box,
-    edge_aware,
-    gradients,
     linear_from_srgb,
     resize,
     resize_area,
@@ -108,31 +104,6 @@ def test_ssim_is_differentiable() -> None:
 def test_ssim_rejects_images_smaller_than_its_window() -> None:
     with pytest.raises(ValueError, match="smaller than the window"):
         ssim(random_image(10, 30), random_image(10, 30))
-
-
-def test_gradients_point_right_and_down() -> None:
-    row, column = torch.meshgrid(torch.arange(4.0), torch.arange(5.0), indexing="ij")
-    dx, dy = gradients((10 * row + column)[..., None])
-    assert dx.shape == (4, 4, 1)
-    assert dy.shape == (3, 5, 1)
-    assert (dx == 1).all()
-    assert (dy == 10).all()
-
-
-def test_edge_aware_smoothness_by_hand() -> None:
-    """A step of 2 in one of three gaps between columns, and none between rows."""
-    x = torch.tensor([0.0, 0.0, 2.0, 2.0], dtype=DOUBLE).expand(3, 4)[..., None]
-    flat = torch.zeros(3, 4, 3, dtype=DOUBLE)
-    edge = torch.stack([x[..., 0], 0 * x[..., 0], 0 * x[..., 0]], -1)
-    assert edge_aware(x, flat).item() == pytest.approx(2 / 3)
-    assert edge_aware(x, edge).item() == pytest.approx(2 / 3 * (math.exp(-2) + 2) / 3)
-    assert edge_aware(flat + 0.3, edge).item() == 0
-
-
-def test_edge_aware_smoothness_treats_both_axes_alike() -> None:
-    x, guide = random_image(9, 9, 2), random_image(9, 9, seed=1)
-    transposed = edge_aware(x.transpose(0, 1), guide.transpose(0, 1))
-    assert transposed.item() == pytest.approx(edge_aware(x, guide).item())
 
 
 @pytest.mark.parametrize("change", [resize, resize_area])

@@ -108,7 +108,7 @@ def test_the_layout_of_the_bits() -> None:
 
 def test_unoccluded_has_all_directions_visible() -> None:
     unshadowed = tracing.unoccluded(fibonacci_sphere(70), 3)
-    assert unshadowed.bits.shape == (3, 3)
+    assert unshadowed.bits[unshadowed.rows()].shape == (3, 3)
     assert unshadowed.unpacked().shape == (3, 70)
     assert unshadowed.unpacked().all()
 

@@ -1,9 +1,11 @@
-"""Rendering backends: the interface of rasterization, ray tracing and shading, and the choice of an implementation.
+"""Backends: the interface of rendering and other kernels of a training step, and the choice of an implementation.
 
 This file defines the interface; every other module of this folder without a leading underscore implements it. Three
-kernels are needed: **rasterize** (splatting of Gaussians), **trace** (rays against Gaussians) and **shade** (reflected
-light). `reference.py` defines the correct result; the others compute the same, faster. There are no options: rules
-for culling, depth and interpolation are part of the method, and other rules need another module.
+kernels render: **rasterize** (splatting of Gaussians), **trace** (rays against Gaussians) and **shade** (reflected
+light). The others replace hundreds of small operations per step: colour (**sh_shade**), materials
+(**corner_features**), light (**lookup**, **bounce**) and loss terms (**image_terms**, **gaussian_terms**,
+**material_terms**). `reference.py` defines the correct result; the others compute the same, faster. There are no
+options: rules for culling, depth and interpolation are part of the method, and other rules need another module.
 
 Vocabulary
     *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third axis
@@ -29,7 +31,7 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 
 __all__ = [
@@ -40,12 +42,23 @@ __all__ = [
     "FACING",
     "Hits",
     "NEAR",
+    "IRRADIANCE_FLOOR",
+    "KNEE",
+    "Lobes",
     "NEAR_SIGMAS",
+    "NORMAL_GRADIENT",
+    "OBJECT",
+    "RATIO_MAX",
     "ROUGHNESS_MIN",
     "Rendering",
+    "SATURATED",
+    "SSIM_SIGMA",
+    "SSIM_STABILISERS",
+    "SSIM_WINDOW",
     "TRACE_SIGMAS",
     "TRACE_T_MIN",
     "T_MIN",
+    "UNKNOWN",
     "VISIBLE",
     "choose",
     "load",
@@ -81,6 +94,27 @@ VISIBLE = 0.5
 """Minimum transmittance at which a direction is visible from a point."""
 ROUGHNESS_MIN = 0.05
 """Lower limit of the roughness used for shading; narrower lobes would fall between the sampled directions."""
+NORMAL_GRADIENT = 0.3
+"""Factor of the gradient from `sh_shade` to the normals: the low-order light causes errors in the full gradient."""
+IRRADIANCE_FLOOR = 0.03
+"""Fraction of the mean irradiance that is added to shadowed and unshadowed irradiance before their ratio is taken, as
+it is unstable where hardly any light arrives."""
+RATIO_MAX = 2.0
+"""Upper limit of the ratio of shadowed to unshadowed irradiance, which interreflection can raise above 1."""
+SATURATED = 254
+"""8-bit value of a photo from which a pixel counts as saturated."""
+KNEE = 0.0031308
+"""Linear value at which the sRGB curve (IEC 61966-2-1) changes from a line to a power."""
+SSIM_WINDOW = 11
+"""Width of the Gaussian window of SSIM [pixels]."""
+SSIM_SIGMA = 1.5
+"""Standard deviation of the Gaussian window of SSIM [pixels]."""
+SSIM_STABILISERS = (0.01**2, 0.03**2)
+"""Constants C1 and C2 of SSIM (Wang et al. 2004) for values in [0, 1]."""
+OBJECT = 255
+"""Mask value of pixels that show the object."""
+UNKNOWN = 128
+"""Mask value of pixels that `image_terms` ignores."""
 
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
@@ -168,6 +202,17 @@ class Hits(NamedTuple):
     """sum w_i radiance_i over black, front to back in order of the peaks; zeros if no radiance was given."""
     hit: Int32[Tensor, " r"]
     """Index of the Gaussian with the largest w_i, -1 if the ray hits none."""
+
+
+class Lobes(NamedTuple):
+    """Radiance reflected by surface points, by lobe."""
+
+    diffuse: Float[Tensor, "p 3"]
+    """Of a Lambertian lobe with albedo 1, which is irradiance / pi."""
+    specular: Float[Tensor, "p 3"]
+    """Of the specular lobe with reflectance 1 at normal incidence."""
+    specular_visibility: Float[Tensor, " p"]
+    """Visible fraction of the specular lobe. Not differentiable."""
 
 
 @runtime_checkable
@@ -280,47 +325,248 @@ class Backend(Protocol):
     def shade(
         self,
         normal: Float[Tensor, "p 3"],
-        albedo: Float[Tensor, "p 3"],
         roughness: Float[Tensor, " p"],
         view: Float[Tensor, "p 3"],
         directions: Float[Tensor, "d 3"],
         radiance: Float[Tensor, "d 3"],
-        visibility: Int32[Tensor, "p words"],
-        blocker: Int32[Tensor, "#p #d"],
+        visibility: Int32[Tensor, "q words"],
+        blocker: Int32[Tensor, "#q #d"],
+        rows: Int64[Tensor, " p"],
         blocker_radiance: Float[Tensor, "m 3"],
-        f0: float,
-    ) -> Float[Tensor, "p 3"]:
-        """Reflected radiance (Lambert + GGX) under light from d directions w_j of equal solid angle over the sphere.
+    ) -> Lobes:
+        """Reflected radiance (Lambert and GGX) under light from d directions w_j of equal solid angle over the sphere.
 
-            L_o = 4 pi / d  sum_j (albedo / pi + f_j) L_j max(n.w_j, 0)
-            f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = f0 (1 + 24 q(1 - v.h))
+            diffuse = 4 / d  sum_j L_j max(n.w_j, 0),  specular = 4 pi / d  sum_j f_j L_j max(n.w_j, 0)
+            f_j = F a^2 / (4 pi t^2 g(n.v) g(n.w_j)),  a = r^2,  F = 1 + 24 q(1 - v.h)
             q(m) = 0.9878 m^3 - 3.8886 m^4 + 9.1922 m^5 - 9.6217 m^6 + 4.3303 m^7  (Fresnel's equations, index 1.5)
             t = (|n x H|^2 + a^2 (n.H)^2) / |H|^2,  H = v + w_j,  |H|^2 = 2 (1 + v.w_j),  v.h = |H| / 2
             g(x) = (x + sqrt(a^2 + (1 - a^2) x^2)) / 2 for x > 0, else a / 2,  r = max(roughness, ROUGHNESS_MIN)
 
         (t is the usual (n.h)^2 (a^2 - 1) + 1 in a form without cancellation for narrow lobes in float32.)
-        Differentiable in normal, albedo, roughness, view and both radiances; normal and view count as independent
-        vectors in the formulas above. f is 0 for a camera below the horizon (n.v <= 0), and where |H| = 0 (v = -w).
+        specular_visibility is the mean of the visibility bits over the directions with n.w > 0, weighted by
+        c / ((1 - c) / 2 + b^2 (1 + c) / 2)^2 with c = max(0, m.w), m = 2 (n.v) n - v, and b = max(a, sqrt(pi / d) / 2):
+        neighbouring directions are sqrt(4 pi / d) apart, and GGX falls to a quarter at a distance of 2 a from its peak.
+        It is 0 if all weights are.
+
+        diffuse and specular are differentiable in normal, roughness, view and both radiances; normal and view count as
+        independent vectors in the formulas above. f is 0 for a camera below the horizon (n.v <= 0), and where |H| = 0
+        (v = -w).
 
         Args:
             normal: Unit normals.
-            albedo: Linear albedo.
             roughness: Perceptual roughness.
             view: Unit directions from surface to camera.
             directions: Unit directions shared by all points, in the frame of normal and view.
             radiance: Linear radiance arriving from each direction where it is visible.
             visibility: Bits of `visible`. L_j is radiance[j] where the bit is set; elsewhere it is
-                blocker_radiance[blocker[p, j]], or 0 if blocker[p, j] is -1.
+                blocker_radiance[blocker[q, j]], or 0 if blocker[q, j] is -1.
             blocker: Result of `blockers`, or `[1 1]` of -1 for black blockers.
+            rows: Row q of visibility and blocker that belongs to each point.
             blocker_radiance: Linear radiance of the Gaussians that `blocker` indexes; m may be 0.
-            f0: Reflectance at normal incidence.
+        """
+        ...
+
+    def lookup(
+        self,
+        stack: Float[Tensor, "levels h w 3"],
+        directions: Float[Tensor, "p 3"],
+        roughness: Float[Tensor, " p"],
+    ) -> Float[Tensor, "p 3"]:
+        """Values of a stack of equirectangular maps in given directions, at level `roughness (levels - 1)`.
+
+        Linear between levels and bilinear between texels (convention of docs/format.md), continuous across the seam and
+        the poles. Differentiable in all arguments, except for the direction at a pole.
+
+        Args:
+            stack: Maps of levels 0 to `levels - 1`; w is even.
+            directions: Directions of any length except 0.
+            roughness: Clamped to [0, 1].
+        """
+        ...
+
+    def sh_shade(
+        self,
+        means: Float[Tensor, "n 3"],
+        quats: Float[Tensor, "n 4"],
+        albedo_logits: Float[Tensor, "n 3"],
+        light: Float[Tensor, "2 16 3"],
+        specular_scale: Float[Tensor, ""],
+        occluded: Float[Tensor, "m 9"],
+        unoccluded: Float[Tensor, "m 9"],
+        directions: Float[Tensor, "d 3"],
+        reflectance: Float[Tensor, " k"],
+        R_env_obj: Float[Tensor, "3 3"],
+        position: Float[Tensor, "3"],
+    ) -> Float[Tensor, "n 3"]:
+        """Linear radiance of Gaussians towards the camera under a light of spherical harmonics.
+
+            c = sigmoid(albedo_logits) rho E(R n) + specular_scale F(n.v) S(R r),  r = 2 (n.v) n - v
+            E(d) = softplus(sum_k light_0k Y_k(d)),  S(d) = softplus(sum_k light_1k Y_k(d)),
+            F(x) = sum_k reflectance_k (1 - min(1, x))^k,  R = R_env_obj,  v = normalize(position - mean)
+
+        c is 0 where n.v <= 0, since `rasterize` culls these Gaussians. rho is irradiance with self-shadowing divided
+        by that without, `(H(occluded) + f) / (H(unoccluded) + f)` but at most RATIO_MAX, and 1 if m is 0.
+        H(t) = max(0, t . q) / max(1e-3, 1 - albedo (1 - min(1, max(0, t_0 sqrt(4 / pi))))) includes all bounces, with
+        q_k the mean over the directions w of 4 pi Y_k(w) S(R w), and f is IRRADIANCE_FLOOR pi times the mean of S(R w).
+
+        Differentiable in means, quaternions, albedo, light, specular scale, R_env_obj (its nine numbers as independent
+        variables) and position, with rho as a constant and the gradient of the normals times NORMAL_GRADIENT.
+
+        Args:
+            means: Centres, object frame.
+            quats: Rotations from local to object frame, of which only the normal n (third axis) is used.
+            albedo_logits: Linear albedo before the sigmoid.
+            light: Coefficients of E and S, env frame.
+            specular_scale: Scale of the specular lobe.
+            occluded: Transfer vectors from light to irradiance with self-shadowing (m = n), or none (m = 0).
+            unoccluded: Transfer vectors without self-shadowing.
+            directions: Evenly distributed unit directions, object frame, for the integral of S.
+            reflectance: Coefficients of a polynomial in 1 - n.v.
+            R_env_obj: Rotation from the object frame to the env frame.
+            position: Camera centre, object frame.
+        """
+        ...
+
+    def image_terms(
+        self,
+        rgb: Float[Tensor, "h w 3"],
+        alpha: Float[Tensor, "h w"],
+        depth: Float[Tensor, "h w"],
+        depth_var: Float[Tensor, "h w"],
+        normal: Float[Tensor, "h w 3"],
+        photo: UInt8[Tensor, "h w 3"],
+        mask: UInt8[Tensor, "h w"],
+        R_cam_obj: Float[Tensor, "3 3"],
+        fx_fy_cx_cy: Float[Tensor, "4"],
+        ssim_weight: float,
+        crease: float,
+    ) -> Float[Tensor, "4"]:
+        """Loss terms of a rendered view (`Rendering`) against a photo, each a mean over the image.
+
+        0. `(1 - w) |x - y| + w (1 - SSIM(x, y))`, w = ssim_weight, with x the rendering in sRGB and y the photo, both
+           black where the mask is UNKNOWN; SSIM is averaged over windows within the image. Where the photo is SATURATED
+           and x larger, x = y. Differentiable in rgb.
+        1. `(alpha - [mask is OBJECT])^2`, 0 where the mask is UNKNOWN. Differentiable in alpha.
+        2. `u / (1 + crease u)`, u = 1 - cosine between the normal and the normal of the depth map by central
+           differences, where a pixel and its four neighbours have alpha > 1/2. The normal of the depth map is that of
+           the surface z (X, Y, 1) with z_x = (z_right - z_left) / 2 and z_y likewise, at the mean of both neighbours.
+           Differentiable in normal, depth and R_cam_obj.
+        3. `sqrt(max(0, depth_var) + 1e-6) - 1e-3`, 0 where alpha is 0. Differentiable in depth_var.
+
+        The images have at least SSIM_WINDOW rows and columns, and rgb is black where alpha is 0.
+
+        Args:
+            rgb: Linear radiance.
+            alpha: Coverage.
+            depth: Mean z-depth, camera frame.
+            depth_var: Variance of the z-depth.
+            normal: Outward normals of any length, object frame.
+            photo: Input image, sRGB.
+            mask: OBJECT, UNKNOWN, or other values beside the object.
+            R_cam_obj: Rotation from object to camera.
+            fx_fy_cx_cy: Focal lengths and principal point [pixels].
+            ssim_weight: Weight of SSIM in the first term, 0 to 1.
+            crease: Saturation of the third term.
+        """
+        ...
+
+    def gaussian_terms(
+        self,
+        means: Float[Tensor, "n 3"],
+        quats: Float[Tensor, "n 4"],
+        log_scales: Float[Tensor, "n 3"],
+        sdf: Float[Tensor, " n"],
+        gamma: Float[Tensor, ""],
+        weight: Float[Tensor, " n"],
+        depth: Float[Tensor, "h w"],
+        R_cam_obj: Float[Tensor, "3 3"],
+        t_cam_obj: Float[Tensor, "3"],
+        fx_fy_cx_cy: Float[Tensor, "4"],
+        floor: float,
+        reach: float,
+    ) -> Float[Tensor, "3"]:
+        """Loss terms of the Gaussians.
+
+        0. Mean of `max(0, -log(max(1e-4, exp(H) - 1)))`, with H the entropy of the squared scales divided by their sum,
+           plus the mean third scale. Differentiable in log_scales.
+        1. `max(0, 1.762747 / max(floor, m) - gamma)`, with m the lower median of |sdf|. Differentiable in gamma.
+        2. Mean of |z - depth(u)| over the Gaussians with weight > 0, where z is the z-depth of `mean - sdf normal` and
+           u its pixel; a difference of at least `reach`, or a depth of 0, counts as 0. depth is interpolated bilinearly
+           between pixel centres. Differentiable in means, quats, sdf, R_cam_obj and t_cam_obj, not in depth.
+
+        All terms are 0 if there are no Gaussians.
+
+        Args:
+            means: Centres, object frame.
+            quats: Rotations from local to object frame, of which only the normal (third axis) is used.
+            log_scales: Logarithms of the standard deviations.
+            sdf: Signed distances.
+            gamma: Sharpness of the opacity.
+            weight: Blending weight of every Gaussian in the view.
+            depth: Rendered depth of the view.
+            R_cam_obj: Rotation from object to camera.
+            t_cam_obj: Translation from object to camera.
+            fx_fy_cx_cy: Focal lengths and principal point [pixels].
+            floor: Lower limit of the median distance.
+            reach: Limit of the depth difference.
+        """
+        ...
+
+    def corner_features(
+        self,
+        albedo_logits: Float[Tensor, "n 4 3"],
+        roughness_logits: Float[Tensor, "n 4"],
+        normal_offset: Float[Tensor, "n 4 3"],
+        temperature: float,
+    ) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+        """Features of all corners for `rasterize`, and the mean albedo of every Gaussian.
+
+        The features are albedo, roughness and normal offset, with sigmoid(x / temperature) of both logits.
+        Differentiable in all tensors.
+        """
+        ...
+
+    def bounce(
+        self,
+        albedo: Float[Tensor, "n 3"],
+        transfer: Float[Tensor, "n 9"],
+        directions: Float[Tensor, "d 3"],
+        radiance: Float[Tensor, "d 3"],
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance `albedo / pi H(transfer)` of surfaces, with the irradiance H of `sh_shade` including all bounces.
+
+        Its q_k is the mean over the directions w of 4 pi Y_k(w) times their radiance. Differentiable in albedo and
+        radiance.
+
+        Args:
+            albedo: Linear albedo.
+            transfer: Transfer vectors from light to shadowed irradiance.
+            directions: Evenly distributed unit directions.
+            radiance: Light from these directions.
+        """
+        ...
+
+    def material_terms(
+        self,
+        features: Float[Tensor, "h w c"],
+        alpha: Float[Tensor, "h w"],
+        photo: UInt8[Tensor, "h w 3"],
+        mask: UInt8[Tensor, "h w"],
+    ) -> Float[Tensor, "2"]:
+        """Loss terms of a rendered material.
+
+        0. The mask term of `image_terms`. Differentiable in alpha.
+        1. Mean of |x_b - x_a| e^-|y_b - y_a| over pairs of neighbours a and b along rows, plus that along columns. x
+           are the first four features where the mask is OBJECT and alpha > 1/2, and 0 elsewhere; y is the photo divided
+           by 255, and the exponential is averaged over its channels. Differentiable in features.
         """
         ...
 
 
-def names() -> list[str]:
-    """Names of all backends, which are their file names."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
+@cache
+def names() -> tuple[str, ...]:
+    """Names of all backends, which are their file names; the folder is read once."""
+    return tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")))
 
 
 def load(name: str) -> Backend:

@@ -17,6 +17,9 @@ from tumble.backends._cache import SOURCES
 ENTRY_POINTS = (
     *("lanes", "sizes", "raster_prepare", "raster_forward", "raster_adjoint", "bvh_build"),
     *("rays_trace", "rays_visible", "rays_blockers", "shade_forward", "shade_adjoint"),
+    *("sh_shade_forward", "sh_shade_adjoint", "image_loss", "gaussian_loss"),
+    *("lookup_forward", "lookup_backward", "material_forward", "material_adjoint"),
+    *("bounce_forward", "bounce_adjoint", "material_loss"),
 )
 """Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (

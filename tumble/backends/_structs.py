@@ -4,13 +4,18 @@ Their sizes are compared with those of the library when it is loaded.
 """
 
 import ctypes
+import threading
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 LEVELS = 8
 """Maximum number of levels of a tree, enough for 16^8 leaves."""
+
+MAX_KEPT_SCRATCH = 1 << 24
+"""Maximum size of the scratch memory kept from one backward pass to the next (64 MiB) [numbers]."""
 
 
 def _pointers(names: str) -> list[tuple[str, Any]]:
@@ -67,15 +72,93 @@ class Shade(ctypes.Structure):
     """`Shade` of `native/shade.h`: arguments of shading."""
 
     _fields_ = [
-        *_pointers("normal albedo roughness view directions radiance visibility blocker blocker_radiance"),
+        *_pointers("normal roughness view directions radiance visibility blocker rows blocker_radiance"),
         *_ints("n_points n_directions stride words n_blockers threads blocker_point_stride blocker_direction_stride"),
-        *_floats("f0 roughness_min"),
-        *_pointers("out v_out radiance_parts blocker_parts"),
-        *_pointers("v_normal v_albedo v_roughness v_view v_radiance v_blocker_radiance"),
+        *_floats("roughness_min"),
+        *_pointers("diffuse specular specular_visibility v_diffuse v_specular radiance_parts blocker_parts"),
+        *_pointers("v_normal v_roughness v_view v_radiance v_blocker_radiance"),
     ]
 
 
-STRUCTURES = (Raster, Bvh, Rays, Shade)
+class ShShade(ctypes.Structure):
+    """`ShShade` of `native/sh_shade.h`: arguments of shading under spherical harmonics."""
+
+    _fields_ = [
+        *_pointers("means quats albedo_logits light specular_scale occluded unoccluded"),
+        *_pointers("directions reflectance R position"),
+        *_ints("n n_directions n_terms shadowed threads"),
+        *_floats("normal_gradient irradiance_floor ratio_max"),
+        *_pointers("out v_out v_means v_quats v_albedo_logits parts"),
+    ]
+
+
+class Image(ctypes.Structure):
+    """`Image` of `native/image.h`: arguments of the loss terms of an image."""
+
+    _fields_ = [
+        *_pointers("rgb alpha depth depth_var normal photo mask R focal taps"),
+        *_ints("height width plane_size threads"),
+        *_floats("ssim_weight crease saturated knee c1 c2"),
+        *_pointers("scratch terms g_rgb g_alpha g_depth g_depth_var g_normal g_R"),
+    ]
+
+
+class GaussianTerms(ctypes.Structure):
+    """`GaussianTerms` of `native/gaussian_terms.h`: arguments of the loss terms of the Gaussians."""
+
+    _fields_ = [
+        *_pointers("means quats log_scales sdf gamma weight depth R t focal"),
+        *_ints("n height width threads"),
+        *_floats("floor reach"),
+        *_pointers("magnitudes terms g_means g_quats g_log_scales g_sdf g_gamma g_R g_t"),
+    ]
+
+
+class Lookup(ctypes.Structure):
+    """`Lookup` of `native/lookup.h`: arguments of lookups in a stack of maps."""
+
+    _fields_ = [
+        *_pointers("stack directions roughness"),
+        *_ints("n levels height width"),
+        *_pointers("out v_out v_stack v_directions v_roughness"),
+    ]
+
+
+class Activation(ctypes.Structure):
+    """`Activation` of `native/material.h`: arguments of the activation of materials."""
+
+    _fields_ = [
+        *_pointers("albedo_logits roughness_logits normal_offset"),
+        *_ints("n threads"),
+        *_floats("temperature"),
+        *_pointers("corners albedo v_corners v_albedo v_albedo_logits v_roughness_logits v_normal_offset"),
+    ]
+
+
+class Indirect(ctypes.Structure):
+    """`Indirect` of `native/material.h`: arguments of indirect light."""
+
+    _fields_ = [
+        *_pointers("albedo transfer directions radiance"),
+        *_ints("n n_directions"),
+        *_pointers("out v_out v_albedo v_radiance"),
+    ]
+
+
+class MaterialImage(ctypes.Structure):
+    """`MaterialImage` of `native/material.h`: arguments of the loss terms of a rendered material."""
+
+    _fields_ = [
+        *_pointers("features alpha photo mask"),
+        *_ints("height width n_features plane_size"),
+        *_pointers("scratch terms g_features g_alpha"),
+    ]
+
+
+STRUCTURES = (
+    *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
+    *(Lookup, Activation, Indirect, MaterialImage),
+)
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 
 
@@ -86,3 +169,18 @@ def set_pointers(
     for name, tensor in {**(tensors or {}), **more}.items():
         setattr(struct, name, None if tensor is None else tensor.data_ptr())
     return [x for x in [*(tensors or {}).values(), *more.values()] if x is not None]
+
+
+def scratch(n: int) -> Tensor:
+    """Uninitialised memory for n numbers, valid until the next call in this thread.
+
+    It is reused because allocating new pages takes as long as rendering a small image.
+    """
+    if n > MAX_KEPT_SCRATCH:
+        return torch.empty(n)
+    if len(getattr(_memory, "scratch", ())) < n:
+        _memory.scratch = torch.empty(n)
+    return _memory.scratch
+
+
+_memory = threading.local()

@@ -11,7 +11,7 @@ import math
 import warp as wp
 
 from tumble.backends import ROUGHNESS_MIN
-from tumble.backends._warp import LANES, add_lanes, add_row, no_type_check, vec32
+from tumble.backends._warp import LANES, add_row, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,7 +76,7 @@ class Lobe:
 
 @wp.func
 @no_type_check
-def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
+def lobe_at(p: Point, w: wp.vec3, n_w: float) -> Lobe:
     o = Lobe()
     o.w = w
     o.n_w = n_w
@@ -90,8 +90,8 @@ def lobe_at(p: Point, w: wp.vec3, n_w: float, f0: float) -> Lobe:
     o.vh = 0.5 * wp.sqrt(o.HH)
     m = 1.0 - o.vh
     # `tumble.rendering.brdf.fresnel` and its derivative in m.
-    o.F = f0 * (1.0 + 24.0 * m * m * m * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
-    o.slope = f0 * 24.0 * m * m * (2.9634 + m * (-15.5544 + m * (45.961 + m * (-57.7302 + m * 30.3121))))
+    o.F = 1.0 + 24.0 * m * m * m * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303))))
+    o.slope = 24.0 * m * m * (2.9634 + m * (-15.5544 + m * (45.961 + m * (-57.7302 + m * 30.3121))))
     x = o.HH / o.t_h2
     o.rest = p.aa * x * x / (FOUR_PI * p.g_v * o.g_w)
     o.f = o.F * o.rest
@@ -126,11 +126,21 @@ def arriving(source: int, radiance: wp.array[wp.vec3], blocker_radiance: wp.arra
     return blocker_radiance[source]
 
 
+@wp.struct
+@no_type_check
+class LobeSums:
+    """Sums of a point over some of its directions; `visible` and `total` are weights of `specular_visibility`."""
+
+    diffuse: wp.vec3
+    specular: wp.vec3
+    visible: float
+    total: float
+
+
 @wp.kernel
 @no_type_check
 def shade_forward(
     normal: wp.array[wp.vec3],
-    albedo: wp.array[wp.vec3],
     roughness: wp.array[float],
     view: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
@@ -138,22 +148,35 @@ def shade_forward(
     visibility: wp.array2d[int],
     blocker: wp.array2d[int],
     blocker_radiance: wp.array[wp.vec3],
-    f0: float,
-    out: wp.array[float],
+    out: wp.array2d[float],
 ):
     i, lane = wp.tid()
     p = point_at(normal, roughness, view, i)
-    sum = wp.vec3()
+    sum = LobeSums()
+    mirrored = 2.0 * p.n_v * p.n - p.v
+    bb = wp.max(p.aa, 0.25 * math.pi / float(directions.shape[0]))
     for j in range(lane, directions.shape[0], LANES):
         n_w = wp.dot(p.n, directions[j])
         source = source_of(visibility, blocker, blocker_radiance, i, j)
+        c = wp.dot(mirrored, directions[j])
+        if n_w > 0.0 and c > 0.0:
+            t = 0.5 * (1.0 - c) + bb * 0.5 * (1.0 + c)
+            sum.total += c / (t * t)
+            if source == UNBLOCKED:
+                sum.visible += c / (t * t)
         if n_w > 0.0 and source != BLACK:
-            f = lobe_at(p, directions[j], n_w, f0).f
+            f = lobe_at(p, directions[j], n_w).f
             lit = n_w * arriving(source, radiance, blocker_radiance, j)
-            sum += INV_PI * wp.cw_mul(albedo[i], lit) + f * lit
-    sum *= FOUR_PI / float(directions.shape[0])
+            sum.diffuse += INV_PI * lit
+            sum.specular += f * lit
+    scale = FOUR_PI / float(directions.shape[0])
+    row = vec32()
     for ch in range(3):
-        add_lanes(out, 3 * i + ch, sum[ch])
+        row[ch] = scale * sum.diffuse[ch]
+        row[3 + ch] = scale * sum.specular[ch]
+    row[6] = sum.visible
+    row[7] = sum.total
+    add_row(out, i, 0, 8, row)
 
 
 @wp.struct
@@ -163,7 +186,6 @@ class PointSums:
 
     n: wp.vec3
     v: wp.vec3
-    albedo: wp.vec3
     g_v: float
     n_v: float
     aa: float
@@ -193,7 +215,7 @@ def lobe_adjoint(p: Point, o: Lobe, v_f: float, v_n_w: float, sum: PointSums) ->
 @wp.func
 @no_type_check
 def point_adjoint(p: Point, sum: PointSums, roughness: float) -> vec32:
-    """Gradients of normal, view, albedo and roughness, in this order."""
+    """Gradients of normal, view and roughness, in this order."""
     row = vec32()
     v_g_v = -sum.g_v / p.g_v
     v_n_v = sum.n_v
@@ -207,9 +229,8 @@ def point_adjoint(p: Point, sum: PointSums, roughness: float) -> vec32:
     for a in range(3):
         row[a] = v_n[a]
         row[3 + a] = v_v[a]
-        row[6 + a] = sum.albedo[a]
     if roughness >= ROUGHNESS_MIN:
-        row[9] = 4.0 * p.r * p.r * p.r * v_aa
+        row[6] = 4.0 * p.r * p.r * p.r * v_aa
     return row
 
 
@@ -217,7 +238,6 @@ def point_adjoint(p: Point, sum: PointSums, roughness: float) -> vec32:
 @no_type_check
 def shade_adjoint(
     normal: wp.array[wp.vec3],
-    albedo: wp.array[wp.vec3],
     roughness: wp.array[float],
     view: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
@@ -225,44 +245,42 @@ def shade_adjoint(
     visibility: wp.array2d[int],
     blocker: wp.array2d[int],
     blocker_radiance: wp.array[wp.vec3],
-    f0: float,
-    v_out: wp.array[wp.vec3],
+    v_diffuse: wp.array[wp.vec3],
+    v_specular: wp.array[wp.vec3],
     v_points: wp.array2d[float],
 ):
-    """Gradients of normal, view, albedo and roughness of each point."""
+    """Gradients of normal, view and roughness of each point."""
     i, lane = wp.tid()
     p = point_at(normal, roughness, view, i)
     sum = PointSums()
-    seed = v_out[i] * (FOUR_PI / float(directions.shape[0]))
-    seed_diffuse = INV_PI * wp.cw_mul(seed, albedo[i])
+    seed = v_specular[i] * (FOUR_PI / float(directions.shape[0]))
+    seed_diffuse = v_diffuse[i] * (4.0 / float(directions.shape[0]))
     for j in range(lane, directions.shape[0], LANES):
         n_w = wp.dot(p.n, directions[j])
         source = source_of(visibility, blocker, blocker_radiance, i, j)
         if n_w > 0.0 and source != BLACK:
             L = arriving(source, radiance, blocker_radiance, j)
-            o = lobe_at(p, directions[j], n_w, f0)
+            o = lobe_at(p, directions[j], n_w)
             specular = wp.dot(seed, L)
             v_n_w = wp.dot(seed_diffuse, L) + o.f * specular
-            sum.albedo += n_w * INV_PI * wp.cw_mul(seed, L)
             if o.exists:
                 sum = lobe_adjoint(p, o, specular * n_w, v_n_w, sum)
             else:
                 sum.n += v_n_w * directions[j]
-    add_row(v_points, i, 0, 10, point_adjoint(p, sum, roughness[i]))
+    add_row(v_points, i, 0, 7, point_adjoint(p, sum, roughness[i]))
 
 
 @wp.kernel
 @no_type_check
 def light_adjoint(
     normal: wp.array[wp.vec3],
-    albedo: wp.array[wp.vec3],
     roughness: wp.array[float],
     view: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     visibility: wp.array2d[int],
     blocker: wp.array2d[int],
-    f0: float,
-    v_out: wp.array[wp.vec3],
+    v_diffuse: wp.array[wp.vec3],
+    v_specular: wp.array[wp.vec3],
     v_radiance: wp.array[wp.vec3],
     v_blocker_radiance: wp.array[wp.vec3],
 ):
@@ -274,8 +292,8 @@ def light_adjoint(
         n_w = wp.dot(p.n, directions[j])
         source = source_of(visibility, blocker, v_blocker_radiance, i, j)
         if n_w > 0.0 and source != BLACK:
-            f = lobe_at(p, directions[j], n_w, f0).f
-            v_L = n_w * (INV_PI * wp.cw_mul(v_out[i], albedo[i]) + f * v_out[i])
+            f = lobe_at(p, directions[j], n_w).f
+            v_L = n_w * (INV_PI * v_diffuse[i] + f * v_specular[i])
             v_L *= FOUR_PI / float(directions.shape[0])
             if source == UNBLOCKED:
                 v_unblocked += v_L

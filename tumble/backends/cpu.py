@@ -4,11 +4,10 @@ This file wraps the kernels in `autograd.Function`s.
 """
 
 import ctypes
-import threading
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from tumble.backends import (
@@ -24,11 +23,37 @@ from tumble.backends import (
     TRACE_T_MIN,
     VISIBLE,
     Hits,
+    Lobes,
     Rendering,
     _native,
     threads,
 )
-from tumble.backends._structs import Bvh, Raster, Rays, Shade, set_pointers
+from tumble.backends._cpu_terms import (
+    bounce,
+    corner_features,
+    gaussian_terms,
+    image_terms,
+    material_terms,
+    sh_shade,
+)
+from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Shade, scratch, set_pointers
+
+__all__ = [
+    "blockers",
+    "bounce",
+    "build",
+    "corner_features",
+    "gaussian_terms",
+    "image_terms",
+    "lookup",
+    "material_terms",
+    "rasterize",
+    "ready",
+    "sh_shade",
+    "shade",
+    "trace",
+    "visible",
+]
 
 TILE = 8
 """Side of a tile in `native/raster.h` [pixels]."""
@@ -52,8 +77,6 @@ FEATURES_PER_PASS = 16
 """Maximum number of features that the kernels blend in one pass; more are split into several passes."""
 MAX_GRADIENT_SCRATCH = 1 << 28
 """Maximum size of the gradient sums of all threads (1 GiB) [numbers]; with many Gaussians fewer threads are used."""
-MAX_KEPT_SCRATCH = 1 << 24
-"""Maximum size of the scratch memory kept from one backward pass to the next (64 MiB) [numbers]."""
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
@@ -147,7 +170,7 @@ class _Rasterize(torch.autograd.Function):
         kept += set_pointers(r, dict(zip((f"v_{name}" for name in _INPUTS[:6]), gradients, strict=True)))
         kept += set_pointers(
             r,
-            parts=_scratch(r.threads * r.n * r.gradient_size),
+            parts=scratch(r.threads * r.n * r.gradient_size),
             camera_parts=torch.empty(r.threads * CAMERA),
         )
         _native.library().raster_adjoint(ctypes.byref(r))
@@ -189,21 +212,6 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
         corner_width=corner_width,
         mask_stride=int(masked),
     )
-
-
-def _scratch(n: int) -> Tensor:
-    """Uninitialised memory for n numbers, valid until the next call in this thread.
-
-    It is reused because allocating new pages takes as long as rendering a small image.
-    """
-    if n > MAX_KEPT_SCRATCH:
-        return torch.empty(n)
-    if len(getattr(_local, "scratch", ())) < n:
-        _local.scratch = torch.empty(n)
-    return _local.scratch
-
-
-_local = threading.local()
 
 
 def _int32(*shape: int) -> Int32[Tensor, "..."]:
@@ -322,47 +330,45 @@ def _rays(bvh: CpuBvh, origins: Tensor, directions: Tensor, **more: Tensor) -> _
 
 def shade(
     normal: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, " p"],
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
     radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "p words"],
-    blocker: Int32[Tensor, "#p #d"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
     blocker_radiance: Float[Tensor, "m 3"],
-    f0: float,
-) -> Float[Tensor, "p 3"]:
+) -> Lobes:
     """See `Backend.shade`."""
-    surface = (normal, albedo, roughness, view)
-    return _ShadeFunction.apply(*surface, radiance, blocker_radiance, directions, visibility, blocker, f0)
+    rest = directions, visibility, blocker, rows
+    return Lobes(*_ShadeFunction.apply(normal, roughness, view, radiance, blocker_radiance, *rest))
 
 
 class _ShadeFunction(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *args: Any) -> Tensor:
-        *tensors, f0 = args
-        tensors = [x.contiguous() for x in tensors]
-        out = torch.empty_like(tensors[0])
-        struct, kept = _shade_launch(tensors, f0)
-        set_pointers(struct, out=out)
+    def forward(ctx: Any, *args: Tensor) -> tuple[Tensor, ...]:
+        tensors = [x.contiguous() for x in args]
+        diffuse, specular = torch.empty_like(tensors[0]), torch.empty_like(tensors[0])
+        fraction = torch.empty_like(tensors[1])
+        struct, kept = _shade_launch(tensors)
+        set_pointers(struct, diffuse=diffuse, specular=specular, specular_visibility=fraction)
         _native.library().shade_forward(ctypes.byref(struct))
         del kept
-        ctx.f0 = f0
         ctx.save_for_backward(*tensors)
-        return out
+        ctx.mark_non_differentiable(fraction)
+        return diffuse, specular, fraction
 
     @staticmethod
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         tensors = ctx.saved_tensors
-        struct, kept = _shade_launch(tensors, ctx.f0)
-        *v_surface, v_radiance, v_blocker = (torch.empty_like(x) for x in tensors[:6])
+        struct, kept = _shade_launch(tensors)
+        *v_surface, v_radiance, v_blocker = (torch.empty_like(x) for x in tensors[:5])
         v_rows = torch.empty(3, struct.stride)
-        kept += set_pointers(
-            struct, dict(zip(("v_normal", "v_albedo", "v_roughness", "v_view"), v_surface, strict=True))
-        )
+        kept += set_pointers(struct, dict(zip(("v_normal", "v_roughness", "v_view"), v_surface, strict=True)))
         kept += set_pointers(
             struct,
-            v_out=v_out.contiguous(),
+            v_diffuse=v_results[0].contiguous(),
+            v_specular=v_results[1].contiguous(),
             v_radiance=v_rows,
             v_blocker_radiance=v_blocker,
             radiance_parts=torch.empty(struct.threads * v_rows.numel()),
@@ -373,9 +379,9 @@ class _ShadeFunction(torch.autograd.Function):
         return (*v_surface, v_radiance, v_blocker, None, None, None, None)
 
 
-def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
+def _shade_launch(tensors: Any) -> tuple[Shade, list[Tensor]]:
     """Arguments of shading and the tensors that they point to; directions and radiance become padded rows."""
-    normal, albedo, roughness, view, radiance, blocker_radiance, directions, visibility, blocker = tensors
+    normal, roughness, view, radiance, blocker_radiance, directions, visibility, blocker, index = tensors
     lanes = _native.library().lanes()
     padding = -len(directions) % lanes
     rows = {"directions": directions, "radiance": radiance}
@@ -389,9 +395,47 @@ def _shade_launch(tensors: Any, f0: float) -> tuple[Shade, list[Tensor]]:
         threads=threads(),
         blocker_point_stride=blocker.stride(0) if blocker.shape[0] > 1 else 0,
         blocker_direction_stride=blocker.stride(1) if blocker.shape[1] > 1 else 0,
-        f0=f0,
         roughness_min=ROUGHNESS_MIN,
     )
-    rest = {"normal": normal, "albedo": albedo, "roughness": roughness, "view": view, "visibility": visibility}
+    rest = {"normal": normal, "roughness": roughness, "view": view, "visibility": visibility, "rows": index}
     kept = set_pointers(struct, {**rows, **rest}, blocker=blocker, blocker_radiance=blocker_radiance)
     return struct, kept
+
+
+def lookup(
+    stack: Float[Tensor, "levels h w 3"],
+    directions: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+) -> Float[Tensor, "p 3"]:
+    """See `Backend.lookup`."""
+    return _LookupFunction.apply(stack, directions, roughness)
+
+
+class _LookupFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        out = torch.empty_like(tensors[1])
+        struct, kept = _lookup_launch(tensors, out=out)
+        _native.library().lookup_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*tensors)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        gradients = [torch.empty_like(x) for x in ctx.saved_tensors]
+        named = dict(zip(("v_stack", "v_directions", "v_roughness"), gradients, strict=True))
+        struct, kept = _lookup_launch(ctx.saved_tensors, v_out=v_out.contiguous(), **named)
+        _native.library().lookup_backward(ctypes.byref(struct))
+        del kept
+        return tuple(gradients)
+
+
+def _lookup_launch(tensors: Any, **more: Tensor) -> tuple[Lookup, list[Tensor]]:
+    """Arguments of lookups, and the tensors that they point to."""
+    stack, directions, roughness = tensors
+    levels, height, width, _ = stack.shape
+    struct = Lookup(n=len(directions), levels=levels, height=height, width=width)
+    named = {"stack": stack, "directions": directions, "roughness": roughness}
+    return struct, set_pointers(struct, named | more)

@@ -3,17 +3,44 @@
 This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
 it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
 GPU differ by rounding errors. The kernels run on the device of the tensors; on the CPU they are slow and serve tests.
+Shading by spherical harmonics, lookups, materials and loss terms have no kernel yet: they are those of the reference.
 """
 
 import importlib.util
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tumble.backends import Hits, Rendering
+from tumble.backends import Hits, Lobes, Rendering
+from tumble.backends.reference import (
+    bounce,
+    corner_features,
+    gaussian_terms,
+    image_terms,
+    lookup,
+    material_terms,
+    sh_shade,
+)
+
+__all__ = [
+    "blockers",
+    "bounce",
+    "build",
+    "corner_features",
+    "gaussian_terms",
+    "image_terms",
+    "lookup",
+    "material_terms",
+    "rasterize",
+    "ready",
+    "sh_shade",
+    "shade",
+    "trace",
+    "visible",
+]
 
 
 def ready(device: torch.device, dtype: torch.dtype) -> str:
@@ -241,35 +268,36 @@ def _int32(like: Tensor, *shape: int) -> Int32[Tensor, "..."]:
 
 def shade(
     normal: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, " p"],
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
     radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "p words"],
-    blocker: Int32[Tensor, "#p #d"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
     blocker_radiance: Float[Tensor, "m 3"],
-    f0: float,
-) -> Float[Tensor, "p 3"]:
+) -> Lobes:
     """See `Backend.shade`."""
-    surface = normal, albedo, roughness, view
-    return _Shade.apply(*surface, directions, radiance, visibility, blocker, blocker_radiance, f0)
+    blocker = blocker[rows] if len(blocker) > 1 else blocker
+    rest = directions, radiance, visibility[rows], blocker, blocker_radiance
+    values = _Shade.apply(normal, roughness, view, *rest)
+    visible, total = values[:, 6:].detach().unbind(1)
+    return Lobes(values[:, :3], values[:, 3:6], visible / total.clamp(min=torch.finfo(total.dtype).tiny))
 
 
 class _Shade(torch.autograd.Function):
-    """`shade` with positional arguments in the same order."""
+    """`shade` with positional arguments in the same order; the last two results are visible and total weight."""
 
     @staticmethod
-    def forward(ctx: Any, *args: Any) -> Tensor:
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
         from tumble.backends import _warp, _warp_shade
 
-        *tensors, ctx.f0 = args
-        tensors = [x.contiguous() for x in tensors]
-        n, d = len(tensors[0]), len(tensors[4])
-        tensors[7] = tensors[7].expand(n, d)
-        out = torch.zeros_like(tensors[0])
+        tensors = [x.contiguous() for x in args]
+        n, d = len(tensors[0]), len(tensors[3])
+        tensors[6] = tensors[6].expand(n, d)
+        out = tensors[0].new_zeros(n, 8)
         with _warp.stream(out.device):
-            _warp.launch(_warp_shade.shade_forward, (n, _warp.LANES), *tensors, ctx.f0, out.view(-1))
+            _warp.launch(_warp_shade.shade_forward, (n, _warp.LANES), *tensors, out)
         ctx.save_for_backward(*tensors)
         return out
 
@@ -278,16 +306,16 @@ class _Shade(torch.autograd.Function):
         from tumble.backends import _warp, _warp_shade
 
         *surface, directions, radiance, visibility, blocker, blocker_radiance = ctx.saved_tensors
-        v_out = v_out.contiguous()
+        v_diffuse, v_specular = v_out[:, :3].contiguous(), v_out[:, 3:6].contiguous()
         n, groups = len(v_out), -(-len(v_out) // _warp_shade.POINTS)
-        v_points = v_out.new_zeros(n, 10)
+        v_points = v_out.new_zeros(n, 7)
         v_radiance, v_blocker_radiance = torch.zeros_like(radiance), torch.zeros_like(blocker_radiance)
         with _warp.stream(v_out.device):
-            inputs = *surface, directions, radiance, visibility, blocker, blocker_radiance, ctx.f0
-            _warp.launch(_warp_shade.shade_adjoint, (n, _warp.LANES), *inputs, v_out, v_points)
-            inputs = *surface, directions, visibility, blocker, ctx.f0
+            inputs = *surface, directions, radiance, visibility, blocker, blocker_radiance
+            _warp.launch(_warp_shade.shade_adjoint, (n, _warp.LANES), *inputs, v_diffuse, v_specular, v_points)
+            inputs = *surface, directions, visibility, blocker
             threads = groups, len(directions)
-            _warp.launch(_warp_shade.light_adjoint, threads, *inputs, v_out, v_radiance, v_blocker_radiance)
-        v_normal, v_view, v_albedo, v_roughness = v_points.split([3, 3, 3, 1], 1)
-        v_surface = v_normal, v_albedo, v_roughness[:, 0], v_view
-        return *v_surface, None, v_radiance, None, None, v_blocker_radiance, None
+            gradients = v_radiance, v_blocker_radiance
+            _warp.launch(_warp_shade.light_adjoint, threads, *inputs, v_diffuse, v_specular, *gradients)
+        v_normal, v_view, v_roughness = v_points.split([3, 3, 1], 1)
+        return v_normal, v_roughness[:, 0], v_view, None, v_radiance, None, None, v_blocker_radiance

@@ -8,24 +8,50 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import conv2d, grid_sample, normalize, softplus
 
 from tumble.backends import (
     ALPHA_MAX,
     ALPHA_MIN,
     CORNER,
     FACING,
+    IRRADIANCE_FLOOR,
+    KNEE,
     NEAR,
     NEAR_SIGMAS,
+    NORMAL_GRADIENT,
+    OBJECT,
+    RATIO_MAX,
     ROUGHNESS_MIN,
+    SATURATED,
+    SSIM_SIGMA,
+    SSIM_STABILISERS,
+    SSIM_WINDOW,
     T_MIN,
+    UNKNOWN,
+    Lobes,
     Rendering,
 )
 from tumble.backends._brute import blockers, build, rotation, trace, unpack, visible
 
-__all__ = ["blockers", "build", "rasterize", "ready", "shade", "trace", "visible"]
+__all__ = [
+    "blockers",
+    "bounce",
+    "build",
+    "corner_features",
+    "gaussian_terms",
+    "image_terms",
+    "lookup",
+    "material_terms",
+    "rasterize",
+    "ready",
+    "sh_shade",
+    "shade",
+    "trace",
+    "visible",
+]
 
 TILE = 32
 """Side of the squares that are rendered at once [pixels]; limits memory and does not affect results."""
@@ -264,22 +290,22 @@ def harmonics(d: Float[Tensor, "*b 3"], k: int) -> Float[Tensor, "*b k"]:
 
 def shade(
     normal: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, " p"],
     view: Float[Tensor, "p 3"],
     directions: Float[Tensor, "d 3"],
     radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "p words"],
-    blocker: Int32[Tensor, "#p #d"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
     blocker_radiance: Float[Tensor, "m 3"],
-    f0: float,
-) -> Float[Tensor, "p 3"]:
+) -> Lobes:
     """See `Backend.shade`."""
     d = directions.shape[0]
-    arriving = torch.where(unpack(visibility, d)[..., None], radiance, 0)
+    visible = unpack(visibility, d)[rows]
+    arriving = torch.where(visible[..., None], radiance, 0)
     if blocker_radiance.shape[0]:
-        blocker = blocker.expand(len(normal), d)
-        is_blocked = ~unpack(visibility, d) & (blocker >= 0)
+        blocker = blocker.expand(len(visibility), d)[rows]
+        is_blocked = ~visible & (blocker >= 0)
         arriving = torch.where(is_blocked[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
     a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
     n_w = normal @ directions.T
@@ -290,8 +316,229 @@ def shade(
     H = view[:, None] + directions
     t = (torch.linalg.cross(normal[:, None], H).square().sum(-1) + a * a * (n_v + n_w) ** 2) / HH
     m = 1 - 0.5 * HH.sqrt()
-    fresnel = f0 * (1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303)))))
+    fresnel = 1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303))))
     g_v, g_w = (0.5 * (x + (a * a + (1 - a * a) * x * x).sqrt()) for x in (n_v.clamp(min=0), n_w.clamp(min=0)))
     specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
     lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]
-    return albedo / math.pi * lit.sum(1) + torch.einsum("pd,pdc->pc", specular, lit)
+    with torch.no_grad():
+        c = ((2 * n_v * normal - view) @ directions.T).clamp(min=0)
+        bb = a.clamp(min=math.sqrt(math.pi / d) / 2) ** 2
+        weight = torch.where(n_w > 0, c / (0.5 * (1 - c) + bb * 0.5 * (1 + c)) ** 2, 0)
+        fraction = (weight * visible).sum(-1) / weight.sum(-1).clamp(min=torch.finfo(weight.dtype).tiny)
+    return Lobes(lit.sum(1) / math.pi, torch.einsum("pd,pdc->pc", specular, lit), fraction)
+
+
+def lookup(
+    stack: Float[Tensor, "levels h w 3"],
+    directions: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+) -> Float[Tensor, "p 3"]:
+    """See `Backend.lookup`."""
+    levels, h, w, _ = stack.shape
+    x, y, z = directions.unbind(-1)
+    rho2 = x * x + z * z
+    # The gradient of atan2(0, 0) is infinite.
+    pole = rho2 == 0
+    rho = torch.where(pole, 0.0, torch.where(pole, 1.0, rho2).sqrt())
+    u = torch.atan2(torch.where(pole, 0.0, x), torch.where(pole, 1.0, -z)) / (2 * math.pi) + 0.5
+    column, row = u * w - 0.5, torch.atan2(rho, y) / math.pi * h - 0.5
+    level = roughness.clamp(0, 1) * (levels - 1)
+    left, top, low = (position.detach().floor() for position in (column, row, level))
+    values = torch.zeros_like(directions)
+    for k in range(8):
+        right, down, up = k & 1, k >> 1 & 1, k >> 2
+        at_level, at_row, at_column = (
+            (low + up).long().clamp(max=levels - 1),
+            (top + down).long(),
+            (left + right).long(),
+        )
+        # The neighbour across a pole is the same row, half a revolution away.
+        beyond = (at_row < 0) | (at_row >= h)
+        at_column = torch.where(beyond, at_column + w // 2, at_column) % w
+        x, y, z = column - left, row - top, level - low
+        weight = (x if right else 1 - x) * (y if down else 1 - y) * (z if up else 1 - z)
+        values = values + weight[:, None] * stack[at_level, at_row.clamp(0, h - 1), at_column]
+    return values
+
+
+def sh_shade(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    albedo_logits: Float[Tensor, "n 3"],
+    light: Float[Tensor, "2 16 3"],
+    specular_scale: Float[Tensor, ""],
+    occluded: Float[Tensor, "m 9"],
+    unoccluded: Float[Tensor, "m 9"],
+    directions: Float[Tensor, "d 3"],
+    reflectance: Float[Tensor, " k"],
+    R_env_obj: Float[Tensor, "3 3"],
+    position: Float[Tensor, "3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.sh_shade`."""
+
+    def at(lobe: int, d_obj: Tensor) -> Tensor:
+        return softplus(harmonics(d_obj @ R_env_obj.T, 16) @ light[lobe])
+
+    normals = rotation(quats)[:, :, 2]
+    normals = torch.lerp(normals.detach(), normals, NORMAL_GRADIENT)
+    view, albedo = normalize(position - means, dim=-1), torch.sigmoid(albedo_logits)
+    n_v = (normals * view).sum(-1, keepdim=True)
+    facing = n_v > 0
+    fresnel = sum(c * (1 - n_v.clamp(max=1)) ** k for k, c in enumerate(reflectance))
+    specular = specular_scale * fresnel * at(1, 2 * n_v * normals - view)
+    if not len(occluded):
+        return torch.where(facing, albedo * at(0, normals) + specular, 0)
+    with torch.no_grad():
+        radiance = at(1, directions)
+        coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
+        floor = IRRADIANCE_FLOOR * math.pi * radiance.mean(0)
+
+        shadowed, full = (_irradiance(x, coefficients, albedo) + floor for x in (occluded, unoccluded))
+        ratio = (shadowed / full.clamp(min=1e-12)).clamp(max=RATIO_MAX)
+    return torch.where(facing, albedo * ratio * at(0, normals) + specular, 0)
+
+
+def _irradiance(transfer: Tensor, coefficients: Tensor, albedo: Tensor) -> Tensor:
+    """H of `Backend.sh_shade`."""
+    visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
+    return (transfer @ coefficients).clamp(min=0) / (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
+
+
+def image_terms(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    depth_var: Float[Tensor, "h w"],
+    normal: Float[Tensor, "h w 3"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    ssim_weight: float,
+    crease: float,
+) -> Float[Tensor, "4"]:
+    """See `Backend.image_terms`."""
+    known, image = (mask != UNKNOWN).to(rgb), photo.to(rgb) / 255
+    power = 1.055 * rgb.clamp(min=KNEE) ** (1 / 2.4) - 0.055
+    srgb = torch.where(rgb <= KNEE, 12.92 * rgb.clamp(min=0), power)
+    srgb = torch.where((photo >= SATURATED) & (srgb > image), image, srgb)
+    x, y = srgb * known[..., None], image * known[..., None]
+    photometric = (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - similarity(x, y)).mean()
+    silhouette = ((alpha - (mask == OBJECT).to(rgb)) ** 2 * known).mean()
+    deviation = torch.where(alpha > 0, (depth_var.clamp(min=0) + 1e-6).sqrt() - 1e-3, 0).mean()
+    return torch.stack(
+        [photometric, silhouette, _normal_term(depth, alpha, normal, R_cam_obj, fx_fy_cx_cy, crease), deviation]
+    )
+
+
+def similarity(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 h-10 w-10"]:
+    """Structural similarity (Wang et al. 2004) at all windows within two images."""
+    offset = torch.arange(SSIM_WINDOW).to(x) - SSIM_WINDOW // 2
+    taps = torch.softmax(-0.5 * (offset / SSIM_SIGMA) ** 2, 0)
+
+    def mean(image: Tensor) -> Tensor:
+        return conv2d(image.movedim(-1, 0)[:, None], torch.outer(taps, taps)[None, None])[:, 0]
+
+    mean_x, mean_y, (c1, c2) = mean(x), mean(y), SSIM_STABILISERS
+    var_x, var_y, covariance = mean(x * x) - mean_x**2, mean(y * y) - mean_y**2, mean(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    return luminance * (2 * covariance + c2) / (var_x + var_y + c2)
+
+
+def _normal_term(
+    depth: Tensor, alpha: Tensor, normal: Tensor, R_cam_obj: Tensor, fx_fy_cx_cy: Tensor, crease: float
+) -> Float[Tensor, ""]:
+    """The third of `image_terms`. A surface z(x, y) (X, Y, 1) has the normal (p, q, -1 - p X - q Y), p = fx z_x / z."""
+    h, w = depth.shape
+    covered, center = alpha > 0.5, (slice(1, -1), slice(1, -1))
+    right, left, below, above = (1, 2), (1, 0), (2, 1), (0, 1)
+
+    def neighbour(image: Tensor, at: tuple[int, int]) -> Tensor:
+        return image[at[0] : h - 2 + at[0], at[1] : w - 2 + at[1]]
+
+    known = covered[center]
+    for at in (right, left, below, above):
+        known = known & neighbour(covered, at)
+    fx, fy, cx, cy = fx_fy_cx_cy
+    X, Y = (torch.arange(w).to(depth) + 0.5 - cx) / fx, (torch.arange(h).to(depth) + 0.5 - cy) / fy
+
+    def slope(focal: Tensor, after: tuple[int, int], before: tuple[int, int]) -> Tensor:
+        a, b = neighbour(depth, after), neighbour(depth, before)
+        return focal * (a - b) / torch.where(known, a + b, 1)
+
+    p, q = slope(fx, right, left), slope(fy, below, above)
+    from_depth = normalize(torch.stack([p, q, -1 - p * X[1:-1] - q * Y[1:-1, None]], -1), dim=-1) @ R_cam_obj
+    difference = 1 - (normalize(normal[center], dim=-1) * from_depth).sum(-1)
+    return (difference / (1 + crease * difference) * known).sum() / (h * w)
+
+
+def gaussian_terms(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+    sdf: Float[Tensor, " n"],
+    gamma: Float[Tensor, ""],
+    weight: Float[Tensor, " n"],
+    depth: Float[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    t_cam_obj: Float[Tensor, "3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    floor: float,
+    reach: float,
+) -> Float[Tensor, "3"]:
+    """See `Backend.gaussian_terms`."""
+    if not len(means):
+        return means.sum() + means.new_zeros(3)
+    log_fraction = (2 * log_scales).log_softmax(-1)
+    entropy = -(log_fraction.exp() * log_fraction).sum(-1)
+    needle = (-(entropy.exp() - 1).clamp(min=1e-4).log()).clamp(min=0)
+    sharpness = (1.762747 / sdf.detach().abs().median().clamp(min=floor) - gamma).clamp(min=0)
+    x_cam = (means - sdf[:, None] * rotation(quats)[:, :, 2]) @ R_cam_obj.T + t_cam_obj
+    z, visible = x_cam[:, 2], weight > 0
+    with torch.no_grad():
+        uv = x_cam[:, :2] / x_cam[:, 2:] * fx_fy_cx_cy[:2] + fx_fy_cx_cy[2:]
+        size = uv.new_tensor([depth.shape[1], depth.shape[0]])
+        surface = grid_sample(depth[None, None], (uv / size * 2 - 1)[None, None], align_corners=False)[0, 0, 0]
+        inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
+        surface = torch.where(inlier, surface, 0)  # NaN behind the camera would reach the gradients
+    difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)
+    return torch.stack([needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference])
+
+
+def corner_features(
+    albedo_logits: Float[Tensor, "n 4 3"],
+    roughness_logits: Float[Tensor, "n 4"],
+    normal_offset: Float[Tensor, "n 4 3"],
+    temperature: float,
+) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+    """See `Backend.corner_features`."""
+    albedo, roughness = (torch.sigmoid(x / temperature) for x in (albedo_logits, roughness_logits))
+    return torch.cat([albedo, roughness[..., None], normal_offset], -1), albedo.mean(1)
+
+
+def bounce(
+    albedo: Float[Tensor, "n 3"],
+    transfer: Float[Tensor, "n 9"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.bounce`."""
+    coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
+    return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
+
+
+def material_terms(
+    features: Float[Tensor, "h w c"],
+    alpha: Float[Tensor, "h w"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+) -> Float[Tensor, "2"]:
+    """See `Backend.material_terms`."""
+    error = (alpha - (mask == OBJECT).to(alpha)) * (mask != UNKNOWN)
+    x, y = features[..., :4] * ((mask == OBJECT) & (alpha > 0.5))[..., None], photo.to(alpha) / 255
+
+    def along(dim: int) -> Tensor:
+        weighted = x.diff(dim=dim).abs() * (-y.diff(dim=dim).abs()).exp().mean(-1, keepdim=True)
+        return weighted.sum() / max(1, weighted.numel())
+
+    return torch.stack([(error**2).mean(), along(1) + along(0)])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
@@ -26,8 +26,10 @@ from tumble.rendering import (
     Surface,
     Visibility,
     build_tracer,
+    corner_features,
     displacement,
     prefilter,
+    rasterize_material,
     render_gbuffer,
     shade_split,
     surface,
@@ -39,6 +41,7 @@ from tumble.rendering import (
 )
 from tumble.scene import (
     DIELECTRIC,
+    OBJECT,
     TEMPERATURE,
     Asset,
     Capture,
@@ -50,7 +53,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 14
+VERSION = 15
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -211,20 +214,19 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
     """
     params, capture, parts = state.params, inputs.capture, []
     roughnesses = sorted({cfg.roughness, *specular_fit.ROUGHNESSES})
+    bounce = _bounce(cfg, state, params, corner_features(params.material)[1])
     for frame in range(0, len(capture), -(-len(capture) // FIT_FRAMES)):
         T_cam_obj = pose(params, inputs, frame)
         view = render_gbuffer(params, T_cam_obj, capture.camera)
         truth = target_view(capture, frame, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
-        pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view, inner, state.rng)
+        pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view, inner > 0.5, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
         R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
-        lobes = [(view, white, 0.0)]
-        for roughness in roughnesses:
-            rough = {"roughness": torch.full_like(view.features["roughness"], roughness)}
-            lobes.append((replace(view, features=view.features | rough), 0 * white, DIELECTRIC))
-        diffuse, *specular = (_shade(cfg, state, params, v, points, R_env_obj, a, f0) for v, a, f0 in lobes)
-        parts.append((_dominant_gaussian(view, points), diffuse, torch.stack(specular), points.sample(truth.image)))
+        gaussian, rough = _dominant_gaussian(view, points), points.sample(view.features["roughness"])
+        lobes = [(white, rough, 0.0), *((0 * white, torch.full_like(rough, r), DIELECTRIC) for r in roughnesses)]
+        diffuse, *specular = (_shade(cfg, state, params, points, gaussian, R_env_obj, *x, bounce) for x in lobes)
+        parts.append((gaussian, diffuse, torch.stack(specular), points.sample(truth.image)))
     gaussian, diffuse, specular, photo = zip(*parts, strict=True)
     samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photo)))
     scale, initial, n = params.log_specular_scale.exp(), roughnesses.index(cfg.roughness), len(params.gaussians.means)
@@ -319,19 +321,28 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         params = replace(params, gaussians=tree.detach(params.gaussians), poses=params.poses.detach())
     frame = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, frame)
-    view = render_gbuffer(params if cfg.corners else without_corners(params), T_cam_obj, capture.camera)
-    truth = target_view(capture, frame, view.alpha)
-    points = surface(view, T_cam_obj, capture.camera, pixels=_sample_pixels(cfg.pixels, view, truth.mask, state.rng))
+    corners, mean_albedo = corner_features((params if cfg.corners else without_corners(params)).material)
+    view = rasterize_material(params, corners, T_cam_obj, capture.camera)
+    photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
+    points = surface(
+        view, T_cam_obj, capture.camera, pixels=_sample_pixels(cfg.pixels, view, mask == OBJECT, state.rng)
+    )
     R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_specular_scale.exp()
-    shaded = _shade(cfg, state, params, view, points, R_env_obj, points.sample(view.features["albedo"]), f0)
-    rendered, photo = (shaded * points.sample(view.alpha[..., None]))[None], points.sample(truth.image)[None]
-    difference = (losses.srgb_as_captured(rendered, photo) - photo).abs().sum()
+    albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
+    gaussian, bounce = _dominant_gaussian(view, points), _bounce(cfg, state, params, mean_albedo)
+    shaded = _shade(cfg, state, params, points, gaussian, R_env_obj, albedo, rough, f0, bounce)
+    rendered, wanted = (
+        (shaded * points.sample(view.alpha[..., None]))[None],
+        points.sample(photo)[None].to(albedo) / 255,
+    )
+    difference = (losses.srgb_as_captured(rendered, wanted) - wanted).abs().sum()
+    of_view = losses.material_terms(view, photo, mask)
     terms = {
         # A frame may have no pixel that certainly shows the object.
         "render": difference / (3 * max(1, len(points.pixels))),
         "light": cfg.weights.light * losses.light_smoothness(params.environment.radiance),
-        "mask": cfg.weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
-        "material": cfg.weights.material * losses.material_smoothness(view, truth.mask, truth.image),
+        "mask": cfg.weights.mask * of_view["mask"],
+        "material": cfg.weights.material * of_view["material"],
         "specular": state.memory["specular_penalty"]
         * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
     }
@@ -342,9 +353,9 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     return {name: value.detach() for name, value in terms.items()}
 
 
-def _sample_pixels(n: int, view: Buffers, mask: Tensor, rng: torch.Generator) -> Tensor:
+def _sample_pixels(n: int, view: Buffers, mask: Bool[Tensor, "h w"], rng: torch.Generator) -> Tensor:
     """`n` random pixels that certainly show the object, counted row by row; none if there are no such pixels."""
-    solid = torch.where(((view.alpha > 0.5) & (mask > 0.5)).flatten())[0]
+    solid = torch.where(((view.alpha > 0.5) & mask).flatten())[0]
     if not len(solid):
         return solid
     return solid[torch.randint(len(solid), (n,), generator=rng).to(solid.device)]
@@ -354,23 +365,18 @@ def _shade(
     cfg: Config,
     state: State,
     params: Params,
-    view: Buffers,
     points: Surface,
+    gaussian: Int64[Tensor, " p"],
     R_env_obj: Tensor,
     albedo: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, "p 1"],
     f0: float | Tensor,
+    bounce: Bounce | AveragedBounce | None,
 ) -> Float[Tensor, "p 3"]:
-    """Reflected radiance of surface points under the current light, with cached visibility."""
-    return shade_split(
-        points,
-        albedo,
-        points.sample(view.features["roughness"]),
-        prefilter(params.environment),
-        R_env_obj,
-        _pixel_visibility(cfg, state, _dominant_gaussian(view, points)),
-        f0=f0,
-        bounce=_bounce(cfg, state, params),
-    )
+    """Reflected radiance of surface points under the current light, with the cached visibility of their Gaussians."""
+    visible = _pixel_visibility(cfg, state, gaussian)
+    light = prefilter(params.environment)
+    return shade_split(points, albedo, roughness, light, R_env_obj, visible, f0=f0, bounce=bounce)
 
 
 def _dominant_gaussian(view: Buffers, points: Surface) -> Tensor:
@@ -378,13 +384,13 @@ def _dominant_gaussian(view: Buffers, points: Surface) -> Tensor:
     return view.dominant.flatten()[points.pixels].clamp_min(0).long()
 
 
-def _bounce(cfg: Config, state: State, params: Params) -> Bounce | AveragedBounce | None:
-    """Indirect light as chosen by the settings, None for none."""
+def _bounce(cfg: Config, state: State, params: Params, albedo: Float[Tensor, "n 3"]) -> Bounce | AveragedBounce | None:
+    """Indirect light as chosen by the settings, None for none; `albedo` is the mean of each Gaussian's corners."""
     if cfg.bounce == "none" or not cfg.visibility:
         return None
     if cfg.bounce == "average":
         return AveragedBounce(params.gaussians.sh[:, 0] / math.sqrt(4 * math.pi))
-    return Bounce(params.material.albedo.mean(1), state.memory["transfer"])
+    return Bounce(albedo, state.memory["transfer"])
 
 
 def _pixel_visibility(cfg: Config, state: State, index: Tensor) -> Visibility:

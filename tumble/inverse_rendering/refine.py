@@ -11,14 +11,13 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from tumble.engine import State, optim
 from tumble.inverse_rendering import densify, losses, sh_lighting
 from tumble.inverse_rendering.photometric_alignment import align_pose
 from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
 from tumble.inverse_rendering.sh_lighting import SHLight
-from tumble.maths import SE3, channels_first, crop, crop_box
+from tumble.maths import SE3
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
     Camera,
@@ -35,11 +34,9 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 9
+VERSION = 10
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
-NORMAL_GRADIENT = 0.3
-"""Factor of the gradient from shading to the normals: the low-order light causes errors in the full gradient."""
 COVERAGE_WEIGHT = 0.3
 """Weight of coverage residuals relative to colour residuals in photometric alignment."""
 
@@ -255,12 +252,8 @@ def render(
     gaussians = points.gaussians
     if gaussians.sh.shape[1] == 1:
         R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
-        view = normalize(T_cam_obj.inverse().xyz - gaussians.means, dim=-1)
-        albedo = torch.sigmoid(points.albedo_logits)
-        if visibility is not None:
-            albedo = albedo * visibility.irradiance_ratio(light, albedo, R_env_obj)
-        normals = torch.lerp(gaussians.normals.detach(), gaussians.normals, NORMAL_GRADIENT)
-        colour = sh_lighting.radiance(light, albedo, normals, view, R_env_obj)
+        lit = (visibility, R_env_obj, -(T_cam_obj.translation @ T_cam_obj.rotation.matrix()))
+        colour = sh_lighting.radiance(light, gaussians, points.albedo_logits, *lit)
         gaussians = replace(gaussians, sh=constant_sh(colour))
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
 
@@ -282,7 +275,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
     view = render(*arguments, visibility=cached_visibility(state))
     state.memory["max_weight"] = torch.maximum(state.memory["max_weight"], view.weight.detach())
-    terms = _terms(cfg, params, view, target_view(inputs.capture, frame, view.alpha), camera, T_cam_obj, progress)
+    terms = _terms(cfg, params, view, inputs.capture, frame, T_cam_obj, progress)
     optim.anneal(state.optimizer, _rate_factors(cfg, progress))
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()} | {
@@ -321,47 +314,25 @@ def _rate_factors(cfg: Config, progress: float) -> dict[str, float]:
 
 
 def _terms(
-    cfg: Config, params: Params, view: Buffers, truth: TargetView, camera: Camera, T_cam_obj: SE3, progress: float
+    cfg: Config, params: Params, view: Buffers, capture: Capture, frame: int, T_cam_obj: SE3, progress: float
 ) -> dict[str, Tensor]:
-    """Weighted loss terms (eq. 11) of one view, at a progress of 0 to 1."""
-    weights, gaussians = cfg.weights, params.points.gaussians
+    """Weighted loss terms (eq. 11) of the view of a frame, at a progress of 0 to 1."""
+    weights, camera = cfg.weights, capture.camera
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
-    full, size, visible, depth = camera, (camera.height, camera.width), view.weight > 0, view.depth
-    view, truth, camera, fraction = _crop_to_object(view, truth, camera)
-    image = losses.srgb_as_captured(view.rgb, truth.image)
-    from_depth, known = losses.surface_normals(view.depth, view.alpha > 0.5, camera, T_cam_obj)
-    normal = losses.normal_consistency(view.normal, from_depth, known, crease=cfg.crease)
-    return {
-        "render": losses.photometric(image, truth.image, truth.valid, ssim_weight=cfg.ssim, size=size),
-        "mask": fraction * weights.mask * losses.silhouette(view.alpha, truth.mask, truth.valid),
-        "normal": fraction * ramp * weights.normal * normal,
-        "variance": fraction * ramp * weights.variance * losses.variance(view.depth_var),
-        "rank": weights.rank * losses.effective_rank(gaussians.log_scales),
-        "gamma": weights.gamma * losses.sharpness(gaussians.sdf, params.gamma, floor=cfg.gamma_floor) * 1e-2,
-        "proj": weights.proj * losses.projection(gaussians, visible, depth, full, T_cam_obj, reach=0.1),
-        "specular": weights.specular * -torch.expm1(-params.light.log_specular_scale.square()),
+    photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
+    terms = losses.image_terms(view, photo, mask, camera, T_cam_obj, ssim_weight=cfg.ssim, crease=cfg.crease)
+    own = (params.points.gaussians, params.gamma, view, camera, T_cam_obj)
+    terms |= losses.gaussian_terms(*own, floor=cfg.gamma_floor, reach=0.1)
+    factors = {
+        "mask": weights.mask,
+        "normal": ramp * weights.normal,
+        "variance": ramp * weights.variance,
+        "rank": weights.rank,
+        "gamma": weights.gamma * 1e-2,
+        "proj": weights.proj,
     }
-
-
-def _crop_to_object(view: Buffers, truth: TargetView, camera: Camera) -> tuple[Buffers, TargetView, Camera, float]:
-    """View, target and camera cropped to the object, and the window's fraction of the image area.
-
-    Rendered and input image are black outside of the window, so a mean over the image is the mean over the window times
-    the fraction. The crop saves computing time.
-    """
-    content = (view.alpha.detach() > 0) | (truth.image > 0).any(-1) | (truth.mask > 0)
-    if not content.any():
-        return view, truth, camera, 1.0
-    box = crop_box(content, losses.SSIM_MARGIN)
-    cropped_view = replace(
-        view,
-        **{name: crop(getattr(view, name), box) for name in ("alpha", "depth", "depth_var", "normal", "dominant")},
-        rgb=channels_first(crop(view.rgb, box)).movedim(0, -1),
-    )
-    cropped_truth = TargetView(
-        channels_first(crop(truth.image, box)).movedim(0, -1), crop(truth.mask, box), crop(truth.valid, box)
-    )
-    return cropped_view, cropped_truth, camera.cropped(*box), box[2] * box[3] / content.numel()
+    weighted = {name: factors.get(name, 1.0) * term for name, term in terms.items()}
+    return weighted | {"specular": weights.specular * -torch.expm1(-params.light.log_specular_scale.square())}
 
 
 @torch.no_grad()

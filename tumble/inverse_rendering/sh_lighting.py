@@ -12,17 +12,18 @@ lobes share one light, because separate lights would leave the colour of each li
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from tumble.maths import spherical_harmonics, texel_directions
-from tumble.scene import DIELECTRIC, Environment
+from tumble import backends
+from tumble.inverse_rendering.self_shadowing import DIRECTIONS, VisibilityTransfer
+from tumble.maths import fibonacci_sphere, spherical_harmonics, texel_directions
+from tumble.scene import DIELECTRIC, Environment, Gaussians
 
 GLOSSY_FALLOFF = 0.08
 """Width of the glossy lobe: harmonics of degree l are scaled by exp(-GLOSSY_FALLOFF l (l + 1)), as by a lobe of
@@ -51,92 +52,64 @@ class SHLight:
 
     def diffuse(self, n_env: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Irradiance / pi of surfaces with unit normals `n_env`, env frame."""
-        return softplus(spherical_harmonics.basis(n_env, 3) @ (self.coefficients * _lobes(self.coefficients)[0]))
+        return softplus(
+            spherical_harmonics.basis(n_env, 3)
+            @ (self.coefficients * _lobes(self.coefficients.dtype, self.coefficients.device)[0])
+        )
 
     def glossy(self, d_env: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Radiance convolved with the glossy lobe around unit directions `d_env`, env frame."""
-        return softplus(spherical_harmonics.basis(d_env, 3) @ (self.coefficients * _lobes(self.coefficients)[1]))
+        return softplus(
+            spherical_harmonics.basis(d_env, 3)
+            @ (self.coefficients * _lobes(self.coefficients.dtype, self.coefficients.device)[1])
+        )
 
 
 def radiance(
     light: SHLight,
-    albedo: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    view: Float[Tensor, "n 3"],
+    points: Gaussians,
+    albedo_logits: Float[Tensor, "n 3"],
+    visibility: VisibilityTransfer | None,
     R_env_obj: Float[Tensor, "3 3"],
+    position: Float[Tensor, "3"],
 ) -> Float[Tensor, "n 3"]:
-    """Linear radiance of surface points towards the camera; differentiable in all arguments.
+    """Linear radiance of Gaussians towards the camera (exact in `Backend.sh_shade`).
+
+    The gradient from shading to the normals is reduced, and the ratio of shadowed to unshadowed irradiance counts as a
+    constant, so that the dependence on the normal remains in E.
 
     Args:
         light: Light and specular scale.
-        albedo: Linear diffuse albedo.
-        normals: Outward unit normals, object frame.
-        view: Unit directions from the points to the camera, object frame.
+        points: Gaussians, of which centres and rotations are used.
+        albedo_logits: Linear diffuse albedo before the sigmoid.
+        visibility: For self-shadowing; no self-shadowing when None.
         R_env_obj: Rotation from the object frame to the env frame.
+        position: Camera centre, object frame.
     """
-    return _Radiance.apply(light.coefficients, light.log_specular_scale, albedo, normals, view, R_env_obj)
+    means, (cosine, gloss) = points.means, _lobes(light.coefficients.dtype, light.coefficients.device)
+    both = torch.stack([light.coefficients * cosine, light.coefficients * gloss])
+    directions, reflectance = _constants(means.dtype, means.device)
+    none = means.new_zeros(0, 9)
+    occluded, unoccluded = (none, none) if visibility is None else (visibility.occluded, visibility.unoccluded)
+    own = (means, points.quats, albedo_logits, both, light.log_specular_scale.exp())
+    rest = (occluded, unoccluded, directions, reflectance, R_env_obj, position)
+    return backends.choose(means.device, means.dtype).sh_shade(*own, *rest)
 
 
-class _Radiance(torch.autograd.Function):
-    """`radiance` with an explicit backward pass, which takes a third of the time of automatic differentiation.
-
-    Tensors are transposed to `[3 n]` inside, since sums over many short rows are slow.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, *args: Tensor) -> Tensor:
-        coefficients, log_specular_scale, R_env_obj = args[0], args[1], args[5]
-        albedo, normals, view = (x.mT.contiguous() for x in args[2:5])
-        n_v = (normals * view).sum(0)
-        reflectance = DIELECTRIC * _polynomial(SPLIT_SUM_POLYNOMIAL, 1 - n_v.clamp(0, 1))
-        mirrored = 2 * n_v * normals - view
-        lobes, scale = _lobes(coefficients), log_specular_scale.exp()
-        diffuse, at_normals = spherical_harmonics.sum_series(coefficients * lobes[0], R_env_obj @ normals)
-        glossy, at_mirrored = spherical_harmonics.sum_series(coefficients * lobes[1], R_env_obj @ mirrored)
-        diffuse, glossy = softplus(diffuse), softplus(glossy)
-        saved = (coefficients, scale, R_env_obj, albedo, normals, view, mirrored, n_v, reflectance)
-        ctx.save_for_backward(*saved, diffuse, at_normals, glossy, at_mirrored)
-        return (albedo * diffuse + scale * reflectance * glossy).mT
-
-    @staticmethod
-    def backward(ctx: Any, v: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
-        coefficients, scale, R, albedo, normals, view, mirrored, n_v, reflectance, *lights = ctx.saved_tensors
-        diffuse, at_normals, glossy, at_mirrored = lights
-        lobes, v = _lobes(coefficients), v.mT.contiguous()
-        v_lobe = v * scale
-        # The derivative of y = softplus(x) is 1 - exp(-y).
-        v_diffuse, v_glossy = -v * albedo * torch.expm1(-diffuse), -v_lobe * reflectance * torch.expm1(-glossy)
-        v_first, v_n_env = spherical_harmonics.series_adjoint(coefficients * lobes[0], at_normals, v_diffuse)
-        v_second, v_mirrored_env = spherical_harmonics.series_adjoint(coefficients * lobes[1], at_mirrored, v_glossy)
-        v_mirrored = R.mT @ v_mirrored_env
-        v_reflectance = torch.where((n_v >= 0) & (n_v <= 1), (v_lobe * glossy).sum(0), 0.0)
-        slope = _polynomial([k * c for k, c in enumerate(SPLIT_SUM_POLYNOMIAL)][1:], 1 - n_v.clamp(0, 1))
-        v_n_v = 2 * (v_mirrored * normals).sum(0) - DIELECTRIC * slope * v_reflectance
-        v_normals = R.mT @ v_n_env + 2 * n_v * v_mirrored + v_n_v * view
-        return (
-            v_first * lobes[0] + v_second * lobes[1],
-            (v_lobe * glossy * reflectance).sum(),
-            (v * diffuse).mT,
-            v_normals.mT,
-            (v_n_v * normals - v_mirrored).mT,
-            v_n_env @ normals.mT + v_mirrored_env @ mirrored.mT,
-        )
+@cache
+def _constants(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "D 3"], Float[Tensor, " k"]]:
+    """Directions over which the light is integrated, and the reflectance as a polynomial in 1 - n.v."""
+    reflectance = DIELECTRIC * torch.tensor(SPLIT_SUM_POLYNOMIAL, dtype=torch.float64)
+    return fibonacci_sphere(DIRECTIONS).to(device, dtype), reflectance.to(device, dtype)
 
 
-def _polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
-    """Sum of c_k x^k by Horner's scheme."""
-    total = torch.full_like(x, coefficients[-1])
-    for c in coefficients[-2::-1]:
-        total = total * x + c
-    return total
-
-
-def _lobes(like: Tensor) -> Float[Tensor, "2 16 1"]:
+@cache
+def _lobes(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 16 1"]:
     """Factors per coefficient of a convolution with the clamped cosine over pi, and with the glossy lobe."""
     degrees = [l for l in range(4) for _ in range(2 * l + 1)]  # noqa: E741
     cosine = [spherical_harmonics.COSINE_LOBE[l] / math.pi for l in degrees]  # noqa: E741
     gloss = [math.exp(-GLOSSY_FALLOFF * l * (l + 1)) for l in degrees]  # noqa: E741
-    return like.new_tensor([cosine, gloss])[..., None]
+    return torch.tensor([cosine, gloss], dtype=dtype, device=device)[..., None]
 
 
 def environment(light: SHLight, height: int) -> Environment:

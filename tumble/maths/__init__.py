@@ -17,16 +17,13 @@ from tumble.maths.directions import (
 )
 from tumble.maths.images import (
     Box,
-    channels_first,
     crop,
     crop_box,
-    edge_aware,
     iou,
     linear_from_srgb,
     resize_area,
     srgb_from_linear,
     ssim,
-    ssim_map,
     to_srgb8,
 )
 from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, select_rows
@@ -44,7 +41,6 @@ __all__ = [
     "crop",
     "crop_box",
     "direction_from_equirect",
-    "edge_aware",
     "equirect_from_direction",
     "fibonacci_sphere",
     "interpolate",
@@ -55,7 +51,6 @@ __all__ = [
     "minimise",
     "nearest",
     "to_srgb8",
-    "channels_first",
     "random_rotation",
     "reflect",
     "resize_area",
@@ -64,7 +59,6 @@ __all__ = [
     "spherical_harmonics",
     "srgb_from_linear",
     "ssim",
-    "ssim_map",
     "texel_directions",
     "texel_solid_angles",
     "umeyama",

@@ -120,6 +120,8 @@ class SO3:
         """`R_a_b @ R_b_c = R_a_c`; `R_a_b @ x_b = x_a` for points `[*b 3]`."""
         if isinstance(other, SO3):
             return SO3(_quaternion_product(self.wxyz, other.wxyz))
+        if self.wxyz.ndim == 1:  # the usual case, without the overhead of einsum
+            return other @ self.matrix().mT
         return torch.einsum("...ij,...j->...i", self.matrix(), other)
 
     def __getitem__(self, index: Any) -> "SO3":

@@ -1,18 +1,17 @@
 """Rendering of Gaussians: rasterizer, ray tracer, BRDF, deferred shading and relighting.
 
-The only room that calls `backends`. It contains no losses and no training.
+It calls the rendering kernels of `backends`, and contains no losses and no training.
 """
 
 from tumble.backends import threads_for_kernels, usable_device
 from tumble.rendering import relight
-from tumble.rendering.gbuffer import antialiased_gbuffer, render_gbuffer
+from tumble.rendering.gbuffer import antialiased_gbuffer, corner_features, rasterize_material, render_gbuffer
 from tumble.rendering.prefiltered_light import Prefiltered, prefilter
 from tumble.rendering.rasterizer import Buffers, rasterize
 from tumble.rendering.shading import (
     AveragedBounce,
     Bounce,
     Surface,
-    self_shadowed_irradiance,
     shade,
     shade_split,
     surface,
@@ -38,12 +37,13 @@ __all__ = [
     "Visibility",
     "antialiased_gbuffer",
     "build_tracer",
+    "corner_features",
     "displacement",
     "prefilter",
     "rasterize",
+    "rasterize_material",
     "relight",
     "render_gbuffer",
-    "self_shadowed_irradiance",
     "shade",
     "shade_split",
     "surface",

@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tumble import backends
 from tumble.maths import SE3
 from tumble.rendering.rasterizer import Buffers, rasterize
-from tumble.scene import Camera, Gaussians, Material
+from tumble.scene import TEMPERATURE, Camera, Gaussians, Material
 
 SAMPLE_OFFSET = 1 / 6
 """Offset of a pixel's four samples from its centre along each axis [pixels].
@@ -33,16 +34,24 @@ class HasMaterial(Protocol):
     def material(self) -> Material: ...
 
 
+def corner_features(material: Material) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+    """Albedo, roughness and normal offset of all corners for `rasterize_material`, and the Gaussians' mean albedo."""
+    backend = backends.choose(material.albedo_logits.device, material.albedo_logits.dtype)
+    logits = (material.albedo_logits, material.roughness_logits)
+    return backend.corner_features(*logits, material.normal_offset, TEMPERATURE)
+
+
+def rasterize_material(asset: HasMaterial, corners: Float[Tensor, "n 4 7"], T_cam_obj: SE3, camera: Camera) -> Buffers:
+    """View with the feature "material": albedo, roughness and normal offset; normals include the offset."""
+    view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, {"material": corners})
+    return replace(view, normal=view.normal + view.features["material"][..., 4:])
+
+
 def render_gbuffer(asset: HasMaterial, T_cam_obj: SE3, camera: Camera) -> Buffers:
     """G-buffer of one view with one sample at each pixel's centre; normals include the material's normal offset."""
-    material = asset.material
-    features = {
-        "albedo": material.albedo,
-        "roughness": material.roughness[..., None],
-        "offset": material.normal_offset,
-    }
-    view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, features)
-    return replace(view, normal=view.normal + view.features["offset"])
+    view = rasterize_material(asset, corner_features(asset.material)[0], T_cam_obj, camera)
+    images = view.features["material"].split([3, 1, 3], -1)
+    return replace(view, features=dict(zip(("albedo", "roughness", "offset"), images, strict=True)))
 
 
 @torch.no_grad()

@@ -61,7 +61,9 @@ def rasterize(
         mask: Pixels that count in `Buffers.touched`, where > 0.5; all when None.
     """
     means = gaussians.means
-    corners = torch.cat([*features.values(), means.new_zeros(len(gaussians), 4, 0)], -1)
+    corners = [*features.values()] or [means.new_zeros(len(gaussians), 4, 0)]
+    # A single feature is not copied.
+    corners = corners[0] if len(corners) == 1 else torch.cat(corners, -1)
     view = backends.choose(means.device, means.dtype).rasterize(
         means,
         gaussians.quats,

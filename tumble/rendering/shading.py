@@ -10,19 +10,18 @@ wide specular lobes, and takes narrow specular lobes (`NARROW_ROUGHNESS`) from a
 images use `importance_sampling.relight_surface` instead.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cache
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int32, Int64, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble import backends
-from tumble.maths import SE3, reflect, spherical_harmonics
+from tumble.maths import SE3, reflect
 from tumble.rendering import brdf
-from tumble.rendering.prefiltered_light import Prefiltered
+from tumble.rendering.prefiltered_light import Prefiltered, cell_roughness
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.trace import Visibility
 from tumble.scene import Camera, Environment
@@ -45,7 +44,7 @@ class Surface:
     views: Float[Tensor, "p 3"]
     """Unit directions to the camera."""
 
-    def sample(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "p c"]:
+    def sample(self, image: Shaped[Tensor, "h w c"]) -> Shaped[Tensor, "p c"]:
         """Values of an image of the same view at the points."""
         return image.flatten(0, 1)[self.pixels]
 
@@ -77,10 +76,10 @@ def surface(
     column, row = pixels % camera.width, pixels // camera.width
     uv = torch.stack([column, row], -1).to(buffers.depth) + 0.5
     ray_cam = camera.unproject(uv, torch.ones_like(uv[:, 0])).to(buffers.depth)
-    T_obj_cam = T_cam_obj.inverse()
-    points = T_obj_cam @ (buffers.depth.flatten()[pixels][:, None] * ray_cam)
+    R_cam_obj = T_cam_obj.rotation.matrix()
+    points = (buffers.depth.flatten()[pixels][:, None] * ray_cam - T_cam_obj.translation) @ R_cam_obj
     normals = normalize(buffers.normal.flatten(0, 1)[pixels], dim=-1)
-    return Surface(pixels, points, normals, normalize(T_obj_cam.rotation @ -ray_cam, dim=-1))
+    return Surface(pixels, points, normals, normalize(-ray_cam @ R_cam_obj, dim=-1))
 
 
 @dataclass(frozen=True)
@@ -96,24 +95,11 @@ class Bounce:
         """Radiance of every Gaussian under a light given in evenly distributed directions.
 
         The light is projected onto harmonics up to degree 2, which is accurate to 1 % of the irradiance for most lights
-        (Ramamoorthi and Hanrahan 2001). Shadows and all bounces are included, see `self_shadowed_irradiance`.
+        (Ramamoorthi and Hanrahan 2001). Shadows and all bounces are included: the occluding surface is assumed to be as
+        bright as the occluded point, which makes the bounces a geometric series (Jimenez et al. 2016).
         """
-        coefficients = 4 * math.pi / len(directions) * (spherical_harmonics.basis(directions, 2).mT @ light)
-        return self.albedo / math.pi * self_shadowed_irradiance(self.transfer, coefficients, self.albedo)
-
-
-def self_shadowed_irradiance(
-    transfer: Float[Tensor, "n 9"], coefficients: Float[Tensor, "9 3"], albedo: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """Shadowed irradiance of surfaces, with all bounces, under light in harmonics up to degree 2.
-
-    The occluding surface is assumed to be as bright as the occluded point, which makes the bounces a geometric series
-    (Jimenez et al. 2016).
-    """
-    # Under a single small light the truncated series is negative on the opposite side.
-    irradiance = (transfer @ coefficients).clamp(min=0)
-    visible_fraction = (transfer[:, :1] * math.sqrt(4 / math.pi)).clamp(0, 1)
-    return irradiance / (1 - albedo * (1 - visible_fraction)).clamp(min=1e-3)
+        backend = backends.choose(self.albedo.device, self.albedo.dtype)
+        return backend.bounce(self.albedo, self.transfer, directions, light)
 
 
 @dataclass(frozen=True)
@@ -154,7 +140,8 @@ def shade(
         bounce: Indirect light, used if the visibility has blockers; occluded directions are black when None.
     """
     light = environment.lookup(visibility.directions @ R_env_obj.mT)
-    return _sum(surface.normals, albedo, roughness, surface.views, visibility, light, bounce, f0)
+    lobes = _lobes(surface, roughness, visibility, light, bounce)
+    return albedo * lobes.diffuse + f0 * lobes.specular
 
 
 def diffuse(
@@ -168,7 +155,7 @@ def diffuse(
 ) -> Float[Tensor, "p 3"]:
     """The diffuse lobe of `shade`."""
     light = environment.lookup(visibility.directions @ R_env_obj.mT)
-    return _diffuse(surface, albedo, visibility, light, bounce)
+    return albedo * _lobes(surface, torch.ones_like(albedo[:, :1]), visibility, light, bounce).diffuse
 
 
 def shade_split(
@@ -184,18 +171,22 @@ def shade_split(
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance with wide lobes summed over the directions, and narrow specular lobes by the split sum.
 
-    The split sum is multiplied by the visible fraction of the specular lobe. It is not used for wide lobes
-    (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the lobe
-    (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
+    The split sum is multiplied by the visible fraction of the specular lobe (`Backend.shade`). It is not used for wide
+    lobes (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the
+    lobe (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
     """
-    light = prefiltered.cell_radiance(visibility.directions @ R_env_obj.mT)
-    narrow = specular(surface.normals, surface.views, roughness, prefiltered, R_env_obj, f0)
-    narrow = lobe_visibility(surface, roughness, visibility) * narrow
-    black = torch.zeros_like(albedo)
-    # The lobe is linear in f0, and the kernel does not differentiate f0, which may be learnt.
-    wide = f0 * _sum(surface.normals, black, roughness, surface.views, visibility, light, bounce, 1.0)
+    # One lookup for both kinds of directions, since its gradient is an image of the size of all levels.
+    mirrored = reflect(surface.views, surface.normals)
+    in_env = torch.cat([visibility.directions, mirrored]) @ R_env_obj.mT
+    cell = torch.full_like(visibility.directions[:, :1], cell_roughness(len(visibility.directions)))
+    radiance = prefiltered.lookup(in_env, torch.cat([cell, roughness]))
+    light, of_mirrored = radiance.split([len(cell), len(mirrored)])
+    lobes = _lobes(surface, roughness, visibility, light, bounce)
+    narrow = of_mirrored * (
+        lobes.specular_visibility[:, None] * _reflectance(surface.normals, surface.views, roughness)
+    )
     wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
-    return _diffuse(surface, albedo, visibility, light, bounce) + torch.lerp(narrow, wide, wideness)
+    return albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wideness)
 
 
 def specular(
@@ -216,26 +207,16 @@ def specular(
         R_env_obj: Rotation from the object frame to the env frame.
         f0: Reflectance at normal incidence.
     """
+    reflected = prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness)
+    return f0 * reflected * _reflectance(normals, views, roughness)
+
+
+def _reflectance(
+    normals: Float[Tensor, "p 3"], views: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]
+) -> Float[Tensor, "p 1"]:
+    """Directional albedo of the specular lobe divided by f0."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
-    reflectance = f0 * brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
-    return prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness) * reflectance
-
-
-@torch.no_grad()
-def lobe_visibility(surface: Surface, roughness: Float[Tensor, "p 1"], visibility: Visibility) -> Float[Tensor, "p 1"]:
-    """Visible fraction of the specular lobe above the horizon; not differentiable.
-
-    Directions are weighted by the lobe of `prefilter`, widened to at least the distance between neighbouring
-    directions.
-    """
-    cosine = reflect(surface.views, surface.normals) @ visibility.directions.T
-    # GGX falls to a quarter at a distance of 2 a from its peak; neighbouring directions are sqrt(4 pi / D) apart.
-    a = roughness.square().clamp(min=math.sqrt(math.pi / len(visibility.directions)) / 2)
-    t = 0.5 * (1 - cosine) + a * a * 0.5 * (1 + cosine)
-    above = surface.normals @ visibility.directions.T > 0
-    weight = torch.where(above, cosine.clamp(min=0), 0.0) / t.square()
-    total = weight.sum(-1, keepdim=True)
-    return (weight * visibility.unpacked()).sum(-1, keepdim=True) / total.clamp(min=torch.finfo(total.dtype).tiny)
+    return brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
 
 
 @cache
@@ -244,39 +225,24 @@ def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size
     return brdf.split_sum_table().to(device, dtype)
 
 
-def _diffuse(
+def _lobes(
     surface: Surface,
-    albedo: Float[Tensor, "p 3"],
-    visibility: Visibility,
-    light: Float[Tensor, "D 3"],
-    bounce: Bounce | AveragedBounce | None,
-) -> Float[Tensor, "p 3"]:
-    """The diffuse lobe summed over the directions."""
-    # For a camera behind the surface the kernel's specular lobe is 0.
-    behind, unused = -surface.normals.detach(), torch.ones_like(albedo[:, :1])
-    return _sum(surface.normals, albedo, unused, behind, visibility, light, bounce, 0.0)
-
-
-def _sum(
-    normals: Float[Tensor, "p 3"],
-    albedo: Float[Tensor, "p 3"],
     roughness: Float[Tensor, "p 1"],
-    views: Float[Tensor, "p 3"],
     visibility: Visibility,
     light: Float[Tensor, "D 3"],
     bounce: Bounce | AveragedBounce | None,
-    f0: float,
-) -> Float[Tensor, "p 3"]:
-    """Sum of both lobes over the directions, by the backend's kernel."""
+) -> backends.Lobes:
+    """Sums of both lobes over the directions, by the backend's kernel."""
     blocker, indirect = _blocker_radiance(visibility, light, bounce)
-    backend = backends.choose(normals.device, normals.dtype)
-    directions, bits = visibility.directions, visibility.bits
-    return backend.shade(normals, albedo, roughness[:, 0], views, directions, light, bits, blocker, indirect, f0)
+    backend = backends.choose(light.device, light.dtype)
+    point = (surface.normals, roughness[:, 0], surface.views)
+    seen = (visibility.bits, blocker, visibility.rows())
+    return backend.shade(*point, visibility.directions, light, *seen, indirect)
 
 
 def _blocker_radiance(
     visibility: Visibility, light: Float[Tensor, "D 3"], bounce: Bounce | AveragedBounce | None
-) -> tuple[Int32[Tensor, "#p #D"], Float[Tensor, "n 3"]]:
+) -> tuple[Int32[Tensor, "#q #D"], Float[Tensor, "n 3"]]:
     """Index of the Gaussian that occludes each direction, -1 for none, and the radiance of every Gaussian."""
     if bounce is None or visibility.blocker is None:
         return torch.full((1, 1), -1, dtype=torch.int32, device=light.device), light.new_zeros(0, 3)

@@ -10,7 +10,7 @@ centres are below the surface, where the Gaussians above would occlude them.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -105,19 +105,26 @@ class Visibility:
 
     directions: Float[Tensor, "D 3"]
     """Unit directions shared by all points, object frame; each represents a solid angle of 4 pi / D [steradian]."""
-    bits: Int32[Tensor, "p words"]
+    bits: Int32[Tensor, "q words"]
     """Bit j % 32 of word j // 32 is set if direction j is above the point's horizon and not occluded."""
-    blocker: Int32[Tensor, "p D"] | None
+    blocker: Int32[Tensor, "q D"] | None
     """Index of the Gaussian that occludes each direction above the horizon, -1 for all other directions."""
+    index: Int64[Tensor, " p"] | None = None
+    """Row of `bits` and `blocker` of each point; one row per point, in order, when None."""
 
-    def gather(self, index: Int64[Tensor, " q"]) -> "Visibility":
-        """Visibility of q points, each a copy of that of point `index`."""
-        return Visibility(self.directions, self.bits[index], None if self.blocker is None else self.blocker[index])
+    def gather(self, index: Int64[Tensor, " r"]) -> "Visibility":
+        """Visibility of r points, each that of point `index`; nothing is copied."""
+        return replace(self, index=index if self.index is None else self.index[index])
+
+    def rows(self) -> Int64[Tensor, " p"]:
+        """Row of `bits` and `blocker` of each point."""
+        return torch.arange(len(self.bits), device=self.bits.device) if self.index is None else self.index
 
     def unpacked(self) -> Bool[Tensor, "p D"]:
         """The bits as booleans."""
         shifts = torch.arange(WORD_BITS, dtype=torch.int32, device=self.bits.device)
-        return ((self.bits[..., None] >> shifts) & 1).flatten(1)[:, : len(self.directions)].bool()
+        bits = self.bits if self.index is None else self.bits[self.index]
+        return ((bits[..., None] >> shifts) & 1).flatten(1)[:, : len(self.directions)].bool()
 
     def fraction(self, normals: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         """Fraction of the directions above each point's horizon that are visible."""
@@ -128,9 +135,8 @@ class Visibility:
 def unoccluded(directions: Float[Tensor, "D 3"], n_points: int) -> Visibility:
     """Visibility of points without any occlusion, not even by their own horizon."""
     words = -(-len(directions) // WORD_BITS)
-    return Visibility(
-        directions, torch.full((1, words), -1, dtype=torch.int32, device=directions.device).expand(n_points, -1), None
-    )
+    bits = torch.full((1, words), -1, dtype=torch.int32, device=directions.device)
+    return Visibility(directions, bits, None, bits.new_zeros(n_points, dtype=torch.int64))
 
 
 def visibility(

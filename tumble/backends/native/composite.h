@@ -390,7 +390,8 @@ static void composite_share(Raster& r, int share) {
 template <int C>
 static void adjoint_share(Raster& r, int share) {
     float* parts = r.parts + (i64)share * r.n * r.gradient_size;
-    clear(parts, (i64)4 * r.n * r.gradient_size);
+    for (int g = 0; g < r.n; g++)
+        if (r.keys[g] != ~0u) clear(parts + (i64)g * r.gradient_size, (i64)4 * r.gradient_size);
     for_blocks(r, share, [&](const Block& b, const int* list, int count) {
         if (b.corner) prefetch_tile(r, b.tile + r.threads);
         if (count && r.v_means) adjoint_block<C>(r, b, list, count, parts);

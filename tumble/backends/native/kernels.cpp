@@ -2,8 +2,13 @@
 #include "bin.h"
 #include "bvh.h"
 #include "composite.h"
+#include "gaussian_terms.h"
+#include "image.h"
+#include "lookup.h"
+#include "material.h"
 #include "parallel.h"
 #include "project.h"
+#include "sh_shade.h"
 #include "shade.h"
 
 #define API extern "C" __attribute__((visibility("default")))
@@ -12,7 +17,9 @@ API int lanes() { return LANES; }
 
 // Sizes of the structures, which the caller compares with its own.
 API int sizes(int which) {
-    const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(Leaf), sizeof(Node)};
+    const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
+                       sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
+                       sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -94,3 +101,30 @@ API void shade_adjoint(const Shade* s) {
     add_parts(s->v_radiance, s->radiance_parts, (i64)3 * s->stride, s->threads);
     add_parts(s->v_blocker_radiance, s->blocker_parts, (i64)3 * s->n_blockers, s->threads);
 }
+
+API void sh_shade_forward(const ShShade* s) {
+    ShLight light;
+    sh_light(*s, light);
+    parallel(s->threads, [=, &light](int share) { sh_shade_share(*s, light, share); });
+}
+API void sh_shade_adjoint(const ShShade* s) {
+    ShLight light;
+    sh_light(*s, light);
+    parallel(s->threads, [=, &light](int share) { sh_shade_adjoint_share(*s, light, share); });
+}
+
+API void image_loss(const Image* m) { image_terms(*m); }
+API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
+
+API void lookup_forward(const Lookup* s) { lookup_values(*s); }
+API void lookup_backward(const Lookup* s) { lookup_adjoint(*s); }
+
+API void material_forward(const Activation* m) {
+    parallel(m->threads, [=](int share) { activate_share(*m, share); });
+}
+API void material_adjoint(const Activation* m) {
+    parallel(m->threads, [=](int share) { activate_adjoint_share(*m, share); });
+}
+API void bounce_forward(const Indirect* s) { bounce_values(*s, false); }
+API void bounce_adjoint(const Indirect* s) { bounce_values(*s, true); }
+API void material_loss(const MaterialImage* m) { material_terms(*m); }

@@ -54,6 +54,32 @@ INLINE void scatter3(float* p, int first, int count, V3 v) {
     scatter(p, 3, 0, first, count, v.x), scatter(p, 3, 1, first, count, v.y), scatter(p, 3, 2, first, count, v.z);
 }
 
+// Up to LANES Gaussians with their indices; further lanes repeat the last one.
+struct Batch {
+    int g[LANES], count;
+    METHOD bool add(int which) {
+        g[count++] = which;
+        return count == LANES;
+    }
+    METHOD void pad() {
+        for (int i = count; i < LANES; i++) g[i] = g[count - 1];
+    }
+};
+INLINE vf gather(const float* p, int stride, int j, const Batch& b) {
+    float x[LANES];
+    for (int i = 0; i < LANES; i++) x[i] = p[(i64)b.g[i] * stride + j];
+    return load(x);
+}
+INLINE void scatter(float* p, int stride, int j, const Batch& b, vf value) {
+    float x[LANES];
+    store(x, value);
+    for (int i = 0; i < b.count; i++) p[(i64)b.g[i] * stride + j] = x[i];
+}
+INLINE V3 gather3(const float* p, const Batch& b) { return {gather(p, 3, 0, b), gather(p, 3, 1, b), gather(p, 3, 2, b)}; }
+INLINE void scatter3(float* p, const Batch& b, V3 v) {
+    scatter(p, 3, 0, b, v.x), scatter(p, 3, 1, b, v.y), scatter(p, 3, 2, b, v.z);
+}
+
 struct Camera {
     M3 R;
     V3 t;
@@ -141,9 +167,9 @@ struct Projected {
     vf opacity;
 };
 
-INLINE Projected project(const Raster& r, const Camera& cam, int first, int count) {
+INLINE Projected project(const Raster& r, const Camera& cam, const Batch& b) {
     Projected o;
-    for (int j = 0; j < 4; j++) o.q[j] = gather(r.quats, 4, j, first, count);
+    for (int j = 0; j < 4; j++) o.q[j] = gather(r.quats, 4, j, b);
     o.q_scale = 1.0f / vsqrt(o.q[0] * o.q[0] + o.q[1] * o.q[1] + o.q[2] * o.q[2] + o.q[3] * o.q[3]);
     for (int j = 0; j < 4; j++) o.q[j] *= o.q_scale;
     o.R_obj_local = rotation(o.q);
@@ -151,10 +177,10 @@ INLINE Projected project(const Raster& r, const Camera& cam, int first, int coun
         for (int j = 0; j < 3; j++)
             o.M.m[3 * i + j] = cam.R(i, 0) * o.R_obj_local(0, j) + cam.R(i, 1) * o.R_obj_local(1, j) +
                                cam.R(i, 2) * o.R_obj_local(2, j);
-    o.mu = gather3(r.means, first, count);
-    o.s = gather3(r.scales, first, count);
+    o.mu = gather3(r.means, b);
+    o.s = gather3(r.scales, b);
     o.inv_s = {1.0f / o.s.x, 1.0f / o.s.y, 1.0f / o.s.z};
-    o.opacity = gather(r.opacity, 1, 0, first, count);
+    o.opacity = gather(r.opacity, 1, 0, b);
     o.mu_cam = mul(cam.R, o.mu);
     o.p = o.mu_cam + cam.t;
     o.inv_z = 1.0f / o.p.z;
@@ -177,9 +203,22 @@ INLINE Projected project(const Raster& r, const Camera& cam, int first, int coun
     harmonics(r.k, o.dir, o.Y);
     for (int ch = 0; ch < 3; ch++) {
         o.raw[ch] = vf{};
-        for (int j = 0; j < r.k; j++) o.raw[ch] += o.Y[j] * gather(r.sh, 3 * r.k, 3 * j + ch, first, count);
+        for (int j = 0; j < r.k; j++) o.raw[ch] += o.Y[j] * gather(r.sh, 3 * r.k, 3 * j + ch, b);
     }
     return o;
+}
+
+// Which of `count` Gaussians from `first` on may be drawn: most others face away from the camera. The limit is looser than
+// in `outline`, which decides.
+INLINE u32 facing(const Raster& r, const Camera& cam, int first, int count) {
+    vf q[4];
+    for (int j = 0; j < 4; j++) q[j] = gather(r.quats, 4, j, first, count);
+    vf w = q[0], x = q[1], y = q[2], z = q[3], length2 = w * w + x * x + y * y + z * z;
+    V3 n = {2.0f * (x * z + w * y), 2.0f * (y * z - w * x), w * w + z * z - x * x - y * y};
+    V3 p = mul(cam.R, gather3(r.means, first, count)) + cam.t;
+    vf along = dot(mul(cam.R, n), p), limit = (r.facing + 1e-3f) * vsqrt(dot(p, p)) * length2;
+    return bits((along <= limit) & (p.z > r.near) & (gather(r.opacity, 1, 0, first, count) >= r.alpha_min) &
+                (lane_index() < count));
 }
 
 // Which lanes are not culled, and the footprint of each: the ellipse on screen inside which alpha can reach alpha_min.
@@ -203,51 +242,62 @@ INLINE vi outline(const Raster& r, const Camera& cam, const Projected& o, vf cut
            (span[1] + half_y > 0.5f) & (span[1] - half_y < (float)r.height - 0.5f);
 }
 
+static void project_batch(Raster& r, const Camera& cam, Batch& b) {
+    b.pad();
+    Projected o = project(r, cam, b);
+    vf cut = 2.0f * vlog(vmax(o.opacity * (1.0f / r.alpha_min), splat(1.0f))) + 1e-4f;
+    vf span[SPAN];
+    u32 drawn = bits(outline(r, cam, o, cut, span));
+    vf uv = splat(1.0f / (2.0f * r.corner)), f[RECORD] = {};
+    f[CX] = cam.cx + cam.fx * o.p.x * o.inv_z, f[CY] = cam.cy + cam.fy * o.p.y * o.inv_z;
+    vf zh = o.p.z * o.h, zzh = o.p.z * zh;
+    f[KA] = zzh * o.S11, f[KB] = 2.0f * zzh * o.S12, f[KC] = zzh * o.S22;
+    f[BX] = zh * (o.e1 + o.tau * o.w1), f[BY] = zh * (o.e2 + o.tau * o.w2), f[KAPPA] = o.tau * o.h;
+    f[CUT] = cut, f[OPACITY] = o.opacity, f[PZ] = o.p.z, f[DZ] = o.mu_cam.z;
+    for (int ch = 0; ch < 3; ch++) f[RED + ch] = vmax(o.raw[ch], vf{});
+    for (int i = 0; i < 3; i++) f[NX + i] = o.R_obj_local(i, 2);
+    f[EU] = uv * o.P.x, f[UX] = uv * o.p.z * o.E1.x, f[UY] = uv * o.p.z * o.E2.x;
+    f[EV] = uv * o.P.y, f[VX] = uv * o.p.z * o.E1.y, f[VY] = uv * o.p.z * o.E2.y;
+    float lanes[RECORD][LANES], spans[SPAN][LANES];
+    for (int j = 0; j < RECORD; j++) store(lanes[j], f[j]);
+    for (int j = 0; j < SPAN; j++) store(spans[j], span[j]);
+    for (int i = 0; i < b.count; i++) {
+        int g = b.g[i];
+        if (!(drawn >> i & 1)) continue;
+        float* record = r.record + (i64)g * r.record_size;
+        for (int j = 0; j < RECORD; j++) record[j] = lanes[j][i];
+        for (int j = 0; j < SPAN; j++) r.span[(i64)g * SPAN + j] = spans[j][i];
+        __builtin_memcpy(&r.keys[g], &record[PZ], 4);
+        const float* f4 = r.corners + (i64)g * 4 * r.c;
+        for (int ch = 0; ch < r.c; ch++) {
+            float *out = record + RECORD + 4 * ch, f00 = f4[ch], f10 = f4[r.c + ch], f01 = f4[2 * r.c + ch];
+            out[0] = f00, out[1] = f10 - f00, out[2] = f01 - f00;
+            out[3] = f4[3 * r.c + ch] - f10 - f01 + f00;
+        }
+        for (int j = RECORD + 4 * r.c; j < r.record_size; j++) record[j] = 0;
+    }
+    b.count = 0;
+}
+
 static void project_share(Raster& r, int share) {
     Camera cam = camera_of(r);
+    Batch b;
+    b.count = 0;
     int end = share_start(r.n, share + 1, r.threads);
     for (int first = share_start(r.n, share, r.threads); first < end; first += LANES) {
         int count = imin2(LANES, end - first);
-        Projected o = project(r, cam, first, count);
-        vf cut = 2.0f * vlog(vmax(o.opacity * (1.0f / r.alpha_min), splat(1.0f))) + 1e-4f;
-        vf span[SPAN];
-        u32 drawn = bits(outline(r, cam, o, cut, span));
-        vf uv = splat(1.0f / (2.0f * r.corner)), f[RECORD] = {};
-        f[CX] = cam.cx + cam.fx * o.p.x * o.inv_z, f[CY] = cam.cy + cam.fy * o.p.y * o.inv_z;
-        vf zh = o.p.z * o.h, zzh = o.p.z * zh;
-        f[KA] = zzh * o.S11, f[KB] = 2.0f * zzh * o.S12, f[KC] = zzh * o.S22;
-        f[BX] = zh * (o.e1 + o.tau * o.w1), f[BY] = zh * (o.e2 + o.tau * o.w2), f[KAPPA] = o.tau * o.h;
-        f[CUT] = cut, f[OPACITY] = o.opacity, f[PZ] = o.p.z, f[DZ] = o.mu_cam.z;
-        for (int ch = 0; ch < 3; ch++) f[RED + ch] = vmax(o.raw[ch], vf{});
-        for (int i = 0; i < 3; i++) f[NX + i] = o.R_obj_local(i, 2);
-        f[EU] = uv * o.P.x, f[UX] = uv * o.p.z * o.E1.x, f[UY] = uv * o.p.z * o.E2.x;
-        f[EV] = uv * o.P.y, f[VX] = uv * o.p.z * o.E1.y, f[VY] = uv * o.p.z * o.E2.y;
-        float lanes[RECORD][LANES], spans[SPAN][LANES];
-        for (int j = 0; j < RECORD; j++) store(lanes[j], f[j]);
-        for (int j = 0; j < SPAN; j++) store(spans[j], span[j]);
-        for (int i = 0; i < count; i++) {
-            int g = first + i;
-            r.keys[g] = ~0u;
-            if (!(drawn >> i & 1)) continue;
-            float* record = r.record + (i64)g * r.record_size;
-            for (int j = 0; j < RECORD; j++) record[j] = lanes[j][i];
-            for (int j = 0; j < SPAN; j++) r.span[(i64)g * SPAN + j] = spans[j][i];
-            __builtin_memcpy(&r.keys[g], &record[PZ], 4);
-            const float* f4 = r.corners + (i64)g * 4 * r.c;
-            for (int ch = 0; ch < r.c; ch++) {
-                float *out = record + RECORD + 4 * ch, f00 = f4[ch], f10 = f4[r.c + ch], f01 = f4[2 * r.c + ch];
-                out[0] = f00, out[1] = f10 - f00, out[2] = f01 - f00;
-                out[3] = f4[3 * r.c + ch] - f10 - f01 + f00;
-            }
-            for (int j = RECORD + 4 * r.c; j < r.record_size; j++) record[j] = 0;
-        }
+        for (int i = 0; i < count; i++) r.keys[first + i] = ~0u;
+        for (u32 some = facing(r, cam, first, count); some; some &= some - 1)
+            if (b.add(first + __builtin_ctz(some))) project_batch(r, cam, b);
     }
+    if (b.count) project_batch(r, cam, b);
 }
 
 // Gradients of the inputs from those of a record's fields, per lane. The gradient of the camera is accumulated in
 // `camera`: R (9), t (3), focal lengths and principal point (4).
 INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected& o, const vf* g, V3 v_rgb,
-                            V3 v_normal, vi drawn, int first, int count, vf* camera) {
+                            V3 v_normal, const Batch& b, vf* camera) {
+    vi drawn = lane_index() < b.count;
     vf z = o.p.z, iz = o.inv_z, uv = splat(1.0f / (2.0f * r.corner)), zh = z * o.h, zzh = z * zh;
     // Conic, slant and kappa.
     vf v_S11 = zzh * g[G_A], v_S12 = 2.0f * zzh * g[G_B], v_S22 = zzh * g[G_C];
@@ -293,8 +343,8 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     for (int j = 0; j < r.k; j++) {
         v_Y[j] = vf{};
         for (int ch = 0; ch < 3; ch++) {
-            v_Y[j] += v_raw[ch] * gather(r.sh, 3 * r.k, 3 * j + ch, first, count);
-            scatter(r.v_sh, 3 * r.k, 3 * j + ch, first, count, keep(drawn, v_raw[ch] * o.Y[j]));
+            v_Y[j] += v_raw[ch] * gather(r.sh, 3 * r.k, 3 * j + ch, b);
+            scatter(r.v_sh, 3 * r.k, 3 * j + ch, b, keep(drawn, v_raw[ch] * o.Y[j]));
         }
     }
     V3 v_dir = harmonics_adjoint(r.k, o.dir, v_Y);
@@ -319,46 +369,53 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     rotation_adjoint(o.q, v_Rq, v_q);
     vf radial = v_q[0] * o.q[0] + v_q[1] * o.q[1] + v_q[2] * o.q[2] + v_q[3] * o.q[3];
     for (int j = 0; j < 4; j++)
-        scatter(r.v_quats, 4, j, first, count, keep(drawn, (v_q[j] - radial * o.q[j]) * o.q_scale));
+        scatter(r.v_quats, 4, j, b, keep(drawn, (v_q[j] - radial * o.q[j]) * o.q_scale));
     V3 v_mu = mul_T(cam.R, v_p);
-    scatter3(r.v_means, first, count, {keep(drawn, v_mu.x), keep(drawn, v_mu.y), keep(drawn, v_mu.z)});
-    scatter3(r.v_scales, first, count, {keep(drawn, v_s.x), keep(drawn, v_s.y), keep(drawn, v_s.z)});
-    scatter(r.v_opacity, 1, 0, first, count, keep(drawn, g[G_OPACITY]));
+    scatter3(r.v_means, b, {keep(drawn, v_mu.x), keep(drawn, v_mu.y), keep(drawn, v_mu.z)});
+    scatter3(r.v_scales, b, {keep(drawn, v_s.x), keep(drawn, v_s.y), keep(drawn, v_s.z)});
+    scatter(r.v_opacity, 1, 0, b, keep(drawn, g[G_OPACITY]));
 }
 
-// Sums the gradients of all shares and propagates them to the inputs.
+// Gradients of a batch from the sums of its records' gradients.
+static void project_adjoint_batch(Raster& r, const Camera& cam, Batch& b, vf* camera) {
+    b.pad();
+    float lanes[GEOMETRY + 6][LANES] = {};
+    for (int i = 0; i < b.count; i++) {
+        int g = b.g[i], size = r.gradient_size;
+        float *total = r.parts + (i64)g * size, *v_corners = r.v_corners + (i64)g * 4 * r.c;
+        for (int part = 1; part < r.threads; part++) {
+            const float* more = r.parts + ((i64)part * r.n + g) * size;
+            for (int j = 0; j < size; j++) total[j] += more[j];
+        }
+        for (int j = 0; j < GEOMETRY + 6; j++) lanes[j][i] = total[j];
+        const float* corner = total + GEOMETRY + r.fixed_width;
+        for (int k = 0; k < 4; k++, corner += r.corner_width)
+            for (int ch = 0; ch < r.c; ch++) v_corners[k * r.c + ch] = corner[ch];
+    }
+    if (r.v_means) {
+        vf g[GEOMETRY + 6];
+        for (int j = 0; j < GEOMETRY + 6; j++) g[j] = load(lanes[j]);
+        Projected o = project(r, cam, b);
+        const vf* c = g + GEOMETRY;
+        project_adjoint(r, cam, o, g, {c[0], c[1], c[2]}, {c[3], c[4], c[5]}, b, camera);
+    }
+    b.count = 0;
+}
+
+// Sums the gradients of all shares and propagates them to the inputs; those of culled Gaussians are 0.
 static void project_adjoint_share(Raster& r, int share) {
     Camera cam = camera_of(r);
     vf camera[CAMERA] = {};
-    int end = share_start(r.n, share + 1, r.threads), size = r.gradient_size;
-    for (int first = share_start(r.n, share, r.threads); first < end; first += LANES) {
-        int count = imin2(LANES, end - first);
-        float lanes[GEOMETRY + 6][LANES] = {}, drawn_lanes[LANES] = {};
-        for (int i = 0; i < count; i++) {
-            int g = first + i;
-            float* v_corners = r.v_corners + (i64)g * 4 * r.c;
-            if (r.keys[g] == ~0u) {
-                clear(v_corners, (i64)16 * r.c);
-                continue;
-            }
-            drawn_lanes[i] = 1;
-            float* total = r.parts + (i64)g * size;
-            for (int part = 1; part < r.threads; part++) {
-                const float* more = r.parts + ((i64)part * r.n + g) * size;
-                for (int j = 0; j < size; j++) total[j] += more[j];
-            }
-            for (int j = 0; j < GEOMETRY + 6; j++) lanes[j][i] = total[j];
-            const float* corner = total + GEOMETRY + r.fixed_width;
-            for (int k = 0; k < 4; k++, corner += r.corner_width)
-                for (int ch = 0; ch < r.c; ch++) v_corners[k * r.c + ch] = corner[ch];
-        }
-        if (!r.v_means) continue;
-        vf g[GEOMETRY + 6];
-        for (int j = 0; j < GEOMETRY + 6; j++) g[j] = load(lanes[j]);
-        vi drawn = load(drawn_lanes) > 0.5f;
-        Projected o = project(r, cam, first, count);
-        const vf* c = g + GEOMETRY;
-        project_adjoint(r, cam, o, g, {c[0], c[1], c[2]}, {c[3], c[4], c[5]}, drawn, first, count, camera);
+    Batch b;
+    b.count = 0;
+    i64 start = share_start(r.n, share, r.threads), end = share_start(r.n, share + 1, r.threads), n = end - start;
+    clear(r.v_corners + 4 * r.c * start, 16 * r.c * n);
+    if (r.v_means) {
+        clear(r.v_means + 3 * start, 12 * n), clear(r.v_quats + 4 * start, 16 * n), clear(r.v_scales + 3 * start, 12 * n);
+        clear(r.v_opacity + start, 4 * n), clear(r.v_sh + 3 * r.k * start, 12 * r.k * n);
     }
+    for (int g = start; g < end; g++)
+        if (r.keys[g] != ~0u && b.add(g)) project_adjoint_batch(r, cam, b, camera);
+    if (b.count) project_adjoint_batch(r, cam, b, camera);
     for (int j = 0; j < CAMERA; j++) r.camera_parts[share * CAMERA + j] = sum_of(camera[j]);
 }

@@ -6,22 +6,24 @@
 #include "simd.h"
 
 struct Shade {
-    const float *normal, *albedo, *roughness, *view, *directions, *radiance;
+    const float *normal, *roughness, *view, *directions, *radiance;
     const int *visibility, *blocker;
+    const i64* rows;   // row of visibility and blocker of each point
     const float* blocker_radiance;
     int n_points, n_directions, stride, words, n_blockers, threads;   // stride: n_directions padded
     int blocker_point_stride, blocker_direction_stride;
-    float f0, roughness_min;
-    float* out;
+    float roughness_min;
+    float *diffuse, *specular, *specular_visibility;
     // Gradients: of results, per share, of inputs.
-    const float* v_out;
+    const float *v_diffuse, *v_specular;
     float *radiance_parts, *blocker_parts;
-    float *v_normal, *v_albedo, *v_roughness, *v_view, *v_radiance, *v_blocker_radiance;
+    float *v_normal, *v_roughness, *v_view, *v_radiance, *v_blocker_radiance;
 };
 
 // Quantities of a point that do not depend on the direction.
 struct Point {
     float n[3], v[3], C[3], n_v, r, a, aa, g_v, slope_v, scale;   // C = n x v, slope_v = dg_v / dn_v
+    float mirrored[3], bb;   // reflected view direction; b^2 of the weights of specular_visibility
 };
 // The root in Smith's g(x) = (x + root) / 2.
 INLINE vf smith_root(vf x, float aa) { return vsqrt(aa + (1 - aa) * x * x); }
@@ -36,6 +38,8 @@ INLINE Point point_at(const Shade& s, i64 p) {
     float facing = fmax2(o.n_v, 0), root = smith_root(splat(facing), o.aa)[0];
     o.g_v = 0.5f * (facing + root), o.slope_v = 0.5f + 0.5f * (1 - o.aa) * facing / root;
     o.scale = 12.566370614f / s.n_directions;
+    for (int i = 0; i < 3; i++) o.mirrored[i] = 2 * o.n_v * o.n[i] - o.v[i];
+    o.bb = fmax2(o.aa, 0.785398163f / s.n_directions);
     return o;
 }
 
@@ -61,25 +65,26 @@ INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
     o.vh = 0.5f * vsqrt(o.HH);
     vf m = 1.0f - o.vh, mm = m * m;
     // tumble.rendering.brdf.fresnel and its derivative in m.
-    o.F = s.f0 * (1 + 24 * m * mm * (0.9878f + m * (-3.8886f + m * (9.1922f + m * (-9.6217f + m * 4.3303f)))));
-    o.slope_F = s.f0 * 24 * mm * (2.9634f + m * (-15.5544f + m * (45.961f + m * (-57.7302f + m * 30.3121f))));
+    o.F = (1 + 24 * m * mm * (0.9878f + m * (-3.8886f + m * (9.1922f + m * (-9.6217f + m * 4.3303f)))));
+    o.slope_F = 24 * mm * (2.9634f + m * (-15.5544f + m * (45.961f + m * (-57.7302f + m * 30.3121f))));
     vf x = o.HH / o.t_num;
     o.rest = keep(o.exists, (p.aa * 0.0795774715f / p.g_v) * x * x / o.g_w);
     o.f = o.F * o.rest;
 }
 
+// The lanes whose bits are set.
+INLINE vi mask_of(u32 lanes) { return (splat((int)lanes) >> lane_index() & 1) != 0; }
 // Radiance arriving from LANES directions, given which are visible (`seen`) and above the horizon (`lit`).
 INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
     float lanes[3][LANES];
     u32 blocked = lit & ~seen;
-    vi in_sight;
-    for (int l = 0; l < LANES; l++) in_sight[l] = -(int)(seen >> l & 1);
+    vi in_sight = mask_of(seen);
     for (int ch = 0; ch < 3; ch++) L[ch] = keep(in_sight, load(s.radiance + ch * s.stride + j));
     if (!blocked || !s.n_blockers) return;
     for (int ch = 0; ch < 3; ch++) store(lanes[ch], L[ch]);
     for (; blocked; blocked &= blocked - 1) {
         int l = __builtin_ctz(blocked);
-        int b = s.blocker[p * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
+        int b = s.blocker[s.rows[p] * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
         for (int ch = 0; ch < 3 && b >= 0; ch++) lanes[ch][l] = s.blocker_radiance[3 * (i64)b + ch];
     }
     for (int ch = 0; ch < 3; ch++) L[ch] = load(lanes[ch]);
@@ -87,31 +92,46 @@ INLINE void arriving(const Shade& s, i64 p, int j, u32 seen, u32 lit, vf* L) {
 
 // Visibility bits of LANES directions from j on; they never straddle two words.
 INLINE u32 seen_at(const Shade& s, i64 p, int j) {
-    return (u32)s.visibility[p * s.words + j / 32] >> j % 32 & ((1ull << LANES) - 1);
+    return (u32)s.visibility[s.rows[p] * s.words + j / 32] >> j % 32 & ((1ull << LANES) - 1);
+}
+
+// Weight of LANES directions above the horizon in `specular_visibility`.
+INLINE vf mirrored_weight(const Point& p, const vf* w, vi above) {
+    vf cosine = p.mirrored[0] * w[0] + p.mirrored[1] * w[1] + p.mirrored[2] * w[2];
+    vf t = 0.5f * (1.0f - cosine) + p.bb * 0.5f * (1.0f + cosine);
+    return keep(above & (cosine > 0.0f), cosine / (t * t));
 }
 
 static void shade_share(const Shade& s, int share) {
     for (i64 p = share; p < s.n_points; p += s.threads) {
         Point o = point_at(s, p);
-        vf diffuse[3] = {}, specular[3] = {};
+        vf diffuse[3] = {}, specular[3] = {}, total = {}, visible = {};
         for (int j = 0; j < s.stride; j += LANES) {
             Lobe b;
             b.n_w = cosine(s, o, j, b.w);
-            u32 lit = bits(b.n_w > 0.0f), seen = seen_at(s, p, j) & lit;
-            if (!(s.n_blockers ? lit : seen)) continue;
+            vi above = b.n_w > 0.0f;
+            u32 lit = bits(above), seen = seen_at(s, p, j) & lit;
+            if (!lit) continue;
+            vf weight = mirrored_weight(o, b.w, above);
+            total += weight, visible += keep(mask_of(seen), weight);
+            if (!s.n_blockers && !seen) continue;
             lobe_at(s, o, b);
             vf L[3], cos = vmax(b.n_w, vf{}), f_cos = b.f * cos;
             arriving(s, p, j, seen, lit, L);
             for (int ch = 0; ch < 3; ch++) diffuse[ch] += L[ch] * cos, specular[ch] += L[ch] * f_cos;
         }
-        for (int ch = 0; ch < 3; ch++)
-            s.out[3 * p + ch] = o.scale * (s.albedo[3 * p + ch] * 0.318309886f * sum_of(diffuse[ch]) + sum_of(specular[ch]));
+        for (int ch = 0; ch < 3; ch++) {
+            s.diffuse[3 * p + ch] = o.scale * 0.318309886f * sum_of(diffuse[ch]);
+            s.specular[3 * p + ch] = o.scale * sum_of(specular[ch]);
+        }
+        float sum = sum_of(total);
+        s.specular_visibility[p] = sum > 0 ? sum_of(visible) / sum : 0;
     }
 }
 
 // Gradients of a point summed over directions.
 struct PointSums {
-    vf n[3], v[3], albedo[3], g_v, n_v, aa, a;
+    vf n[3], v[3], g_v, n_v, aa, a;
 };
 
 INLINE void lobe_adjoint(const Shade& s, const Point& p, const Lobe& b, vf v_f, vf v_n_w, PointSums& sum) {
@@ -143,8 +163,8 @@ static void shade_adjoint_share(const Shade& s, int share) {
         PointSums sum = {};
         float seed[3], seed_diffuse[3];
         for (int ch = 0; ch < 3; ch++) {
-            seed[ch] = s.v_out[3 * p + ch] * o.scale;
-            seed_diffuse[ch] = seed[ch] * s.albedo[3 * p + ch] * 0.318309886f;
+            seed[ch] = s.v_specular[3 * p + ch] * o.scale;
+            seed_diffuse[ch] = s.v_diffuse[3 * p + ch] * o.scale * 0.318309886f;
         }
         for (int j = 0; j < s.stride; j += LANES) {
             Lobe b;
@@ -154,14 +174,12 @@ static void shade_adjoint_share(const Shade& s, int share) {
             lobe_at(s, o, b);
             vf L[3], cos = vmax(b.n_w, vf{}), v_L[3];
             arriving(s, p, j, seen, lit, L);
-            for (int ch = 0; ch < 3; ch++)
-                v_L[ch] = cos * (seed_diffuse[ch] + seed[ch] * b.f), sum.albedo[ch] += L[ch] * cos;
+            for (int ch = 0; ch < 3; ch++) v_L[ch] = cos * (seed_diffuse[ch] + seed[ch] * b.f);
             vf specular = seed[0] * L[0] + seed[1] * L[1] + seed[2] * L[2];
             vf diffuse = seed_diffuse[0] * L[0] + seed_diffuse[1] * L[1] + seed_diffuse[2] * L[2];
             vf v_n_w = keep(b.n_w > 0.0f, diffuse + b.f * specular);
             lobe_adjoint(s, o, b, specular * cos, v_n_w, sum);
-            vi in_sight;
-            for (int l = 0; l < LANES; l++) in_sight[l] = -(int)(seen >> l & 1);
+            vi in_sight = mask_of(seen);
             for (int ch = 0; ch < 3; ch++) {
                 float* to = v_radiance + ch * s.stride + j;
                 store(to, load(to) + keep(in_sight, v_L[ch]));
@@ -172,7 +190,7 @@ static void shade_adjoint_share(const Shade& s, int share) {
             for (int ch = 0; ch < 3; ch++) store(lanes[ch], v_L[ch]);
             for (; blocked; blocked &= blocked - 1) {
                 int l = __builtin_ctz(blocked);
-                int at = s.blocker[p * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
+                int at = s.blocker[s.rows[p] * s.blocker_point_stride + (i64)(j + l) * s.blocker_direction_stride];
                 for (int ch = 0; ch < 3 && at >= 0; ch++) v_blocker[3 * (i64)at + ch] += lanes[ch][l];
             }
         }
@@ -184,7 +202,6 @@ static void shade_adjoint_share(const Shade& s, int share) {
         for (int i = 0; i < 3; i++) {
             s.v_normal[3 * p + i] = sum_of(sum.n[i]) + v_n_v * o.v[i];
             s.v_view[3 * p + i] = sum_of(sum.v[i]) + v_n_v * o.n[i];
-            s.v_albedo[3 * p + i] = s.v_out[3 * p + i] * o.scale * 0.318309886f * sum_of(sum.albedo[i]);
         }
     }
 }

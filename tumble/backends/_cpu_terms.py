@@ -1,0 +1,334 @@
+"""CPU kernels of the steps of stages 2 and 3 besides rendering: materials, colour and loss terms (see `native/`)."""
+
+import ctypes
+import math
+from functools import cache
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from tumble.backends import (
+    IRRADIANCE_FLOOR,
+    KNEE,
+    NORMAL_GRADIENT,
+    RATIO_MAX,
+    SATURATED,
+    SSIM_SIGMA,
+    SSIM_STABILISERS,
+    SSIM_WINDOW,
+    _native,
+    threads,
+)
+from tumble.backends._structs import (
+    Activation,
+    GaussianTerms,
+    Image,
+    Indirect,
+    MaterialImage,
+    ShShade,
+    scratch,
+    set_pointers,
+)
+
+PLANES = 11
+"""Planes of scratch memory in `native/image.h` (per channel) and `native/material.h`."""
+LIGHT_SUMS = 109
+"""Numbers of the gradient of light, specular scale, rotation and position in `native/sh_shade.h`."""
+
+
+def sh_shade(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    albedo_logits: Float[Tensor, "n 3"],
+    light: Float[Tensor, "2 16 3"],
+    specular_scale: Float[Tensor, ""],
+    occluded: Float[Tensor, "m 9"],
+    unoccluded: Float[Tensor, "m 9"],
+    directions: Float[Tensor, "d 3"],
+    reflectance: Float[Tensor, " k"],
+    R_env_obj: Float[Tensor, "3 3"],
+    position: Float[Tensor, "3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.sh_shade`."""
+    constants = (occluded, unoccluded, directions, reflectance)
+    return _ShShadeFunction.apply(means, quats, albedo_logits, light, specular_scale, R_env_obj, position, *constants)
+
+
+_SH_INPUTS: tuple[str, ...] = (
+    *("means", "quats", "albedo_logits", "light", "specular_scale", "R", "position"),
+    *("occluded", "unoccluded", "directions", "reflectance"),
+)
+"""Arguments of `sh_shade` by their names in `native/sh_shade.h`, the differentiable ones first."""
+
+
+class _ShShadeFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        out = torch.empty_like(tensors[0])
+        struct, kept = _sh_launch(tensors, out=out)
+        _native.library().sh_shade_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*tensors)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        v_means, v_quats, v_albedo = (torch.empty_like(x) for x in ctx.saved_tensors[:3])
+        gradients = {"v_out": v_out.contiguous(), "v_means": v_means, "v_quats": v_quats, "v_albedo_logits": v_albedo}
+        parts = torch.empty(threads(), LIGHT_SUMS)
+        struct, kept = _sh_launch(ctx.saved_tensors, **gradients, parts=parts)
+        _native.library().sh_shade_adjoint(ctypes.byref(struct))
+        del kept
+        v_light, v_scale, v_R, v_position = parts.sum(0).split([96, 1, 9, 3])
+        pose = v_R.view(3, 3), v_position
+        return v_means, v_quats, v_albedo, v_light.view(2, 16, 3), v_scale[0], *pose, None, None, None, None
+
+
+def _sh_launch(tensors: Any, **more: Tensor) -> tuple[ShShade, list[Tensor]]:
+    """Arguments of shading under spherical harmonics, and the tensors that they point to."""
+    named = dict(zip(_SH_INPUTS, tensors, strict=True))
+    struct = ShShade(
+        n=len(named["means"]),
+        n_directions=len(named["directions"]),
+        n_terms=len(named["reflectance"]),
+        shadowed=int(len(named["occluded"]) > 0),
+        threads=threads(),
+        normal_gradient=NORMAL_GRADIENT,
+        irradiance_floor=IRRADIANCE_FLOOR,
+        ratio_max=RATIO_MAX,
+    )
+    return struct, set_pointers(struct, named, **more)
+
+
+def image_terms(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    depth_var: Float[Tensor, "h w"],
+    normal: Float[Tensor, "h w 3"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    ssim_weight: float,
+    crease: float,
+) -> Float[Tensor, "4"]:
+    """See `Backend.image_terms`."""
+    inputs = (rgb, alpha, depth, depth_var, normal, R_cam_obj)
+    return _ImageTermsFunction.apply(*inputs, photo, mask, fx_fy_cx_cy, ssim_weight, crease)
+
+
+_IMAGE_INPUTS: tuple[str, ...] = ("rgb", "alpha", "depth", "depth_var", "normal", "R")
+"""Differentiable inputs of `image_terms` by their names in `native/image.h`."""
+_IMAGE_TERM = (0, 1, 2, 3, 2, 2)
+"""The term to which each of them belongs."""
+
+
+class _ImageTermsFunction(torch.autograd.Function):
+    """The kernel computes values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> Tensor:
+        *tensors, ssim_weight, crease = args
+        tensors = [x.contiguous() for x in tensors]
+        (height, width), lanes = tensors[1].shape, _native.library().lanes()
+        plane_size = (height + SSIM_WINDOW) * (width + SSIM_WINDOW + 2 * lanes)
+        struct = Image(
+            height=height,
+            width=width,
+            plane_size=plane_size,
+            threads=threads(),
+            ssim_weight=ssim_weight,
+            crease=crease,
+            saturated=SATURATED,
+            knee=KNEE,
+            c1=SSIM_STABILISERS[0],
+            c2=SSIM_STABILISERS[1],
+        )
+        terms, gradients = torch.empty(4), [torch.empty_like(x) for x in tensors[:6]]
+        named = dict(zip((*_IMAGE_INPUTS, "photo", "mask", "focal"), tensors, strict=True))
+        kept = set_pointers(struct, named, taps=_taps(), terms=terms, scratch=scratch(3 * PLANES * plane_size))
+        set_pointers(struct, dict(zip((f"g_{name}" for name in _IMAGE_INPUTS), gradients, strict=True)))
+        _native.library().image_loss(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*gradients)
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        v, needed = v_terms.unbind(), ctx.needs_input_grad
+        gradients = zip(ctx.saved_tensors, _IMAGE_TERM, needed[:6], strict=True)
+        return (*(v[term] * x if need else None for x, term, need in gradients), *(None for _ in range(5)))
+
+
+@cache
+def _taps() -> Float[Tensor, " taps"]:
+    """Weights of SSIM's window along one axis."""
+    weights = [math.exp(-0.5 * ((i - SSIM_WINDOW // 2) / SSIM_SIGMA) ** 2) for i in range(SSIM_WINDOW)]
+    return torch.tensor(weights) / sum(weights)
+
+
+def gaussian_terms(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+    sdf: Float[Tensor, " n"],
+    gamma: Float[Tensor, ""],
+    weight: Float[Tensor, " n"],
+    depth: Float[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    t_cam_obj: Float[Tensor, "3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    floor: float,
+    reach: float,
+) -> Float[Tensor, "3"]:
+    """See `Backend.gaussian_terms`."""
+    inputs = (means, quats, log_scales, sdf, gamma, R_cam_obj, t_cam_obj)
+    return _GaussianTermsFunction.apply(*inputs, weight, depth, fx_fy_cx_cy, floor, reach)
+
+
+_GAUSSIAN_INPUTS: tuple[str, ...] = ("means", "quats", "log_scales", "sdf", "gamma", "R", "t")
+"""Differentiable inputs of `gaussian_terms` by their names in `native/gaussian_terms.h`."""
+_GAUSSIAN_TERM = (2, 2, 0, 2, 1, 2, 2)
+"""The term to which each of them belongs."""
+
+
+class _GaussianTermsFunction(torch.autograd.Function):
+    """The kernel computes values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> Tensor:
+        *tensors, floor, reach = args
+        tensors = [x.detach().contiguous() for x in tensors]
+        named = dict(zip((*_GAUSSIAN_INPUTS, "weight", "depth", "focal"), tensors, strict=True))
+        n, (height, width) = len(named["means"]), named["depth"].shape
+        struct = GaussianTerms(n=n, height=height, width=width, threads=threads(), floor=floor, reach=reach)
+        terms, gradients = torch.empty(3), [torch.empty_like(x) for x in tensors[:5]]
+        gradients += [torch.zeros(3, 3), torch.zeros(3)]
+        kept = set_pointers(struct, named, terms=terms, magnitudes=torch.empty(n, dtype=torch.int32))
+        kept += set_pointers(struct, dict(zip((f"g_{x}" for x in _GAUSSIAN_INPUTS[:5]), gradients, strict=False)))
+        set_pointers(struct, g_R=gradients[5][2], g_t=gradients[6][2:])
+        _native.library().gaussian_loss(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*gradients)
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        v, needed = v_terms.unbind(), ctx.needs_input_grad
+        gradients = zip(ctx.saved_tensors, _GAUSSIAN_TERM, needed[:7], strict=True)
+        return (*(v[term] * x if need else None for x, term, need in gradients), *(None for _ in range(5)))
+
+
+def corner_features(
+    albedo_logits: Float[Tensor, "n 4 3"],
+    roughness_logits: Float[Tensor, "n 4"],
+    normal_offset: Float[Tensor, "n 4 3"],
+    temperature: float,
+) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+    """See `Backend.corner_features`."""
+    return _MaterialFunction.apply(albedo_logits, roughness_logits, normal_offset, temperature)
+
+
+class _MaterialFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor]:
+        *tensors, ctx.temperature = args
+        inputs = [x.contiguous() for x in tensors]
+        n = len(inputs[0])
+        corners, albedo = torch.empty(n, 4, 7), torch.empty(n, 3)
+        struct = Activation(n=n, threads=threads(), temperature=ctx.temperature)
+        named = dict(zip(("albedo_logits", "roughness_logits", "normal_offset"), inputs, strict=True))
+        kept = set_pointers(struct, {"corners": corners, "albedo": albedo, **named})
+        _native.library().material_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(corners)
+        return corners, albedo
+
+    @staticmethod
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        corners, n = ctx.saved_tensors[0], len(ctx.saved_tensors[0])
+        gradients = torch.empty(n, 4, 3), torch.empty(n, 4), torch.empty(n, 4, 3)
+        struct = Activation(n=n, threads=threads(), temperature=ctx.temperature)
+        v_corners, v_albedo = (v.contiguous() for v in v_results)
+        kept = set_pointers(struct, corners=corners, v_corners=v_corners, v_albedo=v_albedo)
+        names = ("v_albedo_logits", "v_roughness_logits", "v_normal_offset")
+        kept += set_pointers(struct, dict(zip(names, gradients, strict=True)))
+        _native.library().material_adjoint(ctypes.byref(struct))
+        return (*gradients, None)
+
+
+def bounce(
+    albedo: Float[Tensor, "n 3"],
+    transfer: Float[Tensor, "n 9"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.bounce`."""
+    return _BounceFunction.apply(albedo, transfer, directions, radiance)
+
+
+class _BounceFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        out = torch.empty_like(tensors[0])
+        struct, kept = _bounce_launch(tensors, out=out)
+        _native.library().bounce_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*tensors)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        v_albedo, _, _, v_radiance = (torch.empty_like(x) for x in ctx.saved_tensors)
+        gradients = {"v_out": v_out.contiguous(), "v_albedo": v_albedo, "v_radiance": v_radiance}
+        struct, kept = _bounce_launch(ctx.saved_tensors, **gradients)
+        _native.library().bounce_adjoint(ctypes.byref(struct))
+        del kept
+        return v_albedo, None, None, v_radiance
+
+
+def _bounce_launch(tensors: Any, **more: Tensor) -> tuple[Indirect, list[Tensor]]:
+    """Arguments of indirect light, and the tensors that they point to."""
+    struct = Indirect(n=len(tensors[0]), n_directions=len(tensors[2]))
+    named = dict(zip(("albedo", "transfer", "directions", "radiance"), tensors, strict=True))
+    return struct, set_pointers(struct, named | more)
+
+
+def material_terms(
+    features: Float[Tensor, "h w c"],
+    alpha: Float[Tensor, "h w"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+) -> Float[Tensor, "2"]:
+    """See `Backend.material_terms`."""
+    return _MaterialTermsFunction.apply(features, alpha, photo, mask)
+
+
+class _MaterialTermsFunction(torch.autograd.Function):
+    """The kernel computes values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        features, alpha = tensors[:2]
+        height, width, n_features = features.shape
+        plane_size = (height + 1) * (width + 2 * _native.library().lanes())
+        struct = MaterialImage(height=height, width=width, n_features=n_features, plane_size=plane_size)
+        terms, g_features, g_alpha = torch.empty(2), torch.empty_like(features), torch.empty_like(alpha)
+        kept = set_pointers(struct, dict(zip(("features", "alpha", "photo", "mask"), tensors, strict=True)))
+        kept += set_pointers(struct, scratch=scratch(PLANES * plane_size), terms=terms)
+        set_pointers(struct, g_features=g_features, g_alpha=g_alpha)
+        _native.library().material_loss(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(g_features, g_alpha)
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        g_features, g_alpha = ctx.saved_tensors
+        return v_terms[1] * g_features, v_terms[0] * g_alpha, None, None

@@ -1,0 +1,167 @@
+// Material of Gaussians, their indirect light, and loss terms of rendered materials, with adjoints (`Backend`:
+// corner_features, bounce, material_terms); `v_x` is the gradient of x.
+#pragma once
+#include "image.h"
+#include "sh_shade.h"
+
+enum { FEATURES = 7, BATCH = 32 };   // features of a corner; Gaussians whose activations are computed at once
+
+struct Activation {
+    const float *albedo_logits, *roughness_logits, *normal_offset;
+    int n, threads;
+    float temperature;
+    float *corners, *albedo;   // albedo: mean of the corners
+    const float *v_corners, *v_albedo;
+    float *v_albedo_logits, *v_roughness_logits, *v_normal_offset;
+};
+
+static void activate_share(const Activation& m, int share) {
+    int end = share_start(m.n, share + 1, m.threads);
+    float inverse = 1 / m.temperature;
+    for (int first = share_start(m.n, share, m.threads); first < end; first += BATCH) {
+        int count = imin2(BATCH, end - first);
+        float albedo[12 * BATCH + LANES], rough[4 * BATCH + LANES];
+        for (int i = 0; i < 12 * count; i += LANES)
+            store(albedo + i, sigmoid(inverse * load_some(m.albedo_logits + 12 * (i64)first + i, 12 * count - i)));
+        for (int i = 0; i < 4 * count; i += LANES)
+            store(rough + i, sigmoid(inverse * load_some(m.roughness_logits + 4 * (i64)first + i, 4 * count - i)));
+        for (int g = 0; g < count; g++) {
+            const float *a = albedo + 12 * g, *offset = m.normal_offset + 12 * (i64)(first + g);
+            float* to = m.corners + 4 * FEATURES * (i64)(first + g);
+            for (int corner = 0; corner < 4; corner++, to += FEATURES) {
+                for (int j = 0; j < 3; j++) to[j] = a[3 * corner + j], to[4 + j] = offset[3 * corner + j];
+                to[3] = rough[4 * g + corner];
+            }
+            for (int j = 0; j < 3; j++) m.albedo[3 * (i64)(first + g) + j] = 0.25f * (a[j] + a[3 + j] + a[6 + j] + a[9 + j]);
+        }
+    }
+}
+
+static void activate_adjoint_share(const Activation& m, int share) {
+    int end = share_start(m.n, share + 1, m.threads);
+    float inverse = 1 / m.temperature;
+    for (i64 g = share_start(m.n, share, m.threads); g < end; g++)
+        for (int corner = 0; corner < 4; corner++) {
+            i64 at = 4 * g + corner;
+            const float *value = m.corners + FEATURES * at, *v = m.v_corners + FEATURES * at;
+            for (int j = 0; j < 3; j++) {
+                float slope = inverse * value[j] * (1 - value[j]);
+                m.v_albedo_logits[3 * at + j] = slope * (v[j] + 0.25f * m.v_albedo[3 * g + j]);
+                m.v_normal_offset[3 * at + j] = v[4 + j];
+            }
+            m.v_roughness_logits[at] = inverse * value[3] * (1 - value[3]) * v[3];
+        }
+}
+
+struct Indirect {
+    const float *albedo, *transfer, *directions, *radiance;
+    int n, n_directions;
+    float* out;
+    const float* v_out;
+    float *v_albedo, *v_radiance;
+};
+
+static void bounce_values(const Indirect& s, bool adjoint) {
+    float coefficients[9][3], per_direction = 12.566370614f / s.n_directions;
+    vf sums[9][3] = {}, projected[9][3] = {};
+    for (int first = 0; first < s.n_directions; first += LANES) {
+        int count = imin2(LANES, s.n_directions - first);
+        vf Y[16];
+        harmonics(9, gather3(s.directions, first, count), Y);
+        for (int ch = 0; ch < 3; ch++) {
+            vf radiance = keep(lane_index() < count, gather(s.radiance, 3, ch, first, count));
+            for (int k = 0; k < 9; k++) projected[k][ch] += Y[k] * radiance;
+        }
+    }
+    for (int k = 0; k < 9; k++)
+        for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(projected[k][ch]);
+    for (int first = 0; first < s.n; first += LANES) {
+        int count = imin2(LANES, s.n - first);
+        vi inside = lane_index() < count;
+        vf t[9];
+        for (int k = 0; k < 9; k++) t[k] = gather(s.transfer, 9, k, first, count);
+        vf hidden = 1.0f - vmin(vmax(t[0] * 1.12837917f, vf{}), splat(1.0f));
+        for (int ch = 0; ch < 3; ch++) {
+            vf irradiance = {}, a = gather(s.albedo, 3, ch, first, count);
+            for (int k = 0; k < 9; k++) irradiance += t[k] * coefficients[k][ch];
+            vf rest = 1.0f - a * hidden, inverse = 1.0f / vmax(rest, splat(1e-3f)), lit = vmax(irradiance, vf{});
+            if (!adjoint) {
+                scatter(s.out, 3, ch, first, count, 0.318309886f * a * lit * inverse);
+                continue;
+            }
+            vf v = keep(inside, 0.318309886f * gather(s.v_out, 3, ch, first, count));
+            vf v_lit = keep(irradiance >= 0.0f, v * a * inverse);
+            vf grows = keep(rest >= 1e-3f, a * hidden * inverse);
+            scatter(s.v_albedo, 3, ch, first, count, v * lit * inverse * (1.0f + grows));
+            for (int k = 0; k < 9; k++) sums[k][ch] += v_lit * t[k];
+        }
+    }
+    if (!adjoint) return;
+    for (int k = 0; k < 9; k++)
+        for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(sums[k][ch]);
+    for (int first = 0; first < s.n_directions; first += LANES) {
+        int count = imin2(LANES, s.n_directions - first);
+        vf Y[16];
+        harmonics(9, gather3(s.directions, first, count), Y);
+        for (int ch = 0; ch < 3; ch++) scatter(s.v_radiance, 3, ch, first, count, series(coefficients, Y, ch, 9));
+    }
+}
+
+struct MaterialImage {
+    const float *features, *alpha;
+    const u8 *photo, *mask;
+    int height, width, n_features, plane_size;
+    float* scratch;   // 11 planes
+    float *terms, *g_features, *g_alpha;
+};
+
+// Sum of |x_b - x_a| w over pairs of neighbours a and b = a + step, and its gradient; w is the mean of e^-|difference|
+// over the channels of the photo.
+static float smoothness(float* const* x, float* const* g, float* const* photo, int height, int width, int stride, i64 step,
+                        float factor) {
+    vf sum = {};
+    for (int y = 0; y < height; y++)
+        for (int c = 0; c < width; c += LANES) {
+            i64 a = (i64)y * stride + c, b = a + step;
+            vf weight = {};
+            for (int j = 0; j < 3; j++) weight += vexp(-vabs(load(photo[j] + b) - load(photo[j] + a)));
+            weight = keep(lane_index() < width - c, weight * (1.0f / 3.0f));
+            for (int j = 0; j < 4; j++) {
+                vf difference = load(x[j] + b) - load(x[j] + a);
+                sum += weight * vabs(difference);
+                vf v = factor * (keep(difference > 0.0f, weight) - keep(difference < 0.0f, weight));
+                store(g[j] + b, load(g[j] + b) + v), store(g[j] + a, load(g[j] + a) - v);
+            }
+        }
+    return factor * sum_of(sum);
+}
+
+static void material_terms(const MaterialImage& m) {
+    float *plane[11], per_pixel = 1 / ((float)m.height * m.width), error_sum = 0;
+    for (int i = 0; i < 11; i++) plane[i] = m.scratch + (i64)i * m.plane_size;
+    float *const *x = plane, *const *g = plane + 4, *const *photo = plane + 8;
+    int stride = m.plane_size / (m.height + 1);
+    for (int i = 0; i < 11; i++) clear(plane[i], 4 * (i64)m.plane_size);
+    for (int y = 0; y < m.height; y++)
+        for (int c = 0; c < m.width; c++) {
+            i64 at = (i64)y * m.width + c, to = (i64)y * stride + c;
+            bool object = m.mask[at] == 255;
+            for (int j = 0; j < 3; j++) photo[j][to] = m.photo[3 * at + j] / 255.0f;
+            if (object && m.alpha[at] > 0.5f)
+                for (int j = 0; j < 4; j++) x[j][to] = m.features[m.n_features * at + j];
+            float error = m.mask[at] == 128 ? 0 : m.alpha[at] - object;
+            error_sum += error * error, m.g_alpha[at] = 2 * per_pixel * error;
+        }
+    float across = m.width > 1 ? 1 / (4.0f * m.height * (m.width - 1)) : 0;
+    float down = m.height > 1 ? 1 / (4.0f * (m.height - 1) * m.width) : 0;
+    m.terms[0] = per_pixel * error_sum;
+    m.terms[1] = smoothness(x, g, photo, m.height, m.width - 1, stride, 1, across) +
+                 smoothness(x, g, photo, m.height - 1, m.width, stride, stride, down);
+    clear(m.g_features, 4 * (i64)m.height * m.width * m.n_features);
+    for (int y = 0; y < m.height; y++)
+        for (int c = 0; c < m.width; c++) {
+            i64 at = (i64)y * m.width + c, from = (i64)y * stride + c;
+            if (m.mask[at] == 255 && m.alpha[at] > 0.5f)
+                for (int j = 0; j < 4; j++) m.g_features[m.n_features * at + j] = g[j][from];
+        }
+}
