@@ -73,6 +73,21 @@ def test_unknown_pixels_carve_nothing() -> None:
     torch.testing.assert_close(carved, sphere.float())
 
 
+def test_a_few_wrong_masks_are_tolerated() -> None:
+    """One of twenty masks is empty."""
+    capture, trajectory = silhouettes(20)
+    masks = capture.masks.clone()
+    masks[7] = BACKGROUND
+    wrong = Capture(capture.images, masks, capture.camera, capture.names, "camera", trajectory)
+    assert not visual_hull.carve(wrong, trajectory, resolution=32).any()
+    inside, true = (
+        visual_hull.carve(each, trajectory, resolution=32, tolerance=tolerance) > 0.5
+        for each, tolerance in ((wrong, 0.05), (capture, 0.0))
+    )
+    assert (inside & true).sum() == true.sum()
+    assert inside.sum() < 1.1 * true.sum()
+
+
 def test_an_empty_hull_is_an_error() -> None:
     capture, trajectory = silhouettes(6)
     nothing = torch.full_like(capture.masks, BACKGROUND)

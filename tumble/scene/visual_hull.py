@@ -26,23 +26,32 @@ class OrientedPoints:
     """Mean distance to the three nearest neighbours [object radius]."""
 
 
-def carve(capture: Capture, trajectory: Trajectory, *, resolution: int) -> Float[Tensor, "x y z"]:
+def carve(
+    capture: Capture, trajectory: Trajectory, *, resolution: int, tolerance: float = 0.0
+) -> Float[Tensor, "x y z"]:
     """Occupancy in [0, 1] of each cell of [-1, 1]^3: the minimum over all frames of the bilinearly sampled masks.
 
     Cells inside the unit sphere that no frame shows are occupied; cells outside the sphere are empty.
+
+    Args:
+        tolerance: Fraction of the frames whose masks or poses may be wrong: as many of the smallest samples of each
+            cell are ignored.
     """
     like = {"dtype": trajectory.T_cam_obj.xyz.dtype, "device": trajectory.T_cam_obj.xyz.device}
     ticks = (torch.arange(resolution, **like) + 0.5) / resolution * 2 - 1
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
-    inside = (x_obj.norm(dim=-1) <= 1).to(**like)
+    smallest = torch.ones(1 + int(tolerance * len(trajectory)), len(x_obj), **like)
     for frame in range(len(trajectory)):
         uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj)
         mask = (capture.masks[frame] != BACKGROUND).to(**like)
         at = (uv / size * 2 - 1)[None, None]
         sampled = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         in_image = ((uv > 0) & (uv < size)).all(-1)
-        inside = torch.minimum(inside, torch.where(in_image, sampled, 1.0))
+        value = torch.where(in_image, sampled, 1.0)
+        for k in range(len(smallest)):
+            smallest[k], value = torch.minimum(smallest[k], value), torch.maximum(smallest[k], value)
+    inside = smallest[-1] * (x_obj.norm(dim=-1) <= 1)
     return inside.reshape(resolution, resolution, resolution)
 
 

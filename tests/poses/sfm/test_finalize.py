@@ -43,6 +43,19 @@ def test_the_object_fills_the_unit_sphere(result: PoseResult) -> None:
     assert (result.colours - 0.127).abs().max() < 0.01, "code value 100 is 0.127 of linear light"
 
 
+def test_a_sphere_that_the_silhouettes_contradict_is_replaced_by_that_of_the_hull() -> None:
+    """Few frontier points, where hands hide contours, may give a sphere of half the size."""
+    scene, lost = tumbling(24), torch.zeros(24, dtype=torch.bool)
+    solution = Solution(scene.T_cam_obj.rotation.matrix(), scene.T_cam_obj.xyz / DISTANCE, 0.7 / DISTANCE, lost * 0.0)
+    true = torch.tensor(0.9 / DISTANCE, dtype=torch.float64)
+    origin = torch.zeros(3, dtype=torch.float64)
+    centre, radius = finalize._better_sphere(scene.capture, solution, (origin, 0.5 * true), lost)
+    assert centre.norm() < 0.25 * true, "knobs stick out"
+    assert 0.9 * true < radius < 1.2 * true
+    good = origin, 1.05 * true
+    assert finalize._better_sphere(scene.capture, solution, good, lost) is good
+
+
 def test_frames_without_observations_are_lost_and_interpolated(result: PoseResult) -> None:
     assert torch.nonzero(result.quality.lost)[:, 0].tolist() == [7, 12]
     true = tumbling(24).T_cam_obj.rotation.matrix()

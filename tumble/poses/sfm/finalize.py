@@ -56,8 +56,20 @@ MIN_TURNTABLE_RANGE = math.radians(90)
 """Smallest rotation range of a turntable [radians]; during smaller rotations other axes hardly move either."""
 MAX_TURNTABLE_TILT = math.radians(60)
 """Largest angle between the axis of a turntable and up in the image, which is the elevation of the camera [radians]."""
+HULL_TOLERANCES = (0.0, 0.05)
+"""Fractions of the frames that may carve a cell in error, of which the one is used whose visual hull overlaps best: a
+single wrong mask carves the object away, but a hull that tolerates errors is too large where there are none."""
 HULL_RESOLUTION = 48
 """Cells per side of the visual hull's grid; also rays per side of the image in which its silhouette is compared."""
+CONFIRMED_OVERLAP = 0.9
+"""Median overlap above which the silhouettes confirm a sphere around the object (IoU)."""
+HULL_MARGIN = 1.6
+"""Radius of the sphere in which the visual hull is searched for, over the object's approximate radius."""
+MIN_HULL_CELLS = 50
+"""Smallest number of cells of a visual hull around which a sphere is drawn."""
+
+Sphere = tuple[Float[Tensor, "3"], Float[Tensor, ""]]
+"""Centre and radius of a sphere around the object [mean distance]."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +108,13 @@ def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: 
     lost = ~relocalization.longest_smooth_sequence(R, ~lost)
     reliable = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < INLIER_THRESHOLD).float()) >= 3
     few = len(frontier_points) < 50
-    centre, scale = _bounding_sphere(torch.cat([frontier_points, X[reliable]]) if few else frontier_points)
-    R_first = R[0]
-    origin = t + R @ centre
-    T = SE3.from_rotation(SO3.from_matrix(R @ R_first.mT), origin / scale)
-    lost, overlap = _reject_by_overlap(capture, Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light), lost)
+    sphere = _bounding_sphere(torch.cat([frontier_points, X[reliable]]) if few else frontier_points)
+    sphere = _better_sphere(capture, solution, sphere, lost)
+    R_first, (centre, scale) = R[0], sphere
+    T = _in_sphere(solution, sphere)
+    lost, overlap = _reject_by_overlap(capture, _trajectory(T, capture), lost)
     T = _interpolate_lost(T, lost)
-    trajectory = Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light)
+    trajectory = _trajectory(T, capture)
     points = ((X[reliable] - centre) / scale) @ R_first.mT
     colours = _point_colours(capture, tracks, residual, reliable)
     observability = _observability(capture, contours, solution, problem, scene, residual < INLIER_THRESHOLD)
@@ -181,7 +193,7 @@ def _residuals_per_frame(
     return median, torch.stack([(g < INLIER_THRESHOLD).sum() for g in groups]).double()
 
 
-def _bounding_sphere(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+def _bounding_sphere(points: Float[Tensor, "n 3"]) -> Sphere:
     """Centre and radius of the smallest sphere around all points but outliers."""
     if len(points) < 4:
         return torch.zeros(3, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
@@ -191,6 +203,41 @@ def _bounding_sphere(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], 
         points = points[distance <= OUTLIER_DISTANCE * distance.quantile(0.95)]
         centre = smallest_enclosing_sphere(lambda x, points=points: points - x, centre, steps=SPHERE_STEPS)
     return centre, (points - centre).norm(dim=-1).max()
+
+
+def _better_sphere(capture: Capture, solution: Solution, sphere: Sphere, lost: Bool[Tensor, " t"]) -> Sphere:
+    """The sphere of the frontier points, or that of the visual hull if silhouettes confirm that instead.
+
+    Frontier points are few and wrong where hands hide much of the contours. A sphere that is too small cuts the visual
+    hull off.
+    """
+
+    def overlap(sphere: Sphere) -> float:
+        trajectory = _trajectory(_in_sphere(solution, sphere), capture)
+        return float(_hull_overlap(capture, trajectory, lost, 0.0)[~lost].median())
+
+    if bool(lost.all()) or (confirmed := overlap(sphere)) > CONFIRMED_OVERLAP:
+        return sphere
+    kept = torch.nonzero(~lost)[:, 0]
+    large = torch.zeros_like(sphere[0]), HULL_MARGIN * sphere[1].new_tensor(solution.radius)
+    trajectory = _trajectory(_in_sphere(solution, large), capture).select(kept)
+    frames = _select_frames(capture, kept.tolist())
+    hull = visual_hull.carve(frames, trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCES[-1])
+    cells = ((torch.nonzero(hull > 0.5) + 0.5) / HULL_RESOLUTION * 2 - 1).double()
+    if len(cells) < MIN_HULL_CELLS:
+        return sphere
+    centre, scale = _bounding_sphere(cells @ solution.R[0] * large[1])
+    return max((sphere, confirmed), ((centre, scale), overlap((centre, scale))), key=lambda pair: pair[1])[0]
+
+
+def _in_sphere(solution: Solution, sphere: Sphere) -> SE3:
+    """Poses whose object frame has the sphere as unit sphere and the axes of the first camera."""
+    R, (centre, scale) = solution.R, sphere
+    return SE3.from_rotation(SO3.from_matrix(R @ R[0].mT), (solution.t + R @ centre) / scale)
+
+
+def _trajectory(T: SE3, capture: Capture) -> Trajectory:
+    return Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light)
 
 
 def _interpolate_lost(T: SE3, lost: Bool[Tensor, " t"]) -> SE3:
@@ -232,7 +279,8 @@ def _reject_by_overlap(
     Several wrong frames distort the visual hull of all, which is therefore carved again without the rejected frames.
     """
     for _ in range(3):
-        overlap = _hull_overlap(capture, trajectory, lost)
+        overlaps = [_hull_overlap(capture, trajectory, lost, tolerance) for tolerance in HULL_TOLERANCES]
+        overlap = max(overlaps, key=lambda each: float(each[~lost].sum()))
         if bool(lost.all()):
             break
         contradicted = overlap < overlap[~lost].median() - MAX_OVERLAP_DEFICIT
@@ -242,13 +290,18 @@ def _reject_by_overlap(
     return lost, overlap
 
 
-def _hull_overlap(capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"]) -> Float[Tensor, " t"]:
+def _hull_overlap(
+    capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"], tolerance: float
+) -> Float[Tensor, " t"]:
     """Intersection over union of all silhouettes with that of the visual hull of the frames that are not lost."""
     kept = torch.nonzero(~lost)[:, 0]
     if not len(kept):
         return torch.zeros(len(capture))
     inside = visual_hull.carve(
-        _select_frames(capture, kept.tolist()), trajectory.select(kept), resolution=HULL_RESOLUTION
+        _select_frames(capture, kept.tolist()),
+        trajectory.select(kept),
+        resolution=HULL_RESOLUTION,
+        tolerance=tolerance,
     )
     camera = capture.camera.resized(HULL_RESOLUTION, HULL_RESOLUTION)
     depth_one = torch.ones(HULL_RESOLUTION, HULL_RESOLUTION)
