@@ -34,6 +34,7 @@ from tumble.preprocess.colour_model import (
 )
 from tumble.preprocess.hands import Hand, arm_region, hand_strokes, hand_surroundings
 from tumble.preprocess.segmentation import Masks, Seed
+from tumble.scene import OBJECT, UNKNOWN
 
 STROKE_LOG_ODDS = 3.0
 """Log odds of a hand at its landmarks, against the other classes."""
@@ -56,8 +57,8 @@ ISLAND_PROBABILITY = 0.6
 MIN_ISLAND_LOG_RATIO = 1.0
 """Minimum mean log likelihood ratio of object to hand in an island away from the predicted object, and of a pixel that
 belongs to an island where no hand was detected."""
-MAX_ISLAND_LOG_RATIO = 4.0
-"""Limit of the log likelihood ratios that are averaged over an island."""
+MAX_AVERAGED_LOG_RATIO = 4.0
+"""Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
 MAX_HOLE_FRACTION = 0.3
 """Maximum area of a hole in the predicted object that is expected to be its print, as a fraction of the object's."""
 SEED_ITERATIONS = 2
@@ -99,6 +100,8 @@ class _State:
 
     probabilities: Float32[np.ndarray, "3 h w"]
     inside: Bool[np.ndarray, "h w"]
+    doubtful: Bool[np.ndarray, "h w"]
+    """Pixels close to the landmarks whose colour is the hand's rather than the object's."""
 
 
 def segment(
@@ -167,7 +170,7 @@ def _segment_seed(
         trimap[segmentation.disc_around(seed.click, box)] = cv2.GC_FGD
     empty = np.zeros(frame.differs.shape, bool)
     if not (trimap & 1).any() or (trimap & 1).all():
-        return _State(np.zeros((3, *empty.shape), np.float32), empty), ColourModel(hand, hand, hand)
+        return _State(np.zeros((3, *empty.shape), np.float32), empty, empty), ColourModel(hand, hand, hand)
     rough = segmentation.main_components(segmentation.grabcut(frame.image, trimap, 5), box)
     unlearnt = np.zeros_like(hand)
     colours = ColourModel(unlearnt, hand, unlearnt).updated(
@@ -182,7 +185,7 @@ def _segment_seed(
     prior[:] = np.array(SEED_PRIOR["rest"], np.float32)[:, None, None]
     for name, region in reversed(list(zip(SEED_PRIOR, regions, strict=False))):
         prior[:, region] = np.array(SEED_PRIOR[name], np.float32)[:, None]
-    state = _State(prior, rough)
+    state = _State(prior, rough, empty)
     for _ in range(SEED_ITERATIONS):
         state = _segment_frame(frame, prior, state.inside | (box & ~static), box, background, colours)
         certain = state.inside & (state.probabilities[OBJECT_CLASS] > CERTAIN)
@@ -207,7 +210,8 @@ def _track(
         state = _segment_frame(frame, prior, predicted, _filled(predicted), background, colours)
         agreement, new_area = segmentation.overlap(predicted, state.inside), int(state.inside.sum())
         if segmentation.is_lost(agreement, new_area):
-            state, agreement = _State(_without_object(state.probabilities), np.zeros_like(predicted)), 0.0
+            nothing = np.zeros_like(predicted)
+            state, agreement = _State(_without_object(state.probabilities), nothing, nothing), 0.0
         else:
             colours = _updated(colours, frame, state, predicted)
         uncertain = lost or segmentation.is_uncertain(agreement, area, new_area)
@@ -235,8 +239,7 @@ def _islands(
     No hand covers them, and they do not reach the border of the image, as arms do. They are near the predicted object,
     or they have its colours and are next to a hand; any place will do if the object was not predicted anywhere.
     """
-    log_object, log_hand, _ = log_likelihoods(frame.image, background, colours, frame.sampled)
-    log_ratio = cv2.blur((log_object - log_hand).clip(-MAX_ISLAND_LOG_RATIO, MAX_ISLAND_LOG_RATIO), (3, 3))
+    log_ratio = _object_over_hand(log_likelihoods(frame.image, background, colours, frame.sampled))
     hand = log_ratio < MIN_ISLAND_LOG_RATIO if frame.surroundings is None else frame.surroundings
     count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
     size = np.bincount(ids.ravel(), minlength=count)
@@ -250,6 +253,12 @@ def _islands(
     chosen = (size >= segmentation.MIN_PIXELS) & ((near & (mean > 0)) | coloured) & ~_at_border(ids, count)
     chosen[0] = False
     return chosen[ids]
+
+
+def _object_over_hand(log_likelihood: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "h w"]:
+    """Log likelihood ratio of object to hand, limited and averaged over 3 x 3 pixels."""
+    log_ratio = log_likelihood[OBJECT_CLASS] - log_likelihood[HAND_CLASS]
+    return cv2.blur(log_ratio.clip(-MAX_AVERAGED_LOG_RATIO, MAX_AVERAGED_LOG_RATIO), (3, 3))
 
 
 def _raised(prior: Float32[np.ndarray, "3 h w"], where: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "3 h w"]:
@@ -275,7 +284,9 @@ def _segment_frame(
             object's print.
     """
     log_ratio = log_likelihoods(frame.image, background, colours, frame.sampled)
+    doubtful = np.zeros_like(predicted)
     if frame.surroundings is not None:
+        doubtful = frame.surroundings & (_object_over_hand(log_ratio) < 0)
         far = expected & ~frame.surroundings
         log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)
     log_ratio = np.maximum(log_ratio, log_ratio.max(0) - MAX_LOG_RATIO)
@@ -285,7 +296,7 @@ def _segment_frame(
     log_ratio[HAND_CLASS, frame.arm & ~inner] += ARM_LOG_ODDS
     probabilities = class_probabilities(log_ratio + np.log(prior), frame.image)
     inside = _connected(probabilities.argmax(0) == OBJECT_CLASS, predicted)
-    return _State(np.where(inside, probabilities, _without_object(probabilities)), inside)
+    return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful)
 
 
 def _connected(mask: Bool[np.ndarray, "h w"], predicted: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -339,7 +350,9 @@ def _updated(colours: ColourModel, frame: _Frame, state: _State, predicted: Bool
 
 
 def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
-    """Three-valued mask. What moves is unknown, and so is a pixel of unknown background near the object."""
+    """Three-valued mask. What moves is unknown, and so are doubtful pixels and unknown background near the object."""
     near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
     unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & ~frame.known)
-    return segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
+    labels = segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
+    labels[state.doubtful & (labels == OBJECT)] = UNKNOWN
+    return labels
