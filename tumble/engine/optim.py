@@ -58,7 +58,11 @@ class Adam:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Move every leaf that has a gradient."""
+        """Move every leaf that has a gradient.
+
+        Raises:
+            RuntimeError: torch has no fused kernel for the device.
+        """
         for group in self.param_groups:
             leaf = group["params"][0]
             if leaf.grad is None:
@@ -69,10 +73,11 @@ class Adam:
                 self.state[leaf] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
             state = self.state[leaf]
             state["step"] += 1
-            torch._fused_adam_(
+            torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
                 [leaf],
                 [leaf.grad],
-                *([state[key]] for key in MOMENTS),
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
                 [],
                 [state["step"]],
                 lr=group["lr"],

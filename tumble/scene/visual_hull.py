@@ -36,13 +36,16 @@ def carve(capture: Capture, trajectory: Trajectory, *, resolution: int) -> Float
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
     inside = (x_obj.norm(dim=-1) <= 1).to(**like)
+    left = torch.where(inside > 0)[0]
     for frame in range(len(trajectory)):
-        uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj)
+        uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj.index_select(0, left))
         mask = (capture.masks[frame] != BACKGROUND).to(**like)
         at = (uv / size * 2 - 1)[None, None]
         sampled = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         in_image = ((uv > 0) & (uv < size)).all(-1)
-        inside = torch.minimum(inside, torch.where(in_image, sampled, 1.0))
+        occupancy = torch.minimum(inside.index_select(0, left), torch.where(in_image, sampled, 1.0))
+        inside[left] = occupancy
+        left = left[occupancy > 0]
     return inside.reshape(resolution, resolution, resolution)
 
 
