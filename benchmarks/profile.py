@@ -25,6 +25,7 @@ from torch.profiler import ProfilerActivity, profile, record_function
 
 from benchmarks.kernels import machine
 from tumble.datasets import folder
+from tumble.engine import optim
 from tumble.inverse_rendering import decompose, losses, refine, sh_lighting
 from tumble.io import files
 from tumble.recipes import DRAFT, Recipe, known_poses
@@ -37,14 +38,14 @@ PARTS: dict[str, dict[str, list[tuple[Any, str]]]] = {
         "colour": [(sh_lighting, "radiance")],
         "losses": [(refine, "_terms")],
         "backward": [(torch.Tensor, "backward")],
-        "optimizer": [(torch.optim.Adam, "step"), (torch.optim.Adam, "zero_grad")],
+        "optimizer": [(optim.Adam, "step"), (optim.Adam, "zero_grad")],
     },
     "decompose": {
         "render": [(decompose, "corner_features"), (decompose, "rasterize_material")],
         "colour": [(decompose, "_bounce"), (decompose, "_shade")],
         "losses": [(losses, "light_smoothness"), (losses, "material_terms")],
         "backward": [(torch.Tensor, "backward")],
-        "optimizer": [(torch.optim.Adam, "step"), (torch.optim.Adam, "zero_grad")],
+        "optimizer": [(optim.Adam, "step"), (optim.Adam, "zero_grad")],
     },
 }
 """Functions of each part; everything else is bookkeeping."""

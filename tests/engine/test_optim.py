@@ -1,5 +1,7 @@
 """Leaves, learning rates and moments, compared with Adam written out in float64."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -281,7 +283,7 @@ def test_second_moments_stay_non_negative_under_a_map_that_overshoots() -> None:
 # To and from the disk -------------------------------------------------------------------------------------------------
 
 
-def trained(steps: int) -> tuple[Scene, torch.optim.Adam]:
+def trained(steps: int) -> tuple[Scene, optim.Adam]:
     scene = make_scene(dtype=torch.float32)
     optimizer = adam(scene, {"": 0.1, "gamma": 0.0})
     for step in range(steps):
@@ -329,3 +331,22 @@ def test_linear_maps_are_recognised() -> None:
     like = torch.zeros(3, 4)
     assert all(optim._is_linear(fn, like) for fn in (finer, lambda x: x.mean(0)))
     assert not any(optim._is_linear(fn, like) for fn in (lambda x: x + 1, lambda x: x.exp().mean(0).log()))
+
+
+def test_adam_does_what_the_class_of_torch_does_bit_for_bit_without_importing_its_compiler() -> None:
+    program = """if True:
+        import sys, torch
+        from tumble.engine.optim import adam, descend, leaves
+        mine, other = leaves({"x": torch.linspace(-1, 1, 101)}), torch.linspace(-1, 1, 101, requires_grad=True)
+        optimizer = adam(mine, {"": 0.1})
+        for step in range(5):
+            descend((mine["x"] - 0.3).square().sum(), optimizer, step=step)
+        assert "torch._dynamo" not in sys.modules
+        reference = torch.optim.Adam([other], lr=0.1, eps=1e-15, fused=True)
+        for step in range(5):
+            reference.zero_grad()
+            (other - 0.3).square().sum().backward()
+            reference.step()
+        assert torch.equal(mine["x"], other)
+    """
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

@@ -1,6 +1,8 @@
 """Group axioms, also near the identity and the angle pi; SciPy and the matrix exponential as oracles."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -244,3 +246,13 @@ def test_umeyama_accepts_points_in_a_plane() -> None:
     _, rotation, offset = umeyama(x_b, T @ x_b)
     same(rotation.matrix(), T.rotation.matrix())
     same(offset, T.xyz)
+
+
+def test_poses_need_no_symbolic_mathematics() -> None:
+    program = """if True:
+        import sys, torch
+        from tumble.maths import SE3, SO3
+        assert SE3.from_rotation(SO3.identity(), torch.zeros(5, 3)).wxyz.shape == (5, 4)
+        assert "sympy" not in sys.modules
+    """
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

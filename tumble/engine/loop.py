@@ -49,7 +49,7 @@ class State:
     """Number of steps made; only `drive` increments it."""
     params: Any
     """A tree of leaf tensors. Shapes may change during training, names may not."""
-    optimizer: torch.optim.Adam | None
+    optimizer: optim.Adam | None
     """Optimizer of leaves of `params`. The set of leaves is fixed in `init`; leaves that are trained only later have
     learning rate 0 until then (`optim.anneal`)."""
     rng: torch.Generator

@@ -9,8 +9,9 @@ transfer the moments and return a new tree, whose leaves replace the old ones in
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -21,7 +22,7 @@ from tumble.io import tree as trees
 T = TypeVar("T")
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-"""Keys of the moments in the state of torch's Adam: running means of the gradient and of its square."""
+"""Keys of the moments in the state of Adam: running means of the gradient and of its square."""
 
 
 class NotFinite(ValueError):
@@ -31,6 +32,62 @@ class NotFinite(ValueError):
         self.name, self.step, self.part, self.state_file = name, step, part, state_file
         message = f"{part + ' of ' if part else ''}{name} is not finite at step {step}"
         super().__init__(message + (f"; the last valid state is in {state_file}" if state_file else ""))
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Adam (Kingma and Ba 2015) with the fields of `torch.optim.Adam`, and with the kernel that its fused step calls.
+
+    The class of torch itself imports its compiler, which takes two seconds, and spends more time around the kernel than
+    the kernel takes.
+    """
+
+    param_groups: list[dict[str, Any]]
+    """One group per leaf."""
+    betas: tuple[float, float]
+    """Decay rates of the moments."""
+    eps: float
+    """Constant against division by zero."""
+    state: dict[Tensor, dict[str, Tensor]] = field(default_factory=dict)
+    """Moments and number of steps (`step`) of each leaf that has had a gradient."""
+
+    def zero_grad(self) -> None:
+        """Forget the gradients of all leaves."""
+        for group in self.param_groups:
+            group["params"][0].grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move every leaf that has a gradient.
+
+        Raises:
+            RuntimeError: torch has no fused kernel for the device.
+        """
+        for group in self.param_groups:
+            leaf = group["params"][0]
+            if leaf.grad is None:
+                continue
+            if leaf not in self.state:
+                first, second = (torch.zeros_like(leaf, memory_format=torch.preserve_format) for _ in MOMENTS)
+                count = torch.zeros((), dtype=torch.float32, device=leaf.device)
+                self.state[leaf] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
+            state = self.state[leaf]
+            state["step"] += 1
+            torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
+                [leaf],
+                [leaf.grad],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                lr=group["lr"],
+                beta1=self.betas[0],
+                beta2=self.betas[1],
+                weight_decay=0.0,
+                eps=self.eps,
+                amsgrad=False,
+                maximize=False,
+            )
 
 
 def leaves(tree: T) -> T:
@@ -46,8 +103,8 @@ def leaves(tree: T) -> T:
 
 def adam(
     tree: object, rates: dict[str, float], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15
-) -> torch.optim.Adam:
-    """Adam over the float leaves of a tree, one group each, with the fused kernel where torch has one for the device.
+) -> Adam:
+    """Adam over the float leaves of a tree, one group each.
 
     Args:
         tree: Result of `leaves`. Leaves with rate 0 are frozen in place: they have no group and require no gradient.
@@ -73,13 +130,10 @@ def adam(
             groups.append({"params": [leaf], "lr": rate, "name": name, "base": rate})
     if not groups:
         raise ValueError("every leaf has learning rate 0: there is nothing to train")
-    try:
-        return torch.optim.Adam(groups, betas=betas, eps=eps, fused=True)
-    except RuntimeError:  # torch has no fused kernel for this device
-        return torch.optim.Adam(groups, betas=betas, eps=eps)
+    return Adam(groups, betas, eps)
 
 
-def anneal(optimizer: torch.optim.Adam, factor: dict[str, float] | float) -> None:
+def anneal(optimizer: Adam, factor: dict[str, float] | float) -> None:
     """Set learning rates to their initial value times a factor; leaves that match no key keep their current rate.
 
     A rate of 0 freezes the values, but their moments are still updated.
@@ -91,13 +145,13 @@ def anneal(optimizer: torch.optim.Adam, factor: dict[str, float] | float) -> Non
             group["lr"] = group["base"] * table[key]
 
 
-def descend(loss: Float[Tensor, ""], optimizer: torch.optim.Adam, *, step: int) -> None:
+def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     """One optimizer step on `loss`; leaves that the loss does not depend on keep their values and moments.
 
     Raises:
         NotFinite: The loss or a gradient holds NaN or infinity; no leaf was changed.
     """
-    optimizer.zero_grad(set_to_none=True)
+    optimizer.zero_grad()
     loss.backward()
     gradients = {name: x.grad for name, x in _named_leaves(optimizer) if x.grad is not None}
     # One scalar covers all gradients, so that each step waits for the device only once.
@@ -123,7 +177,7 @@ def first_not_finite(named: Iterable[tuple[str, Tensor]]) -> str | None:
 # Leaves that change their shape ---------------------------------------------------------------------------------------
 
 
-def regrow(tree: T, optimizer: torch.optim.Adam, index: Int64[Tensor, " m"], fresh: Bool[Tensor, " m"]) -> T:
+def regrow(tree: T, optimizer: Adam, index: Int64[Tensor, " m"], fresh: Bool[Tensor, " m"]) -> T:
     """The tree with rows of every leaf gathered together with their moments, for pruning, cloning and splitting.
 
     The caller may edit fresh rows of the new leaves in place, under `torch.no_grad()`.
@@ -151,7 +205,7 @@ def regrow(tree: T, optimizer: torch.optim.Adam, index: Int64[Tensor, " m"], fre
 
 def resample(
     tree: T,
-    optimizer: torch.optim.Adam,
+    optimizer: Adam,
     name: str,
     fn: Callable[[Tensor], Tensor],
     *,
@@ -188,7 +242,7 @@ def resample(
     return trees.map(lambda leaf: _replaced(leaf, values, optimizer, transfer) if leaf is old else leaf, tree)
 
 
-def overwrite(tree: T, optimizer: torch.optim.Adam | None, values: dict[str, Tensor]) -> T:
+def overwrite(tree: T, optimizer: Adam | None, values: dict[str, Tensor]) -> T:
     """The tree with new leaves of the given values and any shapes; moments are reset (see `unpack`).
 
     Raises:
@@ -208,7 +262,7 @@ def overwrite(tree: T, optimizer: torch.optim.Adam | None, values: dict[str, Ten
 def _replaced(
     leaf: Tensor,
     values: Tensor,
-    optimizer: torch.optim.Adam | None,
+    optimizer: Adam | None,
     transfer: Callable[[Tensor, str], Tensor],
 ) -> Tensor:
     """A new leaf that replaces an old one in the optimizer; `transfer` maps each moment, given with its key."""
@@ -233,7 +287,7 @@ def _is_linear(fn: Callable[[Tensor], Tensor], like: Tensor) -> bool:
 # To and from the disk -------------------------------------------------------------------------------------------------
 
 
-def pack(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
+def pack(optimizer: Adam) -> dict[str, Tensor]:
     """The optimizer's state as tensors `name/exp_avg`, `name/exp_avg_sq`, `name/step` and `name/lr` (float64)."""
     packed: dict[str, Tensor] = {}
     for group in optimizer.param_groups:
@@ -243,7 +297,7 @@ def pack(optimizer: torch.optim.Adam) -> dict[str, Tensor]:
     return packed
 
 
-def unpack(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+def unpack(optimizer: Adam, tensors: dict[str, Tensor]) -> None:
     """Restore the state returned by `pack` exactly; the leaves must already have their shapes.
 
     Raises:
@@ -261,14 +315,12 @@ def unpack(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
         if wrong := [key for key in MOMENTS if key in state and state[key].shape != leaf.shape]:
             shapes = f"{list(state[wrong[0]].shape)}, not {list(leaf.shape)}"
             raise ValueError(f"{wrong[0]} of {group['name']} has the shape {shapes}")
-        # Without a fused kernel torch keeps the step count on the CPU.
-        devices = {"step": leaf.device if group["fused"] else torch.device("cpu")}
         optimizer.state.pop(leaf, None)
         if state:
-            optimizer.state[leaf] = {key: x.to(devices.get(key, leaf.device), copy=True) for key, x in state.items()}
+            optimizer.state[leaf] = {key: x.to(leaf.device, copy=True) for key, x in state.items()}
 
 
-def _named_leaves(optimizer: torch.optim.Adam) -> list[tuple[str, Tensor]]:
+def _named_leaves(optimizer: Adam) -> list[tuple[str, Tensor]]:
     return [(group["name"], group["params"][0]) for group in optimizer.param_groups]
 
 

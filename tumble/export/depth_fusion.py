@@ -59,14 +59,14 @@ def signed_distances(
     means = gaussians.means
     camera = Camera(camera.fx_fy_cx_cy.to(means), pixels, pixels)
     poses = SE3(poses.wxyz.to(means), poses.xyz.to(means))
-    cell, backs = 2 * HALF_SIDE / cells, _flipped(gaussians)
+    cell, backs, centres = 2 * HALF_SIDE / cells, _flipped(gaussians), camera.pixel_centers().to(means)
     maps, near = [], torch.zeros((cells + 1,) * 3, dtype=torch.bool, device=means.device)
     for i in range(views):
         view = rasterize(gaussians, gamma, poses[i], camera, {})
-        known, x_obj = _surface(view, poses[i], camera, 2 * cell)
+        known, x_obj = _surface(view, poses[i], camera, centres, 2 * cell)
         back = rasterize(backs, gamma, poses[i], camera, {}).alpha
         maps.append(_depth_map(view, known, back, x_obj))
-        at = ((x_obj[known] + HALF_SIDE) / cell).round().long().clamp(0, cells)
+        at = ((x_obj + HALF_SIDE) / cell).round().long().clamp(0, cells)
         near[at[:, 0], at[:, 1], at[:, 2]] = True
     corners = torch.where(_dilated(near, TRUNCATION))
     coarse = torch.cartesian_prod(*[torch.arange(2, cells + 1, 4, device=means.device)] * 3)
@@ -84,11 +84,11 @@ def signed_distances(
 
 
 def _surface(
-    view: Buffers, T_cam_obj: SE3, camera: Camera, spread: float
-) -> tuple[Bool[Tensor, "h w"], Float[Tensor, "h w 3"]]:
+    view: Buffers, T_cam_obj: SE3, camera: Camera, centres: Float[Tensor, "h w 2"], spread: float
+) -> tuple[Bool[Tensor, "h w"], Float[Tensor, "k 3"]]:
     """Mask of pixels that show a single surface (small depth variance), and their surface points, object frame."""
     known = (view.alpha > 0.5) & (view.depth_var < spread**2) & (view.normal.norm(dim=-1) > 0.1)
-    x_cam = camera.unproject(camera.pixel_centers().to(view.depth), view.depth)
+    x_cam = camera.unproject(centres[known], view.depth[known])
     return known, T_cam_obj.inverse() @ x_cam
 
 
@@ -113,11 +113,11 @@ class _DepthMap:
 
 
 def _depth_map(
-    view: Buffers, known: Bool[Tensor, "h w"], back: Float[Tensor, "h w"], x_obj: Float[Tensor, "h w 3"]
+    view: Buffers, known: Bool[Tensor, "h w"], back: Float[Tensor, "h w"], x_obj: Float[Tensor, "k 3"]
 ) -> _DepthMap:
     """Depth map of a view; pixels that show only backs of Gaussians (`back`) look in through a hole: not free space."""
     normal = normalize(view.normal[known], dim=-1)
-    offset = (normal * x_obj[known]).sum(-1)
+    offset = (normal * x_obj).sum(-1)
     state = known.to(torch.int8) - ((view.alpha < 0.5) & (back < 0.5)).to(torch.int8)
     plane_index = (known.flatten().cumsum(0, dtype=torch.int32) - 1).clamp(min=0)
     planes = torch.cat([normal, offset[:, None]], -1)

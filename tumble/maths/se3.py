@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, overload
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -314,7 +315,8 @@ def _proper(U: Tensor, Vh: Tensor) -> Float[Tensor, "3 3"]:
 
 
 def _broadcast(wxyz: Tensor, xyz: Tensor) -> SE3:
-    batch = torch.broadcast_shapes(wxyz.shape[:-1], xyz.shape[:-1])
+    # That of torch imports a library of symbolic mathematics, which takes a second.
+    batch = np.broadcast_shapes(wxyz.shape[:-1], xyz.shape[:-1])
     return SE3(wxyz.expand(*batch, 4), xyz.expand(*batch, 3))
 
 

@@ -43,10 +43,10 @@ def ggx(
     grazing angles.
     """
     rough = _rough(roughness, wo)
-    nol, nov = _cosine(n, wi), _cosine(n, wo)
+    nol, nov = cosine(n, wi), cosine(n, wo)
     above = (nol > 0) & (nov > 0)
     h = _half_vector(wi, wo, n)
-    value = _ndf(h, n, rough) * f0 * fresnel(_cosine(wo, h)) * _visibility(nol, nov, rough)
+    value = _ndf(h, n, rough) * f0 * fresnel(cosine(wo, h)) * _visibility(nol, nov, rough)
     return torch.where(above, value, 0.0)
 
 
@@ -115,9 +115,9 @@ def pdf(
     """Density of `sample` [1 / steradian], also for directions below the horizon; its integral over the sphere is 1."""
     h = _half_vector(wi, wo, n)
     # For wi = -wo the half vector is perpendicular to wo, and the density has a pole.
-    voh = _cosine(wo, h).abs().clamp_min(1e-7)
-    specular = _ndf(h, n, _rough(roughness, wo)) * _cosine(n, h) / (4 * voh)
-    return 0.5 * (_cosine(n, wi).clamp_min(0) / math.pi + specular)
+    voh = cosine(wo, h).abs().clamp_min(1e-7)
+    specular = _ndf(h, n, _rough(roughness, wo)) * cosine(n, h) / (4 * voh)
+    return 0.5 * (cosine(n, wi).clamp_min(0) / math.pi + specular)
 
 
 def split_sum_table(size: int = 64) -> Float[Tensor, "{size} {size}"]:
@@ -160,21 +160,23 @@ def _rough(roughness: float | Tensor, like: Tensor) -> Tensor:
     return torch.as_tensor(roughness, dtype=like.dtype, device=like.device).clamp_min(MIN_ROUGHNESS)
 
 
-def _cosine(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(-1, keepdim=True)
+def cosine(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 1"]:
+    """Dot product, the cosine of the angle between unit vectors."""
+    # A matrix product takes a fraction of the time of a sum over three columns.
+    return (a * b) @ a.new_ones(3, 1)
 
 
 def _half_vector(wi: Tensor, wo: Tensor, n: Tensor) -> Tensor:
     """Half vector of wi and wo, flipped to the normal's side."""
     h = normalize(wi + wo, dim=-1)
-    return torch.where(_cosine(n, h) < 0, -h, h)
+    return torch.where(cosine(n, h) < 0, -h, h)
 
 
 def _ndf(h: Tensor, n: Tensor, rough: Tensor) -> Tensor:
     """GGX normal distribution D [1 / steradian]; D noh integrates to 1 over the hemisphere."""
     a2 = rough**4
     # 1 - noh from the difference of both vectors: 1 - noh^2 would lose all digits at the peak of a smooth lobe.
-    one_minus_noh = 0.5 * (h - n).square().sum(-1, keepdim=True)
+    one_minus_noh = 0.5 * cosine(h - n, h - n)
     return a2 / (math.pi * (a2 * (1 - one_minus_noh).square() + one_minus_noh * (2 - one_minus_noh)).square())
 
 

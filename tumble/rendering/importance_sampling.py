@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
+from tumble import backends
 from tumble.maths import equirect_from_direction, fibonacci_sphere, texel_directions, texel_solid_angles
 from tumble.rendering import brdf
 from tumble.rendering.prefiltered_light import Prefiltered
@@ -73,12 +74,10 @@ def _locate(
     ends: Float64[Tensor, " bins"], x: Float64[Tensor, "*b"]
 ) -> tuple[Int64[Tensor, "*b"], Float64[Tensor, "*b"], Float64[Tensor, "*b"], Float64[Tensor, "*b"]]:
     """Index of the bin that contains x, relative position of x in it (0 to 1), and start and width of the bin."""
-    if len(ends) <= x.numel():
-        bin_ = torch.searchsorted(ends, x.contiguous(), right=True)
-    else:
-        # Ascending numbers find their places in a list of millions in a third of the time.
-        ascending, order = x.flatten().sort()
-        bin_ = torch.empty_like(order).index_copy_(0, order, torch.searchsorted(ends, ascending, right=True))
+    # Nearly ascending numbers find their places in half the time, and 16-bit integers are sorted almost for free.
+    values = x.flatten()
+    order = (values * torch.iinfo(torch.int16).max).short().argsort()
+    bin_ = torch.empty_like(order).index_copy_(0, order, torch.searchsorted(ends, values[order], right=True))
     bin_ = bin_.reshape(x.shape).clamp(max=len(ends) - 1)
     start = torch.where(bin_ > 0, ends[(bin_ - 1).clamp(min=0)], 0.0)
     width = ends[bin_] - start
@@ -143,7 +142,8 @@ def relight_surface(
         bounce: Indirect light; occluded directions are black when None.
     """
     shift = torch.rand(len(surface.points), 1, 3, generator=generator, dtype=albedo.dtype, device=generator.device)
-    diffuse = None if bounce is None else _diffuse(bounce, R_env_obj)
+    diffuse, radiance = None if bounce is None else _diffuse(bounce, R_env_obj), light.environment.radiance
+    backend = backends.choose(albedo.device, albedo.dtype)
     chunk = max(1, MAX_RAYS // (n_brdf + n_light))
     parts = [albedo.new_zeros(0, 3)]
     for at in torch.arange(len(surface.points), device=albedo.device).split(chunk):
@@ -152,26 +152,27 @@ def relight_surface(
         scattered = brdf.sample(u[:, :n_brdf], views, normals, roughness=rough)
         directions = torch.cat([scattered, light.sample(u[:, n_brdf:, 1:]) @ R_env_obj], 1)
         # All that follows is for the directions above the horizon, in one list for all points.
-        useful = (directions * normals).sum(-1) > 0
-        index, wi = at[torch.where(useful)[0]], directions[useful]
+        above = torch.where((directions @ normals.mT).flatten() > 0)[0]
+        index, wi = at[above // (n_brdf + n_light)], directions.flatten(0, 1).index_select(0, above)
         normals, views, rough = (x.index_select(0, index) for x in (surface.normals, surface.views, roughness))
-        density = n_brdf * brdf.pdf(wi, views, normals, roughness=rough) + n_light * light.pdf(wi @ R_env_obj.mT)
+        wi_env = wi @ R_env_obj.mT
+        density = n_brdf * brdf.pdf(wi, views, normals, roughness=rough) + n_light * light.pdf(wi_env)
         value = brdf.evaluate(wi, views, normals, albedo=albedo.index_select(0, index), roughness=rough, f0=f0)
-        weight = torch.where(density > 0, value * (wi * normals).sum(-1, keepdim=True) / density, 0.0)
-        origins = tracer.ray_origins(surface.points[at], surface.normals[at])[:, None].expand_as(directions)[useful]
+        weight = torch.where(density > 0, value * brdf.cosine(wi, normals) / density, 0.0)
+        origins = tracer.ray_origins(surface.points, surface.normals).index_select(0, index)
+        environment = backend.lookup(radiance[None], wi_env, torch.zeros_like(wi_env[:, 0]))
         arriving = _arriving_radiance(
-            origins, wi, light.environment, R_env_obj, tracer, f0=f0, bounce=bounce, diffuse=diffuse
+            origins, wi, environment, R_env_obj, tracer, f0=f0, bounce=bounce, diffuse=diffuse
         )
-        reflected = torch.zeros_like(directions)
-        reflected[useful] = weight * arriving
-        parts.append(reflected.sum(1))
+        reflected = torch.zeros_like(directions).flatten(0, 1).index_copy_(0, above, weight * arriving)
+        parts.append(reflected.view_as(directions).sum(1))
     return torch.cat(parts)
 
 
 def _arriving_radiance(
     origins: Float[Tensor, "r 3"],
     wi: Float[Tensor, "r 3"],
-    environment: Environment,
+    environment: Float[Tensor, "r 3"],
     R_env_obj: Float[Tensor, "3 3"],
     tracer: Tracer,
     *,
@@ -179,9 +180,9 @@ def _arriving_radiance(
     bounce: GlossyBounce | None,
     diffuse: Float[Tensor, "n 3"] | None,
 ) -> Float[Tensor, "r 3"]:
-    """Incident radiance along rays: environment times transmittance, plus the radiance of occluding Gaussians."""
+    """Incident radiance along rays: the environment's times the transmittance, plus that of occluding Gaussians."""
     hits = trace(tracer, origins, wi, diffuse)
-    arriving = hits.transmittance[:, None] * environment.lookup(wi @ R_env_obj.mT) + hits.radiance
+    arriving = hits.transmittance[:, None] * environment + hits.radiance
     if bounce is None:
         return arriving
     occluded = torch.where(hits.hit >= 0)[0]

@@ -95,15 +95,17 @@ def _lobes(h: int, w: int) -> Float[Tensor, "frequencies rows h"]:
     s = SUBDIVISIONS
     fine = texel_directions(h * s, w * s)
     area = texel_solid_angles(h * s, w * s)
-    # Lobes around the centres of the first column are even along the columns, so their transform is real.
-    centre = texel_directions(h, w)[:, 0]
+    # Lobes around the centres of the first column are even along the columns, so their transform is real. Those of the
+    # lower half of the map are the upper ones, mirrored.
+    centre = texel_directions(h, w)[: (h + 1) // 2, 0]
     cosine = torch.einsum("id,jkd->ijk", centre, fine)
     levels = []
     for level in range(1, LEVELS):
         a2 = (level / (LEVELS - 1)) ** 4
         # GGX density of the half vector, whose angle is half that between light and reflected direction.
         t = 0.5 * (1 - cosine) + a2 * 0.5 * (1 + cosine)
-        lobe = (cosine.clamp(min=0) / t.square() * area).reshape(h, h, s, w, s).sum((2, 4))
+        upper = (cosine.clamp(min=0) / t.square() * area).reshape(-1, h, s, w, s).sum((2, 4))
+        lobe = torch.cat([upper, upper[: h // 2].flip(0, 1)])
         # Columns are counted from the centre of the lobe.
         spectrum = torch.fft.rfft(lobe / lobe.sum((1, 2), keepdim=True), dim=2)
         levels.append(spectrum.real.permute(2, 0, 1))

@@ -41,18 +41,20 @@ def carve(
     ticks = (torch.arange(resolution, **like) + 0.5) / resolution * 2 - 1
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
-    smallest = torch.ones(1 + int(tolerance * len(trajectory)), len(x_obj), **like)
+    smallest = (x_obj.norm(dim=-1) <= 1).to(**like).repeat(1 + int(tolerance * len(trajectory)), 1)
+    left = torch.where(smallest[-1] > 0)[0]
     for frame in range(len(trajectory)):
-        uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj)
+        uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj.index_select(0, left))
         mask = (capture.masks[frame] != BACKGROUND).to(**like)
         at = (uv / size * 2 - 1)[None, None]
         sampled = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         in_image = ((uv > 0) & (uv < size)).all(-1)
         value = torch.where(in_image, sampled, 1.0)
         for k in range(len(smallest)):
-            smallest[k], value = torch.minimum(smallest[k], value), torch.maximum(smallest[k], value)
-    inside = smallest[-1] * (x_obj.norm(dim=-1) <= 1)
-    return inside.reshape(resolution, resolution, resolution)
+            old = smallest[k].index_select(0, left)
+            smallest[k, left], value = torch.minimum(old, value), torch.maximum(old, value)
+        left = left[smallest[-1].index_select(0, left) > 0]
+    return smallest[-1].reshape(resolution, resolution, resolution)
 
 
 def sample_surface(inside: Float[Tensor, "x y z"], n: int, rng: torch.Generator) -> OrientedPoints:
