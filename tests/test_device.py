@@ -1,0 +1,144 @@
+"""Steps and commands on another device than the CPU, which `tests.simulated_gpu` simulates."""
+
+import dataclasses
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests import test_pipeline
+from tests.inverse_rendering.test_refine import textured_sphere
+from tests.simulated_gpu import DEVICE, SimulatedGpu, simulated_gpu
+from tumble import actions, backends, pipeline, recipes
+from tumble.export import asset as export
+from tumble.export.asset import Preset
+from tumble.inverse_rendering import decompose, refine
+from tumble.io import files, tree, video
+from tumble.report import page
+from tumble.scene.asset import Asset
+from tumble.scene.trajectory import Trajectory
+
+RECIPE, capture, finished = test_pipeline.RECIPE, test_pipeline.capture, test_pipeline.finished
+SMALL = Preset(triangles=200, texture=32, cells=16, views=4, pixels=32)
+"""A mesh that is made in no time."""
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedGpu]:
+    """The simulated device, as `--device cuda`."""
+
+    def device(name: str) -> torch.device:
+        return DEVICE if name == "cuda" else backends.usable_device(name)
+
+    monkeypatch.setattr(actions, "usable_device", device)
+    monkeypatch.setattr(actions, "TURNTABLE_FRAMES", 2)
+    monkeypatch.setattr(actions, "TURNTABLE_SIDE", 32)
+    monkeypatch.setattr(page, "MESH", SMALL)
+    monkeypatch.setitem(export.PRESETS, "web", SMALL)
+    with simulated_gpu() as simulated:
+        yield simulated
+
+
+def on_device(inputs: Any) -> Any:
+    """The inputs of a stage, on the simulated device."""
+    return type(inputs)(*(tree.to(x, DEVICE) for x in vars(inputs).values()))
+
+
+def steps(stage: Any, cfg: Any, inputs: Any, n: int) -> tuple[Any, list[dict[str, float]]]:
+    """The output of a stage after `n` steps, and the terms of each."""
+    state, seen = stage.init(cfg, inputs, torch.Generator().manual_seed(0)), []
+    for _ in range(n):
+        seen.append({name: float(value) for name, value in stage.step(cfg, inputs, state).items()})
+        state.step += 1
+    return stage.finish(cfg, inputs, state), seen
+
+
+def test_steps_on_a_device_are_those_of_the_cpu(gpu: SimulatedGpu) -> None:
+    _, true, taken = textured_sphere()
+    inputs = refine.Inputs(taken, Trajectory(true, "camera"))
+    cfg = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    refined, here = steps(refine, cfg, inputs, 2)
+    _, there = steps(refine, cfg, on_device(inputs), 2)
+    # Sums in another order, and what Adam makes of their rounding.
+    for a, b in zip(here, there, strict=True):
+        assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
+    third = decompose.Inputs(taken, refined)
+    cfg = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, fit_specular=False)
+    _, here = steps(decompose, cfg, third, 2)
+    asset, there = steps(decompose, cfg, on_device(third), 2)
+    for a, b in zip(here, there, strict=True):
+        assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
+    assert {x.device for x in tree.named_tensors(asset).values()} == {DEVICE}
+
+
+def test_relit_images_and_videos_are_those_of_the_cpu(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    light = capture / "truth" / "lights" / "sun.hdr"
+    for fast in (False, True):
+        here, there = (
+            actions.relight_run(finished[0], light, tmp_path / f"{device}-{fast}", fast=fast, device=device)
+            for device in ("cpu", "cuda")
+        )
+        for path in here.glob("*.png"):
+            a, b = (files.read_image(folder / path.name).astype(int) for folder in (here, there))
+            assert np.abs(a - b).max() <= 1
+    clip = actions.relight_turntable(finished[0], light, tmp_path / "turn.mp4", fast=True, device="cuda")
+    assert len(list(video.read_clip(clip))) == 2
+
+
+def test_scores_are_those_of_the_cpu(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    here, there = (
+        actions.evaluate_run(finished[0], capture, tmp_path / name, device=name)["regions"]["shared"]
+        for name in ("cpu", "cuda")
+    )
+    assert there == pytest.approx(here, rel=1e-4)
+
+
+def test_exported_files_are_those_of_the_cpu(finished: tuple[Path, Asset], tmp_path: Path, gpu: SimulatedGpu) -> None:
+    here, there = (
+        actions.export_run(finished[0], tmp_path / name, "splat", None, device=name) for name in ("cpu", "cuda")
+    )
+    assert {path.name for path in here.iterdir()} == {path.name for path in there.iterdir()}
+    for path in (*here.glob("*.json"), *here.glob("*.ply")):
+        if path.name != "export.json":
+            assert path.read_bytes() == (there / path.name).read_bytes(), path.name
+    mesh = actions.export_run(finished[0], tmp_path / "mesh", "web", None, device="cuda")
+    assert (mesh / "asset.glb").is_file()
+
+
+def test_the_key_of_a_stage_names_the_kind_of_device(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stage that was finished on the CPU is run again on a device, and starts from its first step."""
+
+    def stop(*_: Any) -> None:
+        raise InterruptedError
+
+    monkeypatch.setattr(refine, "step", stop)
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    pipeline.reconstruct(capture, run, RECIPE)
+    with pytest.raises(InterruptedError):
+        pipeline.reconstruct(capture, run, RECIPE, device=DEVICE)
+
+
+@pytest.mark.slow
+def test_a_run_with_its_report_is_made_on_a_device(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    asset = pipeline.reconstruct(capture, tmp_path / "run", RECIPE, device=DEVICE)
+    assert len(asset.gaussians) == pytest.approx(len(finished[1].gaussians), rel=0.1)
+    assert page.write_report(tmp_path / "run", capture=capture, device=DEVICE).is_file()
+
+
+def test_auto_is_the_cpu_unless_a_gpu_and_its_kernels_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends.load("cuda"), "ready", lambda device, dtype: "")
+    assert backends.usable_device("auto") == torch.device("cuda")
+    monkeypatch.setattr(backends.load("cuda"), "ready", lambda device, dtype: "no driver")
+    assert backends.usable_device("auto") == torch.device("cpu")
