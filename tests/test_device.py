@@ -14,6 +14,7 @@ from tests import test_pipeline
 from tests.inverse_rendering.test_refine import textured_sphere
 from tests.simulated_gpu import DEVICE, SimulatedGpu, simulated_gpu
 from tumble import actions, backends, pipeline, recipes
+from tumble.engine import loop, optim
 from tumble.export import asset as export
 from tumble.export.asset import Preset
 from tumble.inverse_rendering import decompose, refine
@@ -73,6 +74,45 @@ def test_steps_on_a_device_are_those_of_the_cpu(gpu: SimulatedGpu) -> None:
     for a, b in zip(here, there, strict=True):
         assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
     assert {x.device for x in tree.named_tensors(asset).values()} == {DEVICE}
+
+
+def test_steps_hardly_ever_wait_for_the_device_and_copy_next_to_nothing_to_it(gpu: SimulatedGpu) -> None:
+    """Stage 3 asks which pixels show the object, and draws some of them on the host."""
+    _, true, taken = textured_sphere()
+    inputs = on_device(refine.Inputs(taken, Trajectory(true, "camera")))
+    cfg = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+
+    def recorded(stage: Any, cfg: Any, inputs: Any, state: Any) -> tuple[list[str], list[str]]:
+        stage.step(cfg, inputs, state)
+        state.step += 1  # the first step fills caches
+        gpu.waits.clear()
+        gpu.copies.clear()
+        stage.step(cfg, inputs, state)
+        return [x.split()[-1] for x in gpu.waits], [x.split()[-1] for x in gpu.copies]
+
+    assert recorded(refine, cfg, inputs, state) == ([], [])
+    third = decompose.Inputs(inputs.capture, refine.finish(cfg, inputs, state))
+    cfg = dataclasses.replace(recipes.known_poses(RECIPE).decompose, fit_specular=False)
+    state = decompose.init(cfg, third, torch.Generator().manual_seed(0))
+    assert recorded(decompose, cfg, third, state) == (["_sample_pixels"], ["_sample_pixels"])
+
+
+def test_a_gradient_on_a_device_that_is_not_finite_changes_nothing_and_is_named_later(gpu: SimulatedGpu) -> None:
+    x = optim.leaves({"x": torch.ones(3), "y": torch.ones(2)})
+    x = optim.leaves(tree.to(x, DEVICE))
+    optimizer = optim.adam(x, {"": 0.1})
+    optim.descend(x["x"].sum() + x["y"].sum(), optimizer, step=0)
+    before = x["x"].tolist()
+    assert before == pytest.approx([0.9] * 3)
+    optim.descend((x["x"] - x["x"].detach()).sqrt().sum() + x["y"].sum(), optimizer, step=1)
+    optim.descend(x["x"].sum() + x["y"].sum(), optimizer, step=2)
+    assert x["x"].tolist() == before
+    state = loop.State(3, x, optimizer, torch.Generator())
+    with pytest.raises(optim.NotFinite, match="in one of the last 50 steps is not finite at step 3"):
+        loop._check(state, None)
+    with pytest.raises(optim.NotFinite, match="the gradient of x is not finite at step 49"):
+        optim.descend((x["x"] - x["x"].detach()).sqrt().sum(), optimizer, step=49)
 
 
 def test_relit_images_and_videos_are_those_of_the_cpu(
