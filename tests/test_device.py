@@ -1,6 +1,7 @@
 """Steps and commands on another device than the CPU, which `tests.simulated_gpu` simulates."""
 
 import dataclasses
+import importlib.util
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -58,22 +59,40 @@ def steps(stage: Any, cfg: Any, inputs: Any, n: int) -> tuple[Any, list[dict[str
     return stage.finish(cfg, inputs, state), seen
 
 
-def test_steps_on_a_device_are_those_of_the_cpu(gpu: SimulatedGpu) -> None:
+@pytest.fixture(scope="module")
+def stages() -> list[tuple[Any, Any, Any, list[dict[str, float]]]]:
+    """Stages 2 and 3 of a textured sphere: the module, its settings and inputs, and the terms of two steps."""
     _, true, taken = textured_sphere()
-    inputs = refine.Inputs(taken, Trajectory(true, "camera"))
-    cfg = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
-    refined, here = steps(refine, cfg, inputs, 2)
-    _, there = steps(refine, cfg, on_device(inputs), 2)
+    second = refine.Inputs(taken, Trajectory(true, "camera"))
+    cfg_2 = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    refined, of_second = steps(refine, cfg_2, second, 2)
+    third = decompose.Inputs(taken, refined)
+    cfg_3 = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, fit_specular=False)
+    _, of_third = steps(decompose, cfg_3, third, 2)
+    return [(refine, cfg_2, second, of_second), (decompose, cfg_3, third, of_third)]
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["refine", "decompose"])
+def test_steps_on_a_device_are_those_of_the_cpu(number: int, stages: list[Any], gpu: SimulatedGpu) -> None:
+    stage, cfg, inputs, here = stages[number]
+    output, there = steps(stage, cfg, on_device(inputs), 2)
     # Sums in another order, and what Adam makes of their rounding.
     for a, b in zip(here, there, strict=True):
         assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
-    third = decompose.Inputs(taken, refined)
-    cfg = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, fit_specular=False)
-    _, here = steps(decompose, cfg, third, 2)
-    asset, there = steps(decompose, cfg, on_device(third), 2)
-    for a, b in zip(here, there, strict=True):
+    assert {x.device for x in tree.named_tensors(output).values()} == {DEVICE}
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["refine", "decompose"])
+def test_steps_with_the_kernels_for_a_gpu_are_those_of_the_cpu(
+    number: int, stages: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernels in Warp run on the CPU here."""
+    if importlib.util.find_spec("warp") is None:
+        pytest.skip("needs NVIDIA Warp: pip install 'tumble[cuda]'")
+    monkeypatch.setattr(backends, "choose", lambda device, dtype: backends.load("cuda"))
+    stage, cfg, inputs, here = stages[number]
+    for a, b in zip(here, steps(stage, cfg, inputs, 2)[1], strict=True):
         assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
-    assert {x.device for x in tree.named_tensors(asset).values()} == {DEVICE}
 
 
 def test_steps_hardly_ever_wait_for_the_device_and_copy_next_to_nothing_to_it(gpu: SimulatedGpu) -> None:
