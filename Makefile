@@ -6,7 +6,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: install demo test test-slow test-gpu check fmt bench docs clean
+.PHONY: install demo test test-slow test-gpu gpu check fmt bench docs clean
 
 install: $(STAMP)
 
@@ -31,6 +31,10 @@ test-slow: install
 
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu
+
+# Without a network: with the venv if there is one, else with the packages that PYTHON finds. Results go to $OUT.
+gpu:
+	$(or $(wildcard $(BIN)/python),$(PYTHON)) -m benchmarks.gpu
 
 check: install
 	$(BIN)/ruff check .

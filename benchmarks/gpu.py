@@ -1,30 +1,41 @@
-"""All measurements that need an NVIDIA GPU, in one command: tests, speed, and the scores of runs.
+"""All measurements that need an NVIDIA GPU, in one command of at most nine minutes: tests, speed, scores and memory.
 
-`python -m benchmarks.gpu [--capture CAPTURE] [--only PART...]` writes JSON and images into `$OUT`, or `build/gpu`. The
-parts run in this order, and the result of each is written as soon as it ends:
+`make gpu`, which is `python -m benchmarks.gpu [--capture CAPTURE] [--only PART...]`, writes `gpu.json`, images and the
+output of the tests into `$OUT`, or `build/gpu`. It needs no network, only the packages on Python's path: those of the
+package, its extra `cuda`, and pytest and beartype for the tests. The parts run in this order:
 
     tests     the tests that are marked `gpu`
     kernels   milliseconds of each kernel: on the GPU, in plain torch on the GPU, and on the CPU
     draft     DRAFT on the bundled clip with its true poses, on the GPU and on the CPU: seconds, scores, difference
     profile   kernel launches, synchronisations and copies in one step of stages 2 and 3
-    standard  STANDARD on `--capture` (default: the bundled clip): seconds, steps per second, memory, scores
+    standard  STANDARD on `--capture`, or on the bundled clip with 200 frames of 512 x 512: seconds, memory, scores
+
+Each part is a process of its own with a limit of time. A part that fails, or is stopped at its limit, is marked in
+`gpu.json` beside what it measured until then, and the next part runs. `--dry` runs everything on the CPU with tiny
+settings, to test this command on a machine without a GPU; its figures mean nothing.
 """
 
 import argparse
+import contextlib
+import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
 import resource
+import shutil
+import signal
 import subprocess
 import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 
 from benchmarks import kernels
@@ -35,16 +46,43 @@ from tumble.evaluation import align_views, predict_views, read_with_truth, score
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files, tree
 from tumble.pipeline import reconstruct
-from tumble.recipes import DRAFT, STANDARD, Recipe, known_poses
+from tumble.recipes import DRAFT, SMOKE, STANDARD, Recipe, known_poses
 from tumble.scene import Asset, Capture, Truth
 
-GPU = torch.device("cuda")
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (100_000, 256), (100_000, 512), (100_000, 1024)]
 """Rasterization cases on a GPU: number of Gaussians, and image width [pixels]."""
+LIMITS = {"tests": 130.0, "kernels": 50.0, "draft": 120.0, "profile": 30.0, "standard": 190.0}
+"""Time of each part, without what earlier parts leave of theirs [s]."""
+GRACE = 20.0
+"""Time in which a stopped part writes its results before it is killed [s]."""
+MAX_DIFFERENCE = 0.2
+"""Difference of the PSNR of the DRAFT runs on GPU and CPU above which the part fails [dB]."""
+STANDARD_FRAMES, STANDARD_SIDE = 200, 512
+"""Number of frames and side of the images [pixels] of the STANDARD run on the bundled clip."""
 WARMUP_STEPS = 20
 """Steps before the profile."""
 PROFILED_STEPS = 10
 """Steps of the profile."""
+
+Row = dict[str, Any]
+"""Results of a part, which the part fills in as it goes on."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the parts measure."""
+
+    out: Path
+    """Folder of all results."""
+    capture: Path | None
+    """Capture of the STANDARD run; None for the bundled clip."""
+    dry: bool
+    """Whether everything runs on the CPU with tiny settings."""
+
+    @property
+    def device(self) -> torch.device:
+        """The GPU, or what takes its place."""
+        return torch.device("cpu" if self.dry else "cuda")
 
 
 def main() -> None:
@@ -52,114 +90,207 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, help="capture of the STANDARD run, with known poses")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT") or "build/gpu"))
+    parser.add_argument("--dry", action="store_true", help="on the CPU with tiny settings, to test the command")
+    parser.add_argument("--here", action="store_true", help="run the only part in this process, without a limit")
     arguments = parser.parse_args()
-    if not torch.cuda.is_available():
+    if not (arguments.dry or torch.cuda.is_available()):
         sys.exit("torch finds no NVIDIA GPU on this machine; `tumble doctor` lists what it finds")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    document: dict[str, Any] = {"command": " ".join(["python -m benchmarks.gpu", *sys.argv[1:]]), "machine": machine()}
-    failed = False
-    for name in arguments.only:
-        print(f"== {name}", flush=True)
-        started = time.perf_counter()
-        try:
-            document[name] = PARTS[name](arguments)
-        except Exception as error:
-            traceback.print_exc()
-            document[name] = {"failed": f"{type(error).__name__}: {error}"}
-        failed |= "failed" in document[name]
-        document[name]["wall_seconds"] = round(time.perf_counter() - started, 1)
-        files.write_json(arguments.out / "gpu.json", document)
+    plan = Plan(arguments.out, arguments.capture, arguments.dry)
+    plan.out.mkdir(parents=True, exist_ok=True)
+    if arguments.here:
+        sys.exit(not run_part(plan, arguments.only[0]))
+    document: Row = {"command": " ".join(["python -m benchmarks.gpu", *sys.argv[1:]]), "machine": machine()}
+    end = time.perf_counter() + sum(LIMITS[name] for name in arguments.only)
+    for number, name in enumerate(arguments.only):
+        later = sum(LIMITS[other] for other in arguments.only[number + 1 :])
+        document[name] = result_of_process(plan, name, end - time.perf_counter() - later)
+        files.write_json(plan.out / "gpu.json", document)
     print(json.dumps(document, indent=1))
-    sys.exit(failed)
+    failed = {name: document[name]["failed"] for name in arguments.only if "failed" in document[name]}
+    sys.exit("\n".join(f"{name} failed: {reason}" for name, reason in failed.items()) or 0)
 
 
-def machine() -> dict[str, Any]:
+def result_of_process(plan: Plan, name: str, limit: float) -> Row:
+    """Result of a part that runs in a process of its own for at most `limit` seconds."""
+    print(f"== {name}, at most {limit:.0f} s", flush=True)
+    file, started = plan.out / f"{name}.json", time.perf_counter()
+    file.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "benchmarks.gpu", "--here", "--only", name, "--out", str(plan.out)]
+    command += ["--dry"] * plan.dry + (["--capture", str(plan.capture)] if plan.capture else [])
+    process = subprocess.Popen(command, start_new_session=True)
+    in_time = False
+    try:
+        process.wait(limit)
+        in_time = True
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(GRACE)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    row: Row = files.read_json(file, Row) if file.is_file() else {"failed": f"exit status {process.returncode}"}
+    if not in_time:
+        row["failed"] = f"stopped at its limit of {limit:.0f} s"
+    return row | {"wall_seconds": round(time.perf_counter() - started, 1)}
+
+
+def run_part(plan: Plan, name: str) -> bool:
+    """Run a part and write its results, also if it fails or is stopped; returns whether it succeeded."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    row: Row = {}
+    try:
+        PARTS[name](plan, row)
+    except (Exception, KeyboardInterrupt) as error:
+        traceback.print_exc()
+        row["failed"] = f"{type(error).__name__}: {error}"
+    files.write_json(plan.out / f"{name}.json", row)
+    return "failed" not in row
+
+
+def machine() -> Row:
     """Hardware and versions that the figures depend on."""
-    import warp
-
     return {
-        "gpu": torch.cuda.get_device_name(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cpu": f"{os.cpu_count()}-core {platform.machine()}",
         "torch": torch.__version__,
-        "warp": warp.__version__,
+        "warp": importlib.metadata.version("warp-lang") if importlib.util.find_spec("warp") else None,
     }
 
 
-def tests(arguments: argparse.Namespace) -> dict[str, Any]:
+def tests(plan: Plan, row: Row) -> None:
     """Summary of pytest for the tests marked `gpu`; its output goes to tests.txt."""
-    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-p", "no:cacheprovider", "-rf", *GPU_TESTS]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    (arguments.out / "tests.txt").write_text(done.stdout + done.stderr, "utf-8")
-    output = (done.stdout + done.stderr)[-3000:]
-    print(output, flush=True)
-    return {"summary": output.strip().splitlines()[-1]} | ({"failed": "tests"} if done.returncode else {})
+    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-v", "-p", "no:cacheprovider", "-rf", *GPU_TESTS]
+    with (plan.out / "tests.txt").open("w", encoding="utf-8") as output:
+        done = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, check=False)
+    lines = (plan.out / "tests.txt").read_text("utf-8").strip().splitlines()
+    print("\n".join(lines[-20:]), flush=True)
+    row["summary"] = lines[-1] if lines else ""
+    if done.returncode:
+        row["failed"] = f"pytest ended with status {done.returncode}"
 
 
-GPU_TESTS = ("tests/backends/test_backends_cuda.py", "tests/backends/test_backends.py", "tests/test_pipeline.py")
+GPU_TESTS = ("tests/backends/test_backends_cuda.py", "tests/test_pipeline.py")
 """Files with tests marked `gpu`: the others are not collected, since they import packages that may be missing there."""
 
 
-def kernel_times(arguments: argparse.Namespace) -> dict[str, Any]:
+def kernel_times(plan: Plan, row: Row) -> None:
     """The rows of `benchmarks.kernels` for three backends."""
-    rows = kernels.measure(backends.load("cuda"), "cuda", 1, SIZES, device=GPU)
+    fast = "cpu" if plan.dry else "cuda"
+    sizes = [(1000, 64)] if plan.dry else SIZES
+    where: Row = {"device": plan.device}
+    rows = row["rows"] = kernels.measure(backends.load(fast), fast, 1, sizes, **where)
+    rows += kernels.image_loss_rows(backends.load(fast), fast, 1, **where)
     # Plain torch stores every pair of a pixel and a nearby Gaussian, hence the single size.
-    rows += kernels.rasterize_rows(backends.load("reference"), "reference", 1, [(10_000, 256)], runs=3, device=GPU)
-    rows += kernels.image_loss_rows(backends.load("cuda"), "cuda", 1, device=GPU)
+    reference = backends.load("reference")
+    one = [(1000, 64)] if plan.dry else [(10_000, 256)]
+    rows += kernels.rasterize_rows(reference, "reference", 1, one, runs=3, **where)
+    rows += kernels.shade_rows(reference, "reference", 1, **where)
     threads = os.cpu_count() or 1
-    rows += kernels.measure(backends.load("cpu"), "cpu", threads, SIZES)
-    return {"rows": rows}
+    rows += kernels.measure(backends.load("cpu"), "cpu", threads, sizes)
+    rows += kernels.image_loss_rows(backends.load("cpu"), "cpu", threads)
 
 
-def draft(arguments: argparse.Namespace) -> dict[str, Any]:
+def draft(plan: Plan, row: Row) -> None:
     """The DRAFT run of the bundled clip on GPU and CPU, and the difference of their scores."""
-    capture = posed_clip(arguments.out / "clip")
-    rows = {name: measure_run(capture, arguments.out, DRAFT, device) for name, device in (("gpu", GPU), ("cpu", "cpu"))}
-    differences = {key: round(rows["gpu"]["scores"][key] - value, 3) for key, value in rows["cpu"]["scores"].items()}
-    return {**rows, "gpu_minus_cpu": differences}
+    clip = posed_clip(plan.out / "clip")
+    for name, device in (("gpu", plan.device), ("cpu", torch.device("cpu"))):
+        row[name] = {}
+        measure_run(row[name], folder.load(clip), clip, plan.out / f"draft-{name}", draft_recipe(plan), device)
+    scores = row["gpu"]["scores"], row["cpu"]["scores"]
+    row["gpu_minus_cpu"] = {key: round(scores[0][key] - value, 3) for key, value in scores[1].items()}
+    worst = max(abs(value) for key, value in row["gpu_minus_cpu"].items() if "psnr" in key)
+    if worst > MAX_DIFFERENCE:
+        row["failed"] = f"scores on GPU and CPU differ by {worst} dB"
 
 
-def standard(arguments: argparse.Namespace) -> dict[str, Any]:
+def draft_recipe(plan: Plan) -> Recipe:
+    """DRAFT, or SMOKE in a dry run."""
+    return SMOKE if plan.dry else DRAFT
+
+
+def standard(plan: Plan, row: Row) -> None:
     """A STANDARD run on the GPU."""
-    capture = arguments.capture or posed_clip(arguments.out / "clip")
-    return {"gpu": measure_run(capture, arguments.out, STANDARD, GPU)}
+    subject = plan.capture or posed_clip(plan.out / "clip")
+    capture = folder.load(subject)
+    if not plan.capture:
+        frames, side = (12, 96) if plan.dry else (STANDARD_FRAMES, STANDARD_SIDE)
+        capture = enlarged(capture, frames, side)
+    measure_run(row, capture, subject, plan.out / "standard", SMOKE if plan.dry else STANDARD, plan.device)
 
 
-def measure_run(path: Path, out: Path, recipe: Recipe, device: torch.device | str) -> dict[str, Any]:
-    """A row of a run with known poses: seconds by stage, peak memory, scores; predicted images are written to `out`."""
-    name = f"{path.name}-{recipe.refine.steps}-{torch.device(device).type}"
-    torch.cuda.reset_peak_memory_stats()
+def enlarged(capture: Capture, n: int, side: int) -> Capture:
+    """A capture with `n` frames, the first again after the last, and with square images of another size.
+
+    Repeated frames cost as much time and memory as others.
+    """
+    index = [i % len(capture) for i in range(n)]
+    images = [cv2.resize(x.numpy(), (side, side), interpolation=cv2.INTER_CUBIC) for x in capture.images[:n]]
+    masks = [cv2.resize(x.numpy(), (side, side), interpolation=cv2.INTER_NEAREST) for x in capture.masks[:n]]
+    assert capture.trajectory is not None
+    return replace(
+        capture,
+        images=torch.stack([torch.from_numpy(images[i]) for i in index]),
+        masks=torch.stack([torch.from_numpy(masks[i]) for i in index]),
+        camera=capture.camera.resized(side, side),
+        names=tuple(f"{number:04}.png" for number in range(n)),
+        trajectory=capture.trajectory.select(index),
+    )
+
+
+def measure_run(row: Row, capture: Capture, subject: Path, out: Path, recipe: Recipe, device: torch.device) -> None:
+    """Seconds by stage, peak memory and scores of a run with known poses; the run and its images are written to `out`.
+
+    Args:
+        row: Filled in.
+        capture: What is reconstructed.
+        subject: Capture with ground truth of the same object and poses, for the scores.
+    """
+    on_gpu = device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
+    row |= {"frames": len(capture), "size": list(capture.images.shape[1:3])}
+    shutil.rmtree(out, ignore_errors=True)  # a finished run would not run again
     started = time.perf_counter()
-    asset = reconstruct(path, out / "runs" / name, recipe, device=device)
-    seconds = {r["name"]: r["seconds"] for r in run.log_records(out / "runs" / name) if r.get("event") == "done"}
-    steps = recipe.decompose.steps if isinstance(recipe.decompose, decompose.Config) else 0
-    row: dict[str, Any] = {
-        "capture": path.name,
-        "seconds": seconds,
-        "run_seconds": round(time.perf_counter() - started, 1),
-        "steps_per_second": {
-            "refine": round(recipe.refine.steps / seconds["refine"], 1),
-            "decompose": round(steps / seconds["decompose"], 1),
-        },
-        "gaussians": len(asset.gaussians),
-        "peak_MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
-    }
-    if torch.device(device).type == "cuda":
-        row["peak_MiB_gpu"] = torch.cuda.max_memory_allocated() // 2**20
+    try:
+        asset = reconstruct(capture, out / "run", recipe, device=device)
+    finally:
+        row["run_seconds"] = round(time.perf_counter() - started, 1)
+        row["stages"] = stages(out / "run")
+        row["peak_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        if on_gpu:
+            row["peak_MiB_gpu"] = torch.cuda.max_memory_allocated() // 2**20
+            row["peak_MiB_gpu_reserved"] = torch.cuda.max_memory_reserved() // 2**20
+    row["gaussians"] = len(asset.gaussians)
     started = time.perf_counter()
-    row["scores"] = shared_scores(path, asset, out / name, recipe)
+    row["scores"] = shared_scores(subject, asset, out / "prediction", recipe, device)
     row["score_seconds"] = round(time.perf_counter() - started, 1)
-    tree.save(asset, out / f"{name}.safetensors")
     print(json.dumps(row), flush=True)
-    return row
 
 
-def shared_scores(path: Path, asset: Asset, out: Path, recipe: Recipe) -> dict[str, float]:
-    """Scores of the evaluation views of region "shared", which are rendered on the GPU and written to `out`."""
+def stages(path: Path) -> dict[str, Row]:
+    """Steps, seconds and steps per second of every stage of a run so far, by name, from its log."""
+    rows: dict[str, Row] = {}
+    for record in run.log_records(path):
+        if "step" in record:
+            steps, seconds = record["step"], record["seconds"]
+            rows[record["name"]] = {"steps": steps, "of": record["of"], "seconds": seconds}
+            rows[record["name"]]["steps_per_second"] = round(steps / max(seconds, 1e-3), 1)
+        elif record.get("event") == "done" and record["name"] in rows:
+            rows[record["name"]]["seconds_with_output"] = record["seconds"]
+    return rows
+
+
+def shared_scores(path: Path, asset: Asset, out: Path, recipe: Recipe, device: torch.device) -> dict[str, float]:
+    """Scores of the evaluation views of region "shared", which are rendered on the device and written to `out`."""
     subject = read_with_truth(path)
-    gpu_asset = tree.to(asset, GPU)
-    capture, truth = tree.to(subject.capture, GPU), tree.to(subject.truth, GPU)
-    alignment, _ = align_views(gpu_asset.trajectory, capture.names, capture, truth, known_poses=True)
-    prediction = predict_views(recipe.relight, gpu_asset, capture, truth, alignment, names=capture.names)
+    known = subject.capture
+    assert known.trajectory is not None
+    moved = tree.to(replace(asset, trajectory=known.trajectory, camera=known.camera), device)
+    capture, truth = tree.to(known, device), tree.to(subject.truth, device)
+    alignment, _ = align_views(moved.trajectory, capture.names, capture, truth, known_poses=True)
+    prediction = predict_views(recipe.relight, moved, capture, truth, alignment, names=capture.names)
     tree.to(prediction, "cpu").write(out)
     scores = score(out, subject, out)["regions"]["shared"]
     return {key: round(scores[key], 3) for key in SCORES if scores.get(key) is not None}
@@ -169,17 +300,18 @@ SCORES = ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_fg_srgb", "no
 """Scores that are stored in a row."""
 
 
-def profile(arguments: argparse.Namespace) -> dict[str, Any]:
+def profile(plan: Plan, row: Row) -> None:
     """Profiles of both stages: DRAFT on the bundled clip, and STANDARD on `--capture` if that is given."""
-    cases = {"draft": (posed_clip(arguments.out / "clip"), DRAFT)}
-    if arguments.capture:
-        cases["standard"] = (arguments.capture, STANDARD)
-    return {name: profile_stages(path, known_poses(recipe)) for name, (path, recipe) in cases.items()}
+    cases = {"draft": (posed_clip(plan.out / "clip"), draft_recipe(plan))}
+    if plan.capture:
+        cases["standard"] = (plan.capture, STANDARD)
+    for name, (path, recipe) in cases.items():
+        row[name] = profile_stages(path, known_poses(recipe), plan.device)
 
 
-def profile_stages(path: Path, recipe: Recipe) -> dict[str, Any]:
+def profile_stages(path: Path, recipe: Recipe, device: torch.device) -> Row:
     """Profile of a step of each stage."""
-    capture = tree.to(folder.load(path), GPU)
+    capture = tree.to(folder.load(path), device)
     assert capture.trajectory is not None
     inputs = refine.Inputs(capture, capture.trajectory)
     state = state_after(refine, recipe.refine, inputs, WARMUP_STEPS)
@@ -203,21 +335,23 @@ def run_step(stage: Any, cfg: Any, inputs: Any, state: loop.State) -> None:
     state.step += 1
 
 
-def profile_step(step: Callable[[], None]) -> dict[str, Any]:
+def profile_step(step: Callable[[], None]) -> Row:
     """Figures per step: wall time, busy time of the GPU, driver calls, and the kernels with the longest times."""
     from torch.profiler import ProfilerActivity
     from torch.profiler import profile as torch_profile
 
-    torch.cuda.synchronize()
+    on_gpu = torch.cuda.is_available()
+    wait = torch.cuda.synchronize if on_gpu else (lambda: None)
+    wait()
     started = time.perf_counter()
     for _ in range(PROFILED_STEPS):
         step()
-    torch.cuda.synchronize()
+    wait()
     wall = (time.perf_counter() - started) / PROFILED_STEPS
-    with torch_profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as events:
+    with torch_profile(activities=[ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * on_gpu]) as events:
         for _ in range(PROFILED_STEPS):
             step()
-        torch.cuda.synchronize()
+        wait()
     calls, busy = Counter[str](), Counter[str]()
     for event in events.key_averages():
         if event.key.startswith("cuda"):
@@ -249,7 +383,14 @@ def with_true_poses(capture: Capture, truth: Truth) -> Capture:
     return replace(capture, trajectory=truth.poses)
 
 
-PARTS = {"tests": tests, "kernels": kernel_times, "draft": draft, "profile": profile, "standard": standard}
+PARTS: dict[str, Callable[[Plan, Row], None]] = {
+    "tests": tests,
+    "kernels": kernel_times,
+    "draft": draft,
+    "profile": profile,
+    "standard": standard,
+}
+"""The parts, by name and in their order."""
 
 
 if __name__ == "__main__":

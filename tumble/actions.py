@@ -29,7 +29,7 @@ from tumble.evaluation import (
     score,
 )
 from tumble.export import EXPORT_FILE, PresetName, write_asset
-from tumble.io import BadFile, files, load_plugin, outputs, progress, video
+from tumble.io import BadFile, files, load_plugin, outputs, progress, tree, video
 from tumble.maths import SE3, to_srgb8
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
@@ -89,7 +89,9 @@ def relight(
     environment = light if isinstance(light, Environment) else Environment.read(Path(light))
     trajectory = trajectory or Trajectory(asset.trajectory.T_cam_obj, "object")
     draw = relighting.preview if fast else relighting.relight
-    return draw(cfg or relighting.Config(), asset, environment, trajectory, camera or asset.camera)
+    place, camera = asset.gamma.device, camera or asset.camera
+    environment, trajectory, camera = tree.to(environment, place), tree.to(trajectory, place), tree.to(camera, place)
+    return draw(cfg or relighting.Config(), asset, environment, trajectory, camera)
 
 
 def export_asset(
@@ -162,7 +164,9 @@ def _scored(
 ) -> Report:
     """Render a prediction into `out/prediction`, score it, and write the scores into `out`."""
     alignment, words = aligned
-    prediction: Prediction = predict_views(cfg, asset, known.capture, known.truth, alignment, names=names)
+    place = asset.gamma.device
+    capture, truth = tree.to(known.capture, place), tree.to(known.truth, place)
+    prediction: Prediction = predict_views(cfg, asset, capture, truth, tree.to(alignment, place), names=names)
     prediction.write(out / run.PREDICTION)
     return score(out / run.PREDICTION, known, out, notes=[words])
 
@@ -170,13 +174,14 @@ def _scored(
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
-def finished(out: Path) -> Asset:
-    """The asset of a finished run.
+def finished(out: Path, device: str = "cpu") -> Asset:
+    """The asset of a finished run, on a device.
 
     Raises:
         BadFile: There is none.
+        ValueError: There is no such device.
     """
-    return run.asset(out, Asset)
+    return tree.to(run.asset(out, Asset), usable_device(device))
 
 
 def run_capture(
@@ -207,11 +212,16 @@ def run_capture(
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
     capture = pipeline.capture_of(path, out, options)
     pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, device=place)
-    return write_report(out, capture=capture)
+    return write_report(out, capture=capture, device=place)
 
 
 def evaluate_folder(
-    prediction: Path, capture: Path | None = None, out: Path | None = None, *, overwrite: bool = False
+    prediction: Path,
+    capture: Path | None = None,
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    device: str = "cpu",
 ) -> Report:
     """Score a prediction folder, or a run, whose prediction is rendered first.
 
@@ -230,7 +240,7 @@ def evaluate_folder(
     if not (is_run and out.resolve() == prediction.resolve()):
         outputs.claim_folder(out, SHEET, overwrite=overwrite)
     if is_run or capture is None:
-        return evaluate_run(prediction, capture, out)
+        return evaluate_run(prediction, capture, out, device=device)
     return score(prediction, capture, out)
 
 
@@ -244,7 +254,7 @@ def _is_run(path: Path) -> bool:
     return (path / run.ASSET).is_file()
 
 
-def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = None) -> Report:
+def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = None, *, device: str = "cpu") -> Report:
     """Render a finished run's prediction for a capture and score it.
 
     A run with estimated poses, or with poses of COLMAP, has its own object frame and is aligned first.
@@ -256,7 +266,7 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     Raises:
         BadFile: There is no finished run in `out`, or the capture has no ground truth.
     """
-    asset = finished(out)
+    asset = finished(out, device)
     known = read_with_truth(capture or run.capture_source(out))
     names = source_names(out, known.capture)
     own_frame = (out / run.TRACK).is_dir() or (out / run.CAPTURE / PROVENANCE).is_file()
@@ -298,6 +308,7 @@ def relight_run(
     fast: bool,
     exposure: float = 0.0,
     overwrite: bool = False,
+    device: str = "cpu",
 ) -> Path:
     """Render a run's object under another light, one image per training frame; returns the folder of the images.
 
@@ -314,7 +325,7 @@ def relight_run(
         ValueError: The exposure is out of range.
     """
     gain = _gain(exposure)
-    asset, light = finished(out), Environment.read(env)
+    asset, light = finished(out, device), Environment.read(env)
     note = {"light": str(env.resolve()), "sha256": hashlib.sha256(env.read_bytes()).hexdigest()}
     images = images or _relit_folder(out, env.stem, note["sha256"])
     outputs.claim_folder(images, LIGHT_FILE, overwrite=overwrite)
@@ -322,7 +333,7 @@ def relight_run(
     views = relight(asset, light, cfg=_relighting(out), fast=fast)
     n = len(asset.trajectory)
     for number, linear in enumerate(progress.track(views, f"relighting under {env.stem}", n)):
-        files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).numpy())
+        files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).cpu().numpy())
     return images
 
 
@@ -339,7 +350,14 @@ def _relit_folder(out: Path, name: str, sha256: str) -> Path:
 
 
 def relight_turntable(
-    out: Path, env: Path, clip: Path, *, fast: bool, exposure: float = 0.0, overwrite: bool = False
+    out: Path,
+    env: Path,
+    clip: Path,
+    *,
+    fast: bool,
+    exposure: float = 0.0,
+    overwrite: bool = False,
+    device: str = "cpu",
 ) -> Path:
     """Render a turntable video of a run's object under another light; returns its path.
 
@@ -357,7 +375,8 @@ def relight_turntable(
     """
     gain = _gain(exposure)
     outputs.claim_file(clip, video.CLIP_FORMATS, overwrite=overwrite)
-    asset, light, cfg = finished(out), Environment.read(env), _relighting(out)
+    asset, cfg = finished(out, device), _relighting(out)
+    light = tree.to(Environment.read(env), asset.gamma.device)
     # A quarter of the rays is enough: in a video the noise averages out over frames.
     cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
     R_gl_obj, turning = relighting.turntable(asset.trajectory, TURNTABLE_FRAMES, TURNTABLE_ELEVATION)
@@ -379,7 +398,13 @@ def _gain(exposure: float) -> float:
 
 
 def export_run(
-    out: Path, folder: Path | None, preset: PresetName, scale_mm: float | None, *, overwrite: bool = False
+    out: Path,
+    folder: Path | None,
+    preset: PresetName,
+    scale_mm: float | None,
+    *,
+    overwrite: bool = False,
+    device: str = "cpu",
 ) -> Path:
     """Export a run's object for other programs; returns the folder, by default `RUN/export/PRESET`.
 
@@ -389,7 +414,7 @@ def export_run(
     if scale_mm is not None and not 0 < scale_mm < 1e6:
         raise ValueError(f"--scale-mm is out of range: {scale_mm:g}; give millimetres above 0")
     folder = folder or out / run.EXPORT / preset
-    asset = finished(out)
+    asset = finished(out, device)
     names = run.frame_names(out, len(asset.trajectory))
     return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, overwrite=overwrite)
 

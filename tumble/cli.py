@@ -31,6 +31,10 @@ OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR", help_
 Overwrite = Annotated[
     bool, arg(help="Write even if the folder holds other files; those with the same names are replaced.")
 ]
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"],
+    arg(help="Where to compute. cuda: on an NVIDIA GPU, which no test has run on yet. auto: on one if there is one."),
+]
 OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 
@@ -103,7 +107,7 @@ def run(
     up: Annotated[str, arg(metavar="{auto,[-]x,[-]y,[-]z,FRAME}")] = "auto",
     matcher: str = "mixed",
     pick: bool = False,
-    device: Literal["cpu", "cuda"] = "cpu",
+    device: Device = "cpu",
     seed: int = 0,
 ) -> None:
     """Reconstruct an object from a video: its motion, geometry, albedo and roughness, and the light of the room.
@@ -124,8 +128,6 @@ def run(
             mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
             xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
-        device: Where stages 2 and 3 run.
-            The CUDA kernels compile and pass their tests on the CPU, but have not run on a GPU yet.
         seed: Seed of all random numbers.
     """
     from dataclasses import replace
@@ -160,6 +162,7 @@ def relight(
     fast: bool = False,
     exposure: float = 0.0,
     overwrite: Overwrite = False,
+    device: Device = "cpu",
 ) -> None:
     """Render a reconstructed object under another light, in the poses of its training frames or as a turntable video.
 
@@ -175,10 +178,8 @@ def relight(
 
     if turntable is not None and out is not None:
         raise ValueError("-o is the folder of images, and --turntable a video instead of them: leave one of them out")
-    if turntable is not None:
-        print(relight_turntable(run, env, turntable, fast=fast, exposure=exposure, overwrite=overwrite))
-    else:
-        print(relight_run(run, env, out, fast=fast, exposure=exposure, overwrite=overwrite))
+    how = {"fast": fast, "exposure": exposure, "overwrite": overwrite, "device": device}
+    print(relight_run(run, env, out, **how) if turntable is None else relight_turntable(run, env, turntable, **how))
 
 
 def export(
@@ -188,6 +189,7 @@ def export(
     scale_mm: Annotated[float | None, arg(metavar="MM", help_behavior_hint="")] = None,
     out: OptionalFolder = None,
     overwrite: Overwrite = False,
+    device: Device = "cpu",
 ) -> None:
     """Export a reconstructed object: textured GLB, Gaussian PLYs, environment map, poses (docs/export.md).
 
@@ -199,19 +201,20 @@ def export(
     """
     from tumble.actions import export_run
 
-    print(export_run(run, out, preset, scale_mm, overwrite=overwrite))
+    print(export_run(run, out, preset, scale_mm, overwrite=overwrite, device=device))
 
 
-def report(run: Positional[Path], /, capture: OptionalCapture = None) -> None:
+def report(run: Positional[Path], /, capture: OptionalCapture = None, device: Device = "cpu") -> None:
     """Write report.html for a finished run: results and their reliability, one file that works offline.
 
     Args:
         run: Run directory.
         capture: New location of the run's capture, if it was moved.
     """
+    from tumble.rendering import usable_device
     from tumble.report import write_report
 
-    print(write_report(run, capture=capture))
+    print(write_report(run, capture=capture, device=usable_device(device)))
 
 
 def evaluate(
@@ -220,6 +223,7 @@ def evaluate(
     /,
     out: OptionalFolder = None,
     overwrite: Overwrite = False,
+    device: Device = "cpu",
 ) -> None:
     """Score a run, or a prediction folder of any other method, against the ground truth of a capture.
 
@@ -231,7 +235,7 @@ def evaluate(
     """
     from tumble.actions import evaluate_folder, score_folder
 
-    _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite))
+    _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite, device=device))
     print((out or score_folder(prediction)) / "report.json")
 
 
@@ -249,7 +253,7 @@ def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = 
         print(line)
 
 
-def demo(out: Folder = Path("runs/demo")) -> None:
+def demo(out: Folder = Path("runs/demo"), device: Device = "cpu") -> None:
     """Reconstruct the bundled clip from its frames and masks, and score the result against ground truth; takes minutes.
 
     Args:
@@ -257,7 +261,7 @@ def demo(out: Folder = Path("runs/demo")) -> None:
     """
     from tumble.demo import reconstruct_clip
 
-    scores, page = reconstruct_clip(out)
+    scores, page = reconstruct_clip(out, device=device)
     shared = scores["regions"]["shared"]
     for part in ("albedo", "relit"):
         object_, image = (shared[f"{part}.psnr_{where}_srgb"] for where in ("fg", "full"))

@@ -16,6 +16,7 @@ from tumble.engine import run
 from tumble.evaluation import Report
 from tumble.io import files, video
 from tumble.recipes import DRAFT, Recipe
+from tumble.rendering import usable_device
 from tumble.report import write_report
 from tumble.synthetic import room_environment, sunset_environment, write_pot
 
@@ -49,7 +50,7 @@ def unpack(out: Path) -> Path:
     return out
 
 
-def reconstruct_clip(out: Path, recipe: Recipe = DRAFT) -> tuple[Report, Path]:
+def reconstruct_clip(out: Path, recipe: Recipe = DRAFT, *, device: str = "cpu") -> tuple[Report, Path]:
     """Reconstruct the bundled clip from its frames and masks, evaluate the result, and write the report page.
 
     Returns:
@@ -57,11 +58,13 @@ def reconstruct_clip(out: Path, recipe: Recipe = DRAFT) -> tuple[Report, Path]:
 
     Raises:
         BadFile: `out` holds something else.
+        ValueError: There is no such device.
     """
+    place = usable_device(device)
     with run.exclusive_access(out):
         folder = unpack(out / run.CAPTURE)
-    pipeline.reconstruct(folder, out, recipe)
-    return actions.evaluate_run(out, folder), write_report(out)
+    pipeline.reconstruct(folder, out, recipe, device=place)
+    return actions.evaluate_run(out, folder, device=device), write_report(out, device=place)
 
 
 def build(out: Path = Path("tumble/data/demo")) -> None:

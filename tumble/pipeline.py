@@ -101,12 +101,17 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
 
 
 def estimate_poses(
-    capture: Capture, recipe: Recipe = DRAFT, *, progress: Callable[[Progress], None] | None = None
+    capture: Capture,
+    recipe: Recipe = DRAFT,
+    *,
+    device: torch.device | str = "cpu",
+    progress: Callable[[Progress], None] | None = None,
 ) -> PoseResult:
     """Estimate the object's pose in every frame from images and masks (stage 1); the capture's own poses are ignored.
 
     Args:
         recipe: Only `matcher`, `track` and `seed` are used.
+        device: Where a matcher's network runs.
         progress: Called every few seconds.
 
     Raises:
@@ -114,7 +119,7 @@ def estimate_poses(
     """
     capture = replace(capture, trajectory=None)
     check_plausible(capture, IN_MEMORY)
-    return _poses_of(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture))[0]
+    return _poses_of(run.Run(None, recipe, progress), capture, IN_MEMORY, content_key(capture), device)[0]
 
 
 def reconstruct(
@@ -142,7 +147,7 @@ def reconstruct(
         up: Up direction of the object, which becomes +y of the asset's frame. "auto": that of the poses, which for
             estimated ones is up in the first frame. Or one of `ROTATIONS_TO_UP`, an axis of the frame of "auto"; or
             the name of a frame in which the object is upright. No stage depends on it.
-        device: Where stages 2 and 3 run.
+        device: Where stages 2 and 3 and the network of a matcher run.
         progress: Called every few seconds.
 
     Returns:
@@ -179,7 +184,7 @@ def _reconstruct(
     """The asset on the CPU, and the names of its frames."""
     recipe, trajectory, key = opened.recipe, capture.trajectory, content_key(capture)
     if trajectory is None:
-        tracked, capture, key = (found, capture, "") if found else _poses_of(opened, capture, where, key)
+        tracked, capture, key = (found, capture, "") if found else _poses_of(opened, capture, where, key, device)
         kept = torch.where(~tracked.quality.lost)[0].tolist()
         trajectory = tracked.trajectory.select(kept)
         capture = replace(capture.select(kept), camera=tracked.camera)
@@ -203,17 +208,19 @@ def stage_of(cfg: Any) -> Any:
     return stage
 
 
-def _poses_of(opened: run.Run, capture: Capture, where: Path, content: str) -> tuple[PoseResult, Capture, str]:
+def _poses_of(
+    opened: run.Run, capture: Capture, where: Path, content: str, device: torch.device | str
+) -> tuple[PoseResult, Capture, str]:
     """Stage 1, repeated with trimmed masks while that explains more: poses, capture with these masks, key."""
     if len(capture) < MIN_FRAMES:
         rule = f"has {len(capture)} frames, too few to estimate the motion"
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
-    tracked, key = _track(opened, capture, where, content, 1)
+    tracked, key = _track(opened, capture, where, content, 1, device)
     for number in range(2, mask_refinement.ROUNDS + 1):
         if not mask_refinement.can_be_trimmed(capture, tracked):
             break
         trimmed = mask_refinement.trim_masks(capture, tracked)
-        new, new_key = _track(opened, trimmed, where, content_key(trimmed), number)
+        new, new_key = _track(opened, trimmed, where, content_key(trimmed), number, device)
         if not mask_refinement.explains_more(new, tracked):
             break
         tracked, capture, key = new, trimmed, new_key
@@ -221,12 +228,14 @@ def _poses_of(opened: run.Run, capture: Capture, where: Path, content: str) -> t
     return tracked, capture, key
 
 
-def _track(opened: run.Run, capture: Capture, where: Path, content: str, number: int) -> tuple[PoseResult, str]:
+def _track(
+    opened: run.Run, capture: Capture, where: Path, content: str, number: int, device: torch.device | str
+) -> tuple[PoseResult, str]:
     """One round of stage 1: match frames, then estimate all poses; also returns the key of the result."""
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
-    matches = matching.match_pairs(matching.views_of(capture), near, recipe.matcher, cache=cache)
+    matches = matching.match_pairs(matching.views_of(capture), near, recipe.matcher, device=device, cache=cache)
     route = stage_of(recipe.track)
     try:
         with progress.task("observations in all frames"):

@@ -12,11 +12,12 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._pytree import tree_map
 
 from tests.backends import cases
 from tests.backends import test_backends as conformance
 from tumble import backends
-from tumble.backends import Hits, Rendering, cuda, reference
+from tumble.backends import cuda, reference
 
 GPU = torch.device("cuda")
 
@@ -161,9 +162,9 @@ class OnGpu:
         def call(*arguments: Any) -> Any:
             there = (x.to(GPU) if isinstance(x, torch.Tensor) else x for x in arguments)
             result = getattr(cuda, verb)(*there)
-            if isinstance(result, Rendering | Hits):
-                return type(result)(*(x.cpu() for x in result))
-            return result.cpu() if isinstance(result, torch.Tensor) else result
+            if verb == "build":
+                return result
+            return tree_map(lambda x: x.cpu() if isinstance(x, torch.Tensor) else x, result)
 
         return call
 

@@ -70,8 +70,8 @@ class Waits(TorchDispatchMode):
 
 
 def test_steps_hardly_ever_wait_for_the_device() -> None:
-    """Stage 2 asks whether poses were corrected and whether all is finite, stage 3 which pixels show the object and
-    whether all is finite; besides, the number of the frame is drawn on the CPU."""
+    """On the CPU, stage 2 asks whether all is finite, stage 3 also which pixels show the object; besides, the number of
+    the frame is drawn on the CPU. `tests/test_device.py` has the same for a device."""
     _, true, capture = textured_sphere()
     inputs = refine.Inputs(capture, Trajectory(true, "camera"))
     cfg = replace(SMOKE.refine, points=600)
@@ -79,7 +79,7 @@ def test_steps_hardly_ever_wait_for_the_device() -> None:
     state.step = 1
     with Waits() as waits:
         refine.step(cfg, inputs, state)
-    assert waits.names == ["_local_scalar_dense"] * 3
+    assert waits.names == ["_local_scalar_dense"] * 2
     third = decompose.Inputs(capture, refine.finish(cfg, inputs, state))
     state = decompose.init(replace(SMOKE.decompose, fit_specular=False), third, torch.Generator().manual_seed(0))
     with Waits() as waits:

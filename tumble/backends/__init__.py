@@ -142,11 +142,14 @@ def threads_for_kernels() -> Iterator[None]:
 
 
 def usable_device(name: str) -> torch.device:
-    """The device with the given name.
+    """The device with the given name; "auto" is a GPU if there is one whose kernels are ready, else the CPU.
 
     Raises:
         ValueError: The device is "cuda", and torch finds no NVIDIA GPU.
     """
+    if name == "auto":
+        gpu = torch.device("cuda")
+        return torch.device("cpu") if load("cuda").ready(gpu, torch.float32) else gpu
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: torch finds no NVIDIA GPU on this machine; for details run: tumble doctor")
     return torch.device(name)

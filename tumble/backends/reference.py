@@ -433,7 +433,7 @@ def image_terms(
 
 def similarity(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 h-10 w-10"]:
     """Structural similarity (Wang et al. 2004) at all windows within two images."""
-    offset = torch.arange(SSIM_WINDOW).to(x) - SSIM_WINDOW // 2
+    offset = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
     taps = torch.softmax(-0.5 * (offset / SSIM_SIGMA) ** 2, 0)
 
     def mean(image: Tensor) -> Tensor:
@@ -460,7 +460,8 @@ def _normal_term(
     for at in (right, left, below, above):
         known = known & neighbour(covered, at)
     fx, fy, cx, cy = fx_fy_cx_cy
-    X, Y = (torch.arange(w).to(depth) + 0.5 - cx) / fx, (torch.arange(h).to(depth) + 0.5 - cy) / fy
+    x, y = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (w, h))
+    X, Y = (x - cx) / fx, (y - cy) / fy
 
     def slope(focal: Tensor, after: tuple[int, int], before: tuple[int, int]) -> Tensor:
         a, b = neighbour(depth, after), neighbour(depth, before)
@@ -497,8 +498,9 @@ def gaussian_terms(
     z, visible = x_cam[:, 2], weight > 0
     with torch.no_grad():
         uv = x_cam[:, :2] / x_cam[:, 2:] * fx_fy_cx_cy[:2] + fx_fy_cx_cy[2:]
-        size = uv.new_tensor([depth.shape[1], depth.shape[0]])
-        surface = grid_sample(depth[None, None], (uv / size * 2 - 1)[None, None], align_corners=False)[0, 0, 0]
+        u, v = uv[:, 0] / depth.shape[1], uv[:, 1] / depth.shape[0]
+        at = torch.stack([u, v], -1)[None, None] * 2 - 1
+        surface = grid_sample(depth[None, None], at, align_corners=False)[0, 0, 0]
         inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
         surface = torch.where(inlier, surface, 0)  # NaN behind the camera would reach the gradients
     difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)

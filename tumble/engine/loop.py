@@ -243,6 +243,8 @@ def _parts(state: State) -> dict[str, dict[str, Tensor]]:
 def _check(state: State, checkpoint: Path | None) -> None:
     """Raise `NotFinite` if parameters or moments are not finite; `memory` may hold infinities."""
     parts = _parts(state)
+    if state.optimizer:
+        optim.check_steps(state.optimizer, state.step)
     if name := optim.first_not_finite((parts["params"] | parts["optimizer"]).items()):
         raise _with_checkpoint(NotFinite(name, state.step), checkpoint)
 

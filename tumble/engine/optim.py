@@ -24,6 +24,9 @@ T = TypeVar("T")
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Keys of the moments in the state of Adam: running means of the gradient and of its square."""
 
+CHECK_EVERY = 50
+"""Steps between two times at which the host asks a GPU whether loss and gradients are finite."""
+
 
 class NotFinite(ValueError):
     """Error for a NaN or an infinity; the message holds the tensor, the step and the last valid checkpoint."""
@@ -148,17 +151,42 @@ def anneal(optimizer: Adam, factor: dict[str, float] | float) -> None:
 def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     """One optimizer step on `loss`; leaves that the loss does not depend on keep their values and moments.
 
+    On a GPU the host looks only in every `CHECK_EVERY`th step whether all is finite.
+
     Raises:
-        NotFinite: The loss or a gradient holds NaN or infinity; no leaf was changed.
+        NotFinite: The loss or a gradient holds NaN or infinity; no leaf was changed since.
     """
     optimizer.zero_grad()
     loss.backward()
     gradients = {name: x.grad for name, x in _named_leaves(optimizer) if x.grad is not None}
+    if loss.device.type != "cpu" and optimizer.defaults["fused"]:
+        _step_without_waiting(loss.detach(), gradients, optimizer, step)
+        return
     # One scalar covers all gradients, so that each step waits for the device only once.
     norm = torch.nn.utils.get_total_norm(list(gradients.values()))
     if not bool(torch.isfinite(norm + loss.detach())):
         _raise_if_not_finite(loss, gradients, step)
     optimizer.step()
+
+
+def _step_without_waiting(loss: Tensor, gradients: dict[str, Tensor], optimizer: torch.optim.Adam, step: int) -> None:
+    """One optimizer step on a device, which changes nothing from the first loss or gradient that is not finite."""
+    largest = torch.nn.utils.get_total_norm(list(gradients.values()), norm_type=float("inf"))
+    bad = (~torch.isfinite(torch.stack([largest, loss])).all()).float()
+    if (before := getattr(optimizer, "found_inf", None)) is not None:
+        bad = torch.maximum(bad, before)
+    optimizer.found_inf = bad  # type: ignore[attr-defined] (torch's fused kernel skips the step where it is 1)
+    optimizer.step()
+    if (step + 1) % CHECK_EVERY == 0 and bool(bad):
+        _raise_if_not_finite(loss, gradients, step)
+        check_steps(optimizer, step)
+
+
+def check_steps(optimizer: torch.optim.Adam, step: int) -> None:
+    """Raise `NotFinite` if `descend` has left out steps on a device since a loss or a gradient was not finite."""
+    bad = getattr(optimizer, "found_inf", None)
+    if bad is not None and bool(bad):
+        raise NotFinite(f"the loss or a gradient in one of the last {CHECK_EVERY} steps", step)
 
 
 def _raise_if_not_finite(loss: Tensor, gradients: dict[str, Tensor], step: int) -> None:

@@ -329,7 +329,7 @@ def stage(
             seed of the stage.
         stage: The stage module. The return annotation of its `finish` is the class of its output.
         cfg: Settings of the stage.
-        inputs: Inputs of the stage.
+        inputs: Inputs of the stage, whose kind of device is a part of the key.
         input_keys: Keys of the inputs: the hash of the capture, keys of earlier stages.
 
     Raises:
@@ -337,7 +337,8 @@ def stage(
     """
     name = folder.partition("-")[2]
     seed = stage_seed(run.recipe.seed, name)
-    own_key = key(name, stage, cfg, [*input_keys, f"seed {seed}"])
+    kind = _device(inputs).type
+    own_key = key(name, stage, cfg, [*input_keys, f"seed {seed}", *([] if kind == "cpu" else [kind])])
     if run.path is None:
         return loop.drive(stage, cfg, inputs, seed=seed, report=run.report, name=name), own_key
     stage_path = run.path / folder

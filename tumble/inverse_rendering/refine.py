@@ -218,12 +218,20 @@ def _rates(cfg: Config) -> dict[str, float]:
     }
 
 
-def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
-    """`T_cam_obj` of one frame."""
+def pose(params: Params, inputs: Inputs, frame: int, *, corrected: bool = True) -> SE3:
+    """`T_cam_obj` of one frame.
+
+    Args:
+        corrected: Whether its tangent may differ from zero. If not, the exponential map, some hundred small operations,
+            is skipped; the result is the same.
+    """
     base = inputs.trajectory.T_cam_obj[frame]
-    # Fixed poses have zero tangents; the exponential map, some hundred small operations, is skipped for speed.
-    corrected = params.poses.requires_grad or bool(params.poses[frame].any())
     return SE3.exp(params.poses[frame]) @ base if corrected else base
+
+
+def _corrects_poses(cfg: Config, step: int) -> bool:
+    """Whether training has changed poses by a step, told from the settings: a device need not be waited for."""
+    return cfg.rates.poses != 0 or any(aligned <= step for aligned in _alignment_steps(cfg))
 
 
 def render(
@@ -271,7 +279,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         _align_poses(inputs, state)
     params, camera = state.params, inputs.capture.camera
     frame = _next_frame(state, len(inputs.capture))
-    T_cam_obj = pose(params, inputs, frame)
+    T_cam_obj = pose(params, inputs, frame, corrected=_corrects_poses(cfg, state.step))
     arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
     view = render(*arguments, visibility=cached_visibility(state))
     state.memory["max_weight"] = torch.maximum(state.memory["max_weight"], view.weight.detach())

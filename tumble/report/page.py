@@ -28,7 +28,7 @@ from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
-from tumble.io import BadFile, files, progress
+from tumble.io import BadFile, files, progress, tree
 from tumble.maths import fibonacci_sphere
 from tumble.poses import PoseQuality, mask_refinement
 from tumble.report import figures, health_card, preset_lights, svg, training_views
@@ -77,11 +77,12 @@ class RunSummary:
     """The capture's focal length if it was assumed, else None [pixels]."""
 
 
-def write_report(out: Path, *, capture: Path | None = None) -> Path:
+def write_report(out: Path, *, capture: Path | None = None, device: torch.device | str = "cpu") -> Path:
     """Write `report.html` into a finished run's folder; returns its path.
 
     Args:
         capture: Path of the run's capture, if it was moved since the run.
+        device: Where the views are rendered.
 
     Raises:
         BadFile: The run is not finished, its capture is missing, or `capture` is not the capture of the run.
@@ -96,6 +97,7 @@ def write_report(out: Path, *, capture: Path | None = None) -> Path:
     assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
     with tempfile.TemporaryDirectory() as folder:
+        asset = tree.to(asset, device)
         glb = write_model(asset, Path(folder))
         build(asset, run_capture, glb, summary, tracked.quality if tracked else None, out / run.REPORT)
     return out / run.REPORT
@@ -136,7 +138,7 @@ def build(
     """Write the page; returns the rows of its health card.
 
     Args:
-        asset: Asset with material and light, on the CPU.
+        asset: Asset with material and light.
         capture: The asset's training frames, in the order of its trajectory.
         glb: Mesh for the live view; without one the live view is left out.
         quality: Quality of the poses, if they were estimated.

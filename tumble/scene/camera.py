@@ -46,7 +46,7 @@ class Camera:
     @property
     def opencv_matrix(self) -> Float64[np.ndarray, "3 3"]:
         """Intrinsic matrix for OpenCV and data layouts such as BOP's, whose first pixel centre lies at (0, 0)."""
-        K = self.matrix.double().numpy().copy()
+        K = self.matrix.double().cpu().numpy().copy()
         K[:2, 2] -= 0.5
         return K
 

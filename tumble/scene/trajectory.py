@@ -21,7 +21,8 @@ Light = Literal["camera", "object"]
 
 def opengl_from_opencv(like: Tensor) -> Float[Tensor, "3 3"]:
     """Rotation from OpenCV to OpenGL camera axes, and its own inverse."""
-    return torch.diag(like.new_tensor([1.0, -1.0, -1.0]))
+    # Made on the device: a list of numbers would be copied to it, for which the host waits.
+    return torch.diag(1 - 2 * (torch.arange(3, device=like.device) > 0).to(like))
 
 
 def env_from_obj(T_cam_obj: SE3, light: Light) -> Float[Tensor, "*b 3 3"]:

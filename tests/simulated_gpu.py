@@ -1,0 +1,171 @@
+"""A simulated device: tensors that lie in main memory but follow the rules of tensors on a GPU.
+
+Within `simulated_gpu() as gpu`, the device `DEVICE` has such tensors. As on a GPU, an operation on tensors of two
+devices is an error, and numpy cannot read them. `gpu.waits` records what the host would have to wait for (values and
+shapes that Python asks for, copies to the host), `gpu.copies` the copies from the host to the device.
+
+The device's name is torch's "meta", because a torch without CUDA knows no other device with gradients. Nothing else of
+torch's meta tensors is used.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map
+
+from tumble import backends
+
+DEVICE = torch.device("meta")
+"""The simulated device."""
+WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_consecutive", "unique_dim"}
+"""Operations whose result, or its shape, is a value that the host has to wait for."""
+MIXING = {"copy_", "index", "index_put_", "_index_put_impl_", "_to_copy", "is_pinned", "set_"}
+"""Operations that accept tensors of both devices."""
+
+
+class OnDevice(torch.Tensor):
+    """A tensor on the simulated device; `inner` holds its values."""
+
+    inner: torch.Tensor
+
+    @staticmethod
+    def __new__(cls, inner: torch.Tensor) -> "OnDevice":
+        layout = {"strides": inner.stride(), "storage_offset": inner.storage_offset(), "dtype": inner.dtype}
+        made = torch.Tensor._make_wrapper_subclass(cls, inner.shape, **layout, device=DEVICE)  # type: ignore
+        made.inner = inner
+        return made
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore
+
+    def __repr__(self, **_: Any) -> str:
+        return f"OnDevice({self.inner!r})"
+
+    def tolist(self) -> Any:
+        return self.cpu().tolist()
+
+    @classmethod
+    def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        raise AssertionError(f"{function} outside the context of the simulated device")
+
+
+class SimulatedGpu(TorchDispatchMode):
+    """Context in which `DEVICE` is the simulated device."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: list[str] = []
+        self.copies: list[str] = []
+        self.paused = False
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        name = function.__name__.partition(".")[0]
+        tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
+        there = [x for x in tensors if isinstance(x, OnDevice)]
+        target = kwargs.get("device")
+        target = torch.device(target).type if target is not None else None
+        if there and name not in MIXING:
+            here = [x for x in tensors if not isinstance(x, OnDevice) and x.dim()]
+            if here:
+                raise RuntimeError(f"{name}: tensors of {[tuple(x.shape) for x in here]} are not on the device")
+        self._record(name, target, there, tensors)
+        if target == DEVICE.type:
+            kwargs["device"] = torch.device("cpu")
+        inner = tree_map(lambda x: x.inner if isinstance(x, OnDevice) else x, (args, kwargs))
+        result = function(*inner[0], **inner[1])
+        if function._schema.is_mutable and isinstance(args[0], torch.Tensor):
+            return args[0]
+        if target == DEVICE.type or (there and target is None and name != "_local_scalar_dense"):
+            return tree_map(lambda x: OnDevice(x) if isinstance(x, torch.Tensor) else x, result)
+        return result
+
+    def _record(self, name: str, target: str | None, there: list[OnDevice], tensors: list[torch.Tensor]) -> None:
+        """Note what an operation waits for or copies."""
+        if self.paused:
+            return
+        indexed = name.startswith(("index", "_index_put")) and any(
+            x.dtype in (torch.bool, torch.uint8) for x in tensors[1:]
+        )
+        to_host = name == "_to_copy" and there and target == "cpu"
+        back = name == "copy_" and len(there) == 1 and not isinstance(tensors[0], OnDevice)
+        if there and (name in WAITING or (name == "index" and indexed) or to_host or back):
+            self.waits.append(f"{name} in {_caller()}")
+        to_device = name == "_to_copy" and target == DEVICE.type and not there
+        mixed = name == "copy_" and len(there) == 1 and isinstance(tensors[0], OnDevice)
+        foreign = name in ("index", "index_put_", "_index_put_impl_") and 0 < len(there) < len(tensors)
+        if to_device or mixed or foreign:
+            self.copies.append(f"{name} in {_caller()}")
+
+
+def _caller() -> str:
+    """File and function of the package that called torch."""
+    frame: Any = sys._getframe(1)
+    while frame is not None and f"{os.sep}tumble{os.sep}" not in frame.f_code.co_filename:
+        frame = frame.f_back
+    return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} {frame.f_code.co_name}" if frame else "a test"
+
+
+class Kernels:
+    """The kernels of the CPU; with gradients, which these cannot hand on to the device's tensors, the reference."""
+
+    def __init__(self, gpu: SimulatedGpu) -> None:
+        self._gpu = gpu
+
+    def __getattr__(self, verb: str) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            if torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in arguments):
+                return self._differentiable(verb, *arguments)
+            inner = [x.inner.detach() if isinstance(x, OnDevice) else x for x in arguments]
+            result = getattr(backends.load("cpu"), verb)(*inner)
+            return tree_map(lambda x: OnDevice(x) if isinstance(x, torch.Tensor) else x, result)
+
+        return call
+
+    def _differentiable(self, verb: str, *arguments: Any) -> Any:
+        """What kernels in Warp replace is not recorded."""
+        self._gpu.paused = verb in ("rasterize", "build", "trace", "visible", "blockers", "shade")
+        try:
+            return getattr(backends.load("reference"), verb)(*arguments)
+        finally:
+            self._gpu.paused = False
+
+
+@contextmanager
+def simulated_gpu() -> Iterator[SimulatedGpu]:
+    """The simulated device, with the kernels of the reference backend."""
+    choose: Callable[..., Any] = backends.choose
+    gpu = SimulatedGpu()
+
+    def chosen(device: torch.device, dtype: torch.dtype) -> Any:
+        return Kernels(gpu) if device == DEVICE else choose(device, dtype)
+
+    # These two make the tensor without a dispatch, which a meta tensor's values do not survive.
+    make, make_like = torch.tensor, torch.Tensor.new_tensor
+
+    def tensor(data: Any, *, device: Any = None, **options: Any) -> torch.Tensor:
+        made = make(data, **options)
+        return made if device is None else made.to(device)
+
+    def new_tensor(like: torch.Tensor, data: Any, *, device: Any = None, **options: Any) -> torch.Tensor:
+        if not isinstance(like, OnDevice):
+            return make_like(like, data, **options)
+        return make(data, **({"dtype": like.dtype} | options)).to(DEVICE)
+
+    patches = (
+        patch("torch.optim.optimizer._get_fused_kernels_supported_devices", lambda: ["cpu", "cuda", DEVICE.type]),
+        patch.object(backends, "choose", chosen),
+        patch.object(torch, "tensor", tensor),
+        patch.object(torch.Tensor, "new_tensor", new_tensor),
+        patch.object(OnDevice, "new_tensor", new_tensor),
+    )
+    with ExitStack() as stack:
+        for each in patches:
+            stack.enter_context(each)
+        yield stack.enter_context(gpu)

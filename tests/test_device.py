@@ -1,0 +1,203 @@
+"""Steps and commands on another device than the CPU, which `tests.simulated_gpu` simulates."""
+
+import dataclasses
+import importlib.util
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests import test_pipeline
+from tests.inverse_rendering.test_refine import textured_sphere
+from tests.simulated_gpu import DEVICE, SimulatedGpu, simulated_gpu
+from tumble import actions, backends, pipeline, recipes
+from tumble.engine import loop, optim
+from tumble.export import asset as export
+from tumble.export.asset import Preset
+from tumble.inverse_rendering import decompose, refine
+from tumble.io import files, tree, video
+from tumble.report import page
+from tumble.scene.asset import Asset
+from tumble.scene.trajectory import Trajectory
+
+RECIPE, capture, finished = test_pipeline.RECIPE, test_pipeline.capture, test_pipeline.finished
+SMALL = Preset(triangles=200, texture=32, cells=16, views=4, pixels=32)
+"""A mesh that is made in no time."""
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedGpu]:
+    """The simulated device, as `--device cuda`."""
+
+    def device(name: str) -> torch.device:
+        return DEVICE if name == "cuda" else backends.usable_device(name)
+
+    monkeypatch.setattr(actions, "usable_device", device)
+    monkeypatch.setattr(actions, "TURNTABLE_FRAMES", 2)
+    monkeypatch.setattr(actions, "TURNTABLE_SIDE", 32)
+    monkeypatch.setattr(page, "MESH", SMALL)
+    monkeypatch.setitem(export.PRESETS, "web", SMALL)
+    with simulated_gpu() as simulated:
+        yield simulated
+
+
+def on_device(inputs: Any) -> Any:
+    """The inputs of a stage, on the simulated device."""
+    return type(inputs)(*(tree.to(x, DEVICE) for x in vars(inputs).values()))
+
+
+def steps(stage: Any, cfg: Any, inputs: Any, n: int) -> tuple[Any, list[dict[str, float]]]:
+    """The output of a stage after `n` steps, and the terms of each."""
+    state, seen = stage.init(cfg, inputs, torch.Generator().manual_seed(0)), []
+    for _ in range(n):
+        seen.append({name: float(value) for name, value in stage.step(cfg, inputs, state).items()})
+        state.step += 1
+    return stage.finish(cfg, inputs, state), seen
+
+
+@pytest.fixture(scope="module")
+def stages() -> list[tuple[Any, Any, Any, list[dict[str, float]]]]:
+    """Stages 2 and 3 of a textured sphere: the module, its settings and inputs, and the terms of two steps."""
+    _, true, taken = textured_sphere()
+    second = refine.Inputs(taken, Trajectory(true, "camera"))
+    cfg_2 = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    refined, of_second = steps(refine, cfg_2, second, 2)
+    third = decompose.Inputs(taken, refined)
+    cfg_3 = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, fit_specular=False)
+    _, of_third = steps(decompose, cfg_3, third, 2)
+    return [(refine, cfg_2, second, of_second), (decompose, cfg_3, third, of_third)]
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["refine", "decompose"])
+def test_steps_on_a_device_are_those_of_the_cpu(number: int, stages: list[Any], gpu: SimulatedGpu) -> None:
+    stage, cfg, inputs, here = stages[number]
+    output, there = steps(stage, cfg, on_device(inputs), 2)
+    # Sums in another order, and what Adam makes of their rounding.
+    for a, b in zip(here, there, strict=True):
+        assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
+    assert {x.device for x in tree.named_tensors(output).values()} == {DEVICE}
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["refine", "decompose"])
+def test_steps_with_the_kernels_for_a_gpu_are_those_of_the_cpu(
+    number: int, stages: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernels in Warp run on the CPU here."""
+    if importlib.util.find_spec("warp") is None:
+        pytest.skip("needs NVIDIA Warp: pip install 'tumble[cuda]'")
+    monkeypatch.setattr(backends, "choose", lambda device, dtype: backends.load("cuda"))
+    stage, cfg, inputs, here = stages[number]
+    for a, b in zip(here, steps(stage, cfg, inputs, 2)[1], strict=True):
+        assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
+
+
+def test_steps_hardly_ever_wait_for_the_device_and_copy_next_to_nothing_to_it(gpu: SimulatedGpu) -> None:
+    """Stage 3 asks which pixels show the object, and draws some of them on the host."""
+    _, true, taken = textured_sphere()
+    inputs = on_device(refine.Inputs(taken, Trajectory(true, "camera")))
+    cfg = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+
+    def recorded(stage: Any, cfg: Any, inputs: Any, state: Any) -> tuple[list[str], list[str]]:
+        stage.step(cfg, inputs, state)
+        state.step += 1  # the first step fills caches
+        gpu.waits.clear()
+        gpu.copies.clear()
+        stage.step(cfg, inputs, state)
+        return [x.split()[-1] for x in gpu.waits], [x.split()[-1] for x in gpu.copies]
+
+    assert recorded(refine, cfg, inputs, state) == ([], [])
+    third = decompose.Inputs(inputs.capture, refine.finish(cfg, inputs, state))
+    cfg = dataclasses.replace(recipes.known_poses(RECIPE).decompose, fit_specular=False)
+    state = decompose.init(cfg, third, torch.Generator().manual_seed(0))
+    assert recorded(decompose, cfg, third, state) == (["_sample_pixels"], ["_sample_pixels"])
+
+
+def test_a_gradient_on_a_device_that_is_not_finite_changes_nothing_and_is_named_later(gpu: SimulatedGpu) -> None:
+    x = optim.leaves({"x": torch.ones(3), "y": torch.ones(2)})
+    x = optim.leaves(tree.to(x, DEVICE))
+    optimizer = optim.adam(x, {"": 0.1})
+    optim.descend(x["x"].sum() + x["y"].sum(), optimizer, step=0)
+    before = x["x"].tolist()
+    assert before == pytest.approx([0.9] * 3)
+    optim.descend((x["x"] - x["x"].detach()).sqrt().sum() + x["y"].sum(), optimizer, step=1)
+    optim.descend(x["x"].sum() + x["y"].sum(), optimizer, step=2)
+    assert x["x"].tolist() == before
+    state = loop.State(3, x, optimizer, torch.Generator())
+    with pytest.raises(optim.NotFinite, match="in one of the last 50 steps is not finite at step 3"):
+        loop._check(state, None)
+    with pytest.raises(optim.NotFinite, match="the gradient of x is not finite at step 49"):
+        optim.descend((x["x"] - x["x"].detach()).sqrt().sum(), optimizer, step=49)
+
+
+def test_relit_images_and_videos_are_those_of_the_cpu(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    light = capture / "truth" / "lights" / "sun.hdr"
+    for fast in (False, True):
+        here, there = (
+            actions.relight_run(finished[0], light, tmp_path / f"{device}-{fast}", fast=fast, device=device)
+            for device in ("cpu", "cuda")
+        )
+        for path in here.glob("*.png"):
+            a, b = (files.read_image(folder / path.name).astype(int) for folder in (here, there))
+            assert np.abs(a - b).max() <= 1
+    clip = actions.relight_turntable(finished[0], light, tmp_path / "turn.mp4", fast=True, device="cuda")
+    assert len(list(video.read_clip(clip))) == 2
+
+
+def test_scores_are_those_of_the_cpu(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    here, there = (
+        actions.evaluate_run(finished[0], capture, tmp_path / name, device=name)["regions"]["shared"]
+        for name in ("cpu", "cuda")
+    )
+    assert there == pytest.approx(here, rel=1e-4)
+
+
+def test_exported_files_are_those_of_the_cpu(finished: tuple[Path, Asset], tmp_path: Path, gpu: SimulatedGpu) -> None:
+    here, there = (
+        actions.export_run(finished[0], tmp_path / name, "splat", None, device=name) for name in ("cpu", "cuda")
+    )
+    assert {path.name for path in here.iterdir()} == {path.name for path in there.iterdir()}
+    for path in (*here.glob("*.json"), *here.glob("*.ply")):
+        if path.name != "export.json":
+            assert path.read_bytes() == (there / path.name).read_bytes(), path.name
+    mesh = actions.export_run(finished[0], tmp_path / "mesh", "web", None, device="cuda")
+    assert (mesh / "asset.glb").is_file()
+
+
+def test_the_key_of_a_stage_names_the_kind_of_device(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stage that was finished on the CPU is run again on a device, and starts from its first step."""
+
+    def stop(*_: Any) -> None:
+        raise InterruptedError
+
+    monkeypatch.setattr(refine, "step", stop)
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    pipeline.reconstruct(capture, run, RECIPE)
+    with pytest.raises(InterruptedError):
+        pipeline.reconstruct(capture, run, RECIPE, device=DEVICE)
+
+
+@pytest.mark.slow
+def test_a_run_with_its_report_is_made_on_a_device(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    asset = pipeline.reconstruct(capture, tmp_path / "run", RECIPE, device=DEVICE)
+    assert len(asset.gaussians) == pytest.approx(len(finished[1].gaussians), rel=0.1)
+    assert page.write_report(tmp_path / "run", capture=capture, device=DEVICE).is_file()
+
+
+def test_auto_is_the_cpu_unless_a_gpu_and_its_kernels_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends.load("cuda"), "ready", lambda device, dtype: "")
+    assert backends.usable_device("auto") == torch.device("cuda")
+    monkeypatch.setattr(backends.load("cuda"), "ready", lambda device, dtype: "no driver")
+    assert backends.usable_device("auto") == torch.device("cpu")
