@@ -37,7 +37,7 @@ class NotFinite(ValueError):
         super().__init__(message + (f"; the last valid state is in {state_file}" if state_file else ""))
 
 
-@dataclass(frozen=True)
+@dataclass
 class Adam:
     """Adam (Kingma and Ba 2015) with the fields of `torch.optim.Adam`, and with the kernel that its fused step calls.
 
@@ -53,6 +53,8 @@ class Adam:
     """Constant against division by zero."""
     state: dict[Tensor, dict[str, Tensor]] = field(default_factory=dict)
     """Moments and number of steps (`step`) of each leaf that has had a gradient."""
+    found_inf: Tensor | None = None
+    """On a GPU: 1 since the first loss or gradient that was not finite, from which on no leaf moves; else 0."""
 
     def zero_grad(self) -> None:
         """Forget the gradients of all leaves."""
@@ -75,7 +77,7 @@ class Adam:
                 count = torch.zeros((), dtype=torch.float32, device=leaf.device)
                 self.state[leaf] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
             state = self.state[leaf]
-            state["step"] += 1
+            state["step"] += 1 if self.found_inf is None else 1 - self.found_inf
             torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
                 [leaf],
                 [leaf.grad],
@@ -90,6 +92,7 @@ class Adam:
                 eps=self.eps,
                 amsgrad=False,
                 maximize=False,
+                found_inf=self.found_inf,
             )
 
 
@@ -159,7 +162,7 @@ def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     optimizer.zero_grad()
     loss.backward()
     gradients = {name: x.grad for name, x in _named_leaves(optimizer) if x.grad is not None}
-    if loss.device.type != "cpu" and optimizer.defaults["fused"]:
+    if loss.device.type != "cpu":
         _step_without_waiting(loss.detach(), gradients, optimizer, step)
         return
     # One scalar covers all gradients, so that each step waits for the device only once.
@@ -169,23 +172,22 @@ def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     optimizer.step()
 
 
-def _step_without_waiting(loss: Tensor, gradients: dict[str, Tensor], optimizer: torch.optim.Adam, step: int) -> None:
+def _step_without_waiting(loss: Tensor, gradients: dict[str, Tensor], optimizer: Adam, step: int) -> None:
     """One optimizer step on a device, which changes nothing from the first loss or gradient that is not finite."""
     largest = torch.nn.utils.get_total_norm(list(gradients.values()), norm_type=float("inf"))
     bad = (~torch.isfinite(torch.stack([largest, loss])).all()).float()
-    if (before := getattr(optimizer, "found_inf", None)) is not None:
-        bad = torch.maximum(bad, before)
-    optimizer.found_inf = bad  # type: ignore[attr-defined] (torch's fused kernel skips the step where it is 1)
+    if optimizer.found_inf is not None:
+        bad = torch.maximum(bad, optimizer.found_inf)
+    optimizer.found_inf = bad
     optimizer.step()
     if (step + 1) % CHECK_EVERY == 0 and bool(bad):
         _raise_if_not_finite(loss, gradients, step)
         check_steps(optimizer, step)
 
 
-def check_steps(optimizer: torch.optim.Adam, step: int) -> None:
+def check_steps(optimizer: Adam, step: int) -> None:
     """Raise `NotFinite` if `descend` has left out steps on a device since a loss or a gradient was not finite."""
-    bad = getattr(optimizer, "found_inf", None)
-    if bad is not None and bool(bad):
+    if optimizer.found_inf is not None and bool(optimizer.found_inf):
         raise NotFinite(f"the loss or a gradient in one of the last {CHECK_EVERY} steps", step)
 
 
