@@ -10,7 +10,6 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,10 +20,10 @@ import torch
 
 import tumble
 from benchmarks.kernels import machine
-from benchmarks.poses import pose_scores
+from benchmarks.poses import line, pose_scores
 from tumble.io import files
 from tumble.preprocess import FootageOptions, Survey, survey_footage
-from tumble.scene import BACKGROUND, OBJECT, Trajectory
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Trajectory
 
 COMMAND = "python -m benchmarks.held CAPTURE..."
 CERTAIN = 0.9
@@ -59,7 +58,7 @@ def main() -> None:
     for path in arguments.captures:
         row = measure(path, arguments.until, arguments.draw)
         rows = [each for each in rows if each["name"] != row["name"]] + [row]
-        print(line(("name", *SCORES), row), flush=True)
+        print(line(["name", *SCORES], row), flush=True)
         files.write_json(arguments.out, {"command": COMMAND, "machine": machine(), "rows": rows})
         arguments.out.with_suffix(".md").write_text(report(rows))
 
@@ -67,7 +66,7 @@ def main() -> None:
 def report(rows: list[Row]) -> str:
     """The table in Markdown."""
     titles = {"name": "film", **SCORES}
-    lines = [line(titles, titles), "|" + " --- |" * len(titles), *(line(titles, row) for row in rows)]
+    lines = [line([*titles], titles), "|" + " --- |" * len(titles), *(line([*titles], row) for row in rows)]
     text = (
         "# Objects in a hand\n\n"
         f"`{COMMAND}`; films of 120 frames of 512 x 384 pixels with motion blur, noise, compression and drifting "
@@ -155,7 +154,7 @@ def contact_sheet(survey: Survey, path: Path) -> np.ndarray:
     tiles = []
     for i in np.linspace(0, len(survey.images) - 1, DRAWN).round().astype(int):
         image, labels = survey.images[i].copy(), survey.masks.labels[i]
-        for value, colour in ((OBJECT, (0, 255, 0)), (128, (255, 0, 0))):
+        for value, colour in ((OBJECT, (0, 255, 0)), (UNKNOWN, (255, 0, 0))):
             where = labels == value
             image[where] = (0.6 * image[where] + 0.4 * np.array(colour)).astype(np.uint8)
         truth = (true_mask(path, "object", int(survey.numbers[i]), labels.shape) > 0.5).astype(np.uint8)
@@ -163,11 +162,6 @@ def contact_sheet(survey: Survey, path: Path) -> np.ndarray:
         tiles.append(cv2.drawContours(image, outline, -1, (255, 255, 255), 1))
         cv2.putText(tiles[-1], f"{survey.numbers[i]}", (4, 14), 0, 0.5, (255, 255, 0), 1)
     return np.concatenate([np.concatenate(tiles[k : k + 5], 1) for k in range(0, DRAWN, 5)])
-
-
-def line(columns: Iterable[str], row: Row) -> str:
-    """A row as a line of a Markdown table."""
-    return "| " + " | ".join(str(row.get(name, "")) for name in columns) + " |"
 
 
 if __name__ == "__main__":

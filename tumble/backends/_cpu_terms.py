@@ -159,9 +159,14 @@ class _ImageTermsFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        v, needed = v_terms.unbind(), ctx.needs_input_grad
-        gradients = zip(ctx.saved_tensors, _IMAGE_TERM, needed[:6], strict=True)
-        return (*(v[term] * x if need else None for x, term, need in gradients), *(None for _ in range(5)))
+        return _scaled(ctx, v_terms, _IMAGE_TERM)
+
+
+def _scaled(ctx: Any, v_terms: Tensor, term: tuple[int, ...]) -> tuple[Tensor | None, ...]:
+    """Gradients of the inputs: the saved ones times that of the term to which each belongs; None for other inputs."""
+    v, needed = v_terms.unbind(), ctx.needs_input_grad
+    gradients = zip(ctx.saved_tensors, term, needed[: len(term)], strict=True)
+    return (*(v[k] * x if need else None for x, k, need in gradients), *(None for _ in needed[len(term) :]))
 
 
 @cache
@@ -218,9 +223,7 @@ class _GaussianTermsFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        v, needed = v_terms.unbind(), ctx.needs_input_grad
-        gradients = zip(ctx.saved_tensors, _GAUSSIAN_TERM, needed[:7], strict=True)
-        return (*(v[term] * x if need else None for x, term, need in gradients), *(None for _ in range(5)))
+        return _scaled(ctx, v_terms, _GAUSSIAN_TERM)
 
 
 def corner_features(
@@ -309,6 +312,10 @@ def material_terms(
     return _MaterialTermsFunction.apply(features, alpha, photo, mask)
 
 
+_MATERIAL_TERM = (1, 0)
+"""The term of `material_terms` to which features and alpha belong."""
+
+
 class _MaterialTermsFunction(torch.autograd.Function):
     """The kernel computes values and gradients at once."""
 
@@ -330,5 +337,4 @@ class _MaterialTermsFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        g_features, g_alpha = ctx.saved_tensors
-        return v_terms[1] * g_features, v_terms[0] * g_alpha, None, None
+        return _scaled(ctx, v_terms, _MATERIAL_TERM)

@@ -187,7 +187,8 @@ def _segment_seed(
         prior[:, region] = np.array(SEED_PRIOR[name], np.float32)[:, None]
     state = _State(prior, rough, empty)
     for _ in range(SEED_ITERATIONS):
-        state = _segment_frame(frame, prior, state.inside | (box & ~static), box, background, colours)
+        likelihood = log_likelihoods(frame.image, background, colours, frame.sampled)
+        state = _segment_frame(frame, prior, state.inside | (box & ~static), box, likelihood)
         certain = state.inside & (state.probabilities[OBJECT_CLASS] > CERTAIN)
         colours = colours.updated(frame.lab, object=certain, hand=empty, background=empty, weight=SEED_WEIGHT / 2)
     return state, colours
@@ -204,10 +205,11 @@ def _track(
         lost = not state.inside.any()
         warped = segmentation.warped(dis, gray, previous, state.probabilities.transpose(1, 2, 0)).transpose(2, 0, 1)
         prior = _prior(warped)
-        islands = _islands(frame, warped[OBJECT_CLASS] > 0.5, background, colours)
+        likelihood = log_likelihoods(frame.image, background, colours, frame.sampled)
+        islands = _islands(frame, warped[OBJECT_CLASS] > 0.5, likelihood)
         prior = _raised(prior, islands & (prior[OBJECT_CLASS] < ISLAND_PROBABILITY))
         predicted = prior[OBJECT_CLASS] > 0.5
-        state = _segment_frame(frame, prior, predicted, _filled(predicted), background, colours)
+        state = _segment_frame(frame, prior, predicted, _filled(predicted), likelihood)
         agreement, new_area = segmentation.overlap(predicted, state.inside), int(state.inside.sum())
         if segmentation.is_lost(agreement, new_area):
             nothing = np.zeros_like(predicted)
@@ -232,14 +234,14 @@ def _prior(warped: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]
 
 
 def _islands(
-    frame: _Frame, predicted: Bool[np.ndarray, "h w"], background: Background, colours: ColourModel
+    frame: _Frame, predicted: Bool[np.ndarray, "h w"], log_likelihood: Float32[np.ndarray, "3 h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Connected parts of the foreground that are likely to show the object.
 
     No hand covers them, and they do not reach the border of the image, as arms do. They are near the predicted object,
     or they have its colours and are next to a hand; any place will do if the object was not predicted anywhere.
     """
-    log_ratio = _object_over_hand(log_likelihoods(frame.image, background, colours, frame.sampled))
+    log_ratio = _object_over_hand(log_likelihood)
     hand = log_ratio < MIN_ISLAND_LOG_RATIO if frame.surroundings is None else frame.surroundings
     count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
     size = np.bincount(ids.ravel(), minlength=count)
@@ -273,8 +275,7 @@ def _segment_frame(
     prior: Float32[np.ndarray, "3 h w"],
     predicted: Bool[np.ndarray, "h w"],
     expected: Bool[np.ndarray, "h w"],
-    background: Background,
-    colours: ColourModel,
+    log_likelihood: Float32[np.ndarray, "3 h w"],
 ) -> _State:
     """Segmentation of a frame.
 
@@ -282,8 +283,9 @@ def _segment_frame(
         predicted: The object, as predicted.
         expected: Where the object is expected; away from the landmarks, a colour in it does not tell a hand: it is the
             object's print.
+        log_likelihood: Of the pixels' colours under object, hand and background.
     """
-    log_ratio = log_likelihoods(frame.image, background, colours, frame.sampled)
+    log_ratio = log_likelihood.copy()
     doubtful = np.zeros_like(predicted)
     if frame.surroundings is not None:
         doubtful = frame.surroundings & (_object_over_hand(log_ratio) < 0)

@@ -166,8 +166,9 @@ def _segment(
     images = _compensated(scan.images, gains)
     background = fill_unknown(estimate_background(images, covered), background)
     if options.segmenter == "grabcut":
-        at_hands = np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
-        samples = sample_background(images, at_hands | (masks.labels == OBJECT)) if any(hands) else None
+        samples = None
+        if any(hands):
+            samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
         masks = _masks(path, images, background, seed, hands, options, samples)
     return images, gains, background, seed, masks
 
@@ -175,8 +176,13 @@ def _segment(
 def _hand_or_skin(images: np.ndarray, hands: Sequence[Sequence[Hand]], background: Background) -> np.ndarray:
     """Pixels of every frame that may show hands: at their landmarks, or those of moving skin if none were detected."""
     if any(hands):
-        return np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
+        return _at_hands(images, hands)
     return np.stack([segmentation.moving_skin(image, background) for image in images])
+
+
+def _at_hands(images: np.ndarray, hands: Sequence[Sequence[Hand]]) -> Bool[np.ndarray, "t h w"]:
+    """Pixels of every frame at the landmarks of its hands."""
+    return np.stack([hand_surroundings(found, images.shape[1:3]) for found in hands])
 
 
 def _read_scan(footage: Footage, options: FootageOptions) -> _Scan:
