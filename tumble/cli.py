@@ -82,7 +82,8 @@ def check(
         footage: A video of an object turned in front of a still camera, or a folder of images with masks.
         options: How the footage is converted to a capture; the same as for `run`.
         out: Folder for the preview of the masks. Default: runs/check/NAME.
-        pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
+        pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`; then, if you
+            like, look at the masks and correct them by clicks on any frame.
     """
     from tumble.preprocess import PREVIEW, check_footage, passes
 
@@ -127,7 +128,8 @@ def run(
         matcher: Finds corresponding pixels in two frames, for estimated poses.
             mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
             xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
-        pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`.
+        pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`; then, if you
+            like, look at the masks and correct them by clicks on any frame.
         seed: Seed of all random numbers.
     """
     from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The page for drawing a box returns the box that is drawn, and refuses all other requests."""
+"""The page returns the box and the clicks of the user, shows masks that obey them, and refuses all other requests."""
 
 import json
 import queue
@@ -20,42 +20,53 @@ from tests.films import scene, written
 from tumble import cli, pipeline
 from tumble.io import files
 from tumble.io.files import BadFile
-from tumble.preprocess import box_picker
-from tumble.preprocess.footage import FootageFrame
+from tumble.preprocess.footage import PROVENANCE, FootageFrame
 from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.picker import box_picker
+from tumble.preprocess.picker.box_picker import Marks
 
+NO_REVIEW = box_picker.Review(lambda box: pytest.fail("no masks are needed"), lambda marks: pytest.fail("nor these"))
 FRAME = FootageFrame(7, 0.0, np.random.default_rng(0).integers(0, 255, (90, 160, 3), np.uint8), None)
 
 
 @dataclass
 class Request:
-    """A request for a box that waits in a thread."""
+    """A request for marks that waits in a thread."""
 
     outputs: queue.Queue = field(default_factory=queue.Queue)
-    boxes: list = field(default_factory=list)
+    marks: list = field(default_factory=list)
 
     def address(self) -> str:
         return re.findall(r"http://127\.0\.0\.1:\d+/[\w-]+/", self.outputs.get(timeout=20))[0]
 
 
 @contextmanager
-def requested(frame: FootageFrame = FRAME) -> Iterator[Request]:
+def requested(frame: FootageFrame = FRAME, review: box_picker.Review = NO_REVIEW) -> Iterator[Request]:
     request = Request()
     thread = threading.Thread(
-        target=lambda: request.boxes.append(box_picker.request_box(frame, request.outputs.put)), daemon=True
+        target=lambda: request.marks.append(box_picker.request_marks(frame, review, request.outputs.put)), daemon=True
     )
     thread.start()
     yield request
     thread.join(20)
-    assert not thread.is_alive(), "no box was sent"
+    assert not thread.is_alive(), "no marks were sent"
 
 
-def post(address: str, content: bytes) -> int:
+def answered(address: str, content: bytes, name: str = "done") -> tuple[int, bytes]:
     try:
-        with urllib.request.urlopen(urllib.request.Request(address + "box", content)) as response:
-            return response.status
+        with urllib.request.urlopen(urllib.request.Request(address + name, content)) as response:
+            return response.status, response.read()
     except urllib.error.HTTPError as error:
-        return error.code
+        return error.code, error.read()
+
+
+def post(address: str, content: bytes, name: str = "done") -> int:
+    return answered(address, content, name)[0]
+
+
+def sent(**marks: object) -> bytes:
+    """A request of the page."""
+    return json.dumps({"box": [12, 5, 100, 80], **marks}).encode()
 
 
 def test_the_box_sent_by_the_page_is_returned_and_the_server_stops() -> None:
@@ -64,8 +75,8 @@ def test_the_box_sent_by_the_page_is_returned_and_the_server_stops() -> None:
         page = urllib.request.urlopen(address).read().decode()
         assert "Frame 7" in page
         assert "{{" not in page
-        assert post(address, b"[12, 5, 100, 80]") == 200
-    assert request.boxes == [(12, 5, 100, 80)]
+        assert post(address, sent(not_object=[[159, 89, 3]])) == 200
+    assert request.marks == [Marks((12, 5, 100, 80), not_object=((159, 89, 3),))]
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(address)
 
@@ -75,16 +86,50 @@ def test_invalid_requests_are_refused() -> None:
     wrong = [[-1, 0, 5, 5], [0, 0, 161, 5], [100, 0, 61, 5], [0, 80, 5, 11], [0, 0, 1, 5], [0, 0, 5], [0, 0, 5.5, 5], 3]
     with requested() as request:
         address = request.address()
-        for content in (*(json.dumps(values).encode() for values in wrong), b"", b"\xff", b"[true, 0, 5, 5]"):
-            assert post(address, content) == 400, content
-        assert post(address, b" " * 300 + b"[0, 0, 5, 5]") == 404
+        clicks = [[160, 0, 0]], [[0, 90, 0]], [[-1, 0, 0]], [[0, 0, -1]], [[0, 0]], [[0.5, 0, 0]], [[0, 0, 0]] * 201, 1
+        contents = [*(sent(box=values) for values in wrong), *(sent(object=each) for each in clicks), sent(path="/")]
+        for content in (*contents, b"", b"\xff", b"{}", b"[1, 2, 5, 5]", sent(box=[True, 0, 5, 5])):
+            for name in ("done", "frames", "mask"):
+                assert post(address, content, name) == 400, content
+        assert post(address, b" " * 17_000 + sent()) == 404
         # Without the token nothing is accepted.
-        assert post(re.sub(r"/[\w-]+/$", "/wrong/", address), b"[0, 0, 5, 5]") == 404
+        for name in ("done", "frames", "mask"):
+            assert post(re.sub(r"/[\w-]+/$", "/wrong/", address), sent(), name) == 404
+        assert post(address, sent(), "../done") == post(address, sent(), "elsewhere") == 404
         with pytest.raises(urllib.error.HTTPError):
             urllib.request.urlopen(re.sub(r"/[\w-]+/$", "/", address))
-        assert request.boxes == []
-        assert post(address, b"[0, 0, 160, 90]") == 200
-    assert request.boxes == [(0, 0, 160, 90)]
+        assert request.marks == []
+        assert post(address, sent(box=[0, 0, 160, 90])) == 200
+    assert request.marks == [Marks((0, 0, 160, 90))]
+
+
+def test_the_masks_on_the_page_obey_clicks(tmp_path: Path) -> None:
+    """A click on the object says that it is something else."""
+    path, video = written(scene(8).pictures, tmp_path / "x.mp4"), scene(8)
+    frame = box_picker.sharpest_frame(path, FootageOptions(at=3, focal=300.0))
+    left, top, width, height = box = video.box(3)
+    column, row = left + width // 2, top + height // 2
+    with requested(frame, box_picker._review(path, FootageOptions(at=3, focal=300.0))) as request:
+        address = request.address()
+        code, content = answered(address, sent(box=box), "frames")
+        assert (code, json.loads(content)) == (200, list(range(8)))
+        shown = []
+        for clicks in ([], [[column, row, 6]]):
+            code, content = answered(address, sent(box=box, not_object=clicks, frame=6), "mask")
+            assert code == 200
+            shown.append(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int))
+        # Unknown pixels are orange; the click made those around it unknown.
+        change = shown[1] - shown[0]
+        near = change[row - 1 : row + 2, column - 1 : column + 2].mean((0, 1))
+        assert near[0] > near[2] + 10
+        assert np.abs(change[:10]).max() < 10
+        code, content = answered(address, sent(box=box, frame=8), "mask")
+        assert (code, content) == (400, b"no such frame: there are 8, counted from 0")
+        code, content = answered(address, sent(box=[0, 100, 20, 20]), "frames")
+        assert code == 400
+        assert b"no object in the box" in content
+        assert post(address, sent(box=box, not_object=[[column, row, 6]])) == 200
+    assert request.marks[0].not_object == ((column, row, 6),)
 
 
 @pytest.mark.slow
@@ -116,7 +161,7 @@ def test_a_box_is_drawn_with_the_mouse(how: str, tmp_path: Path) -> None:
         mouse("mouseReleased", *corners[1])
         page.value("document.getElementById('use').click()")
     # The corners may come in either order; the box is rounded outwards to whole pixels.
-    np.testing.assert_allclose(request.boxes[0], (800, 400, 1200, 1100), atol=2)
+    np.testing.assert_allclose(request.marks[0].box, (800, 400, 1200, 1100), atol=2)
 
 
 # Frame and run --------------------------------------------------------------------------------------------------------
@@ -151,14 +196,21 @@ def test_a_run_requests_the_box_only_once(
 ) -> None:
     path, box = video_of(tmp_path), scene().box(3)
     numbers = []
-    monkeypatch.setattr(box_picker, "request_box", lambda frame, _: numbers.append(frame.number) or box)
+    marks = Marks(box, object=((box[0] + box[2] // 2, box[1] + box[3] // 2, 7),), not_object=((0, 0, 5), (3, 2, 6)))
+    monkeypatch.setattr(box_picker, "request_marks", lambda frame, *_: numbers.append(frame.number) or marks)
     options = box_picker.pick_box(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
     assert (options.box, options.at) == (box, 3)
-    assert capsys.readouterr().out == f"--box {' '.join(map(str, box))} --at 3\n"
+    assert (options.object, options.not_object) == (marks.object, marks.not_object)
+    clicks = f"--object {marks.object[0][0]} {marks.object[0][1]} 7 --not-object 0 0 5 --not-object 3 2 6"
+    assert capsys.readouterr().out == f"--box {' '.join(map(str, box))} --at 3 {clicks}\n"
     pipeline.capture_of(path, tmp_path / "run", options)
     again = box_picker.pick_box(path, FootageOptions(focal=300.0), tmp_path / "run" / "capture")
     assert again == options
     assert numbers == [3]
+    stored = json.loads((tmp_path / "run" / "capture" / PROVENANCE).read_text())["options"]
+    assert stored["not_object"] == [[0, 0, 5], [3, 2, 6]]
+    with pytest.raises(BadFile, match=r"options.not_object is \[\[0, 0, 5\]"):
+        pipeline.capture_of(path, tmp_path / "run", replace(options, not_object=()))
     # The options that were printed select the same capture.
     assert pipeline.capture_of(path, tmp_path / "run", again) == tmp_path / "run" / "capture"
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from tumble._lazy import lazy_getattr
 
 if TYPE_CHECKING:
-    from tumble.preprocess.box_picker import pick_box
     from tumble.preprocess.check import check_footage, passes
     from tumble.preprocess.footage import PROVENANCE, read_provenance
     from tumble.preprocess.options import FootageOptions
+    from tumble.preprocess.picker import pick_box
     from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
     from tumble.preprocess.survey import Survey, survey_footage
     from tumble.preprocess.video_to_capture import PREVIEW, footage_fingerprint
@@ -35,7 +35,7 @@ __all__ = [
 __getattr__ = lazy_getattr(
     __name__,
     {
-        "box_picker": ("pick_box",),
+        "picker": ("pick_box",),
         "check": ("check_footage", "passes"),
         "options": ("FootageOptions",),
         "source": ("FOOTAGE", "input_kind", "to_capture"),

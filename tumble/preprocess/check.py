@@ -14,8 +14,8 @@ import numpy as np
 
 from tumble.io import outputs, progress, video
 from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, video_to_capture
-from tumble.preprocess.box_picker import pick_box
 from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.picker import pick_box
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey_footage
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 
 MAX_SURVEY_FRAMES = 400
 """Maximum number of frames that the survey keeps; of a longer video every second, every fourth, ... frame is kept."""
@@ -16,6 +16,11 @@ MIN_SIDE = 64
 """Minimum of width and height of footage, and minimum of `--size` [pixels]."""
 MIN_FRAMES = 3
 """Minimum number of frames of a capture."""
+
+Clicks = Annotated[
+    UseAppendAction[tuple[tuple[int, int, int], ...]], arg(metavar="X Y FRAME", help_behavior_hint="(repeatable)")
+]
+"""Column and row of pixels [pixels], each with the number of its frame."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,10 @@ class FootageOptions:
     """A pixel on the object on frame `--at`, in place of a box: column, row [pixels]."""
     at: int = 0
     """Number of the frame to which the box or the click refers, counted from 0."""
+    object: Clicks = ()
+    """A pixel on the object where the mask lacks it: column, row [pixels], frame. The mask is cut again there."""
+    not_object: Clicks = ()
+    """A pixel on something else that the mask contains, such as a hand: column, row [pixels], frame."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder of mask images, one per frame in order or by name: white object, black background, grey unknown."""
     invert_masks: bool = False
@@ -58,6 +67,8 @@ class FootageOptions:
     def __post_init__(self) -> None:
         if self.box is not None and self.click is not None:
             raise ValueError("--box and --click both mark the object: give only one of them")
+        if (self.object or self.not_object) and self.masks is not None:
+            raise ValueError("--object and --not-object correct masks that are found: leave them out, or --masks")
         if self.box is not None and min(self.box[2:]) < 2:
             raise ValueError(
                 f"--box is left, top, width, height, at least 2 x 2 pixels; this one is {self.box[2]} x {self.box[3]}"

@@ -28,6 +28,7 @@ from tumble.preprocess.background import (
     fill_unknown,
     sample_background,
 )
+from tumble.preprocess.clicks import Click, correct_masks
 from tumble.preprocess.footage import Footage, FootageFrame, Lens, open_footage, read_frames, resolve_lens
 from tumble.preprocess.hands import Hand, hand_surroundings, track_hands
 from tumble.preprocess.options import MAX_SURVEY_FRAMES, MIN_SIDE, FootageOptions
@@ -105,6 +106,8 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
     footage = open_footage(path, options.masks)
     scan = _read_scan(footage, options)
     if scan.masks is not None:
+        if options.object or options.not_object:
+            raise BadFile(path, "has masks, which clicks do not correct", "leave out --object and --not-object")
         covered = scan.masks != BACKGROUND
         gains, seed, masks = estimate_gains(scan.images, covered), None, _masks_from_labels(path, scan.masks)
         images = _compensated(scan.images, gains)
@@ -126,10 +129,29 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
         gains=gains,
         masks=masks,
         seed=seed,
-        seed_from_motion=seed is not None and options.box is None and options.click is None,
+        seed_from_motion=seed is not None and not (options.box or options.click or options.object),
         blurs=blurs,
         rotation=keyframes.cumulative_rotation(images, inside),
     )
+
+
+def to_clicks(
+    object: Sequence[tuple[int, int, int]],
+    not_object: Sequence[tuple[int, int, int]],
+    numbers: Integer[np.ndarray, " t"],
+    scale: float,
+) -> list[Click]:
+    """Clicks on small copies of the frames, from column, row and frame number of clicks on the footage.
+
+    Args:
+        numbers: Numbers, in the footage, of the frames that have a copy; a click on another frame counts for the next.
+        scale: Side of a small image divided by that of the footage.
+    """
+    return [
+        Click(int(np.abs(numbers - number).argmin()), (int(column * scale), int(row * scale)), is_object)
+        for is_object, clicks in ((True, object), (False, not_object))
+        for column, row, number in clicks
+    ]
 
 
 def undistort_frame(frame: FootageFrame, lens: Lens) -> FootageFrame:
@@ -160,7 +182,9 @@ def _segment(
     background = estimate_background(images, _hand_or_skin(images, hands, background))
     seed = _seed(path, scan, images, background, options)
     background = segmentation.exclude_possible_object(background, images[seed.index], seed)
+    clicks = to_clicks(options.object, options.not_object, scan.numbers, scan.scale)
     masks = _masks(path, images, background, seed, hands, options)
+    masks = correct_masks(images, masks, background, clicks)
     covered = np.stack([cv2.dilate((m != BACKGROUND).astype(np.uint8), np.ones((5, 5))) for m in masks.labels]) > 0
     gains = estimate_gains(scan.images, covered)
     images = _compensated(scan.images, gains)
@@ -170,6 +194,7 @@ def _segment(
         if any(hands):
             samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
         masks = _masks(path, images, background, seed, hands, options, samples)
+        masks = correct_masks(images, masks, background, clicks)
     return images, gains, background, seed, masks
 
 
@@ -245,6 +270,13 @@ def _check_box_and_click(footage: Footage, options: FootageOptions, camera: Came
         raise BadFile(footage.path, rule, "--box is left top width height, --click column row, in the upright image")
     if not 0 <= options.at < n_frames:
         raise BadFile(footage.path, f"has about {n_frames} frames, but --at is {options.at}")
+    for column, row, number in (*options.object, *options.not_object):
+        fix = "--object and --not-object are column, row and frame, counted from 0, in the upright image"
+        if not (0 <= column < camera.width and 0 <= row < camera.height):
+            rule = f"has {camera.width} x {camera.height} pixels; the click {column} {row} lies outside"
+            raise BadFile(footage.path, rule, fix)
+        if not 0 <= number < n_frames:
+            raise BadFile(footage.path, f"has about {n_frames} frames, but a click is on frame {number}", fix)
 
 
 def _downsample(frame: FootageFrame, scale: float) -> tuple[FootageFrame, np.ndarray]:
@@ -262,6 +294,9 @@ def _compensated(images: UInt8[np.ndarray, "t h w 3"], gains: Float32[np.ndarray
 
 
 def _seed(path: Path, scan: _Scan, images: np.ndarray, background: Background, options: FootageOptions) -> Seed:
+    if options.box is None and options.click is None and options.object:
+        first = to_clicks(options.object[:1], (), scan.numbers, scan.scale)[0]
+        return Seed(first.index, click=first.pixel)
     if options.box is None and options.click is None:
         seed = segmentation.find_seed(images, background)
         if seed is None:

@@ -96,7 +96,9 @@ def footage_fingerprint(path: Path, options: FootageOptions) -> dict[str, Any]:
     for each in inside:
         with each.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
-    return {"footage": digest.hexdigest(), "options": json.loads(json.dumps(vars(options), default=str))}
+    # Without clicks the options are those of captures made before there were any.
+    stated = {name: value for name, value in vars(options).items() if value != ()}
+    return {"footage": digest.hexdigest(), "options": json.loads(json.dumps(stated, default=str))}
 
 
 def select_frames(survey: Survey, options: FootageOptions) -> list[int]:
