@@ -117,7 +117,7 @@ def test_the_masks_on_the_page_obey_clicks(tmp_path: Path) -> None:
         for clicks in ([], [[column, row, 6]]):
             code, content = answered(address, sent(box=box, not_object=clicks, frame=6), "mask")
             assert code == 200
-            shown.append(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int))
+            shown.append(np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR), int)[..., ::-1])
         # Unknown pixels are orange; the click made those around it unknown.
         change = shown[1] - shown[0]
         near = change[row - 1 : row + 2, column - 1 : column + 2].mean((0, 1))

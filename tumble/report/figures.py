@@ -12,16 +12,18 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble.export import Confidence
+from tumble.io import tree
 from tumble.maths import srgb_from_linear, texel_directions
-from tumble.rendering import rasterize, render_gbuffer
+from tumble.rendering import corner_features, rasterize, render_gbuffer
 from tumble.report import training_views
+from tumble.report.coverage import Coverage, best_direction, nearest_oriented, outside_view
 from tumble.report.training_views import RenderedFrame
 from tumble.scene import Asset, Camera, Environment, opengl_from_opencv
 
@@ -31,6 +33,8 @@ HERO_SIDE = 448
 """Longer side of the image at the top of the page [pixels]."""
 PANORAMA_LUMINANCE = 0.18
 """Mean linear value to which a panorama is scaled by its tone mapping: middle grey."""
+REGION_COLOUR = (240, 110, 0)
+"""Colour of a marked region of the surface (orange), sRGB."""
 COLOUR_BAR_CODES = (0, 64, 128, 192, 255)
 """8-bit values at which a colour bar's gradient has its stops."""
 
@@ -99,6 +103,22 @@ def material_maps(asset: Asset, views: Sequence[RenderedFrame]) -> Markup:
         + _strip("Roughness", "perceptual", roughness, grey)
         + _strip("Normals", "camera axes: red right, green up, blue to the viewer", normals)
     )
+
+
+def region_image(asset: Asset, coverage: Coverage, region: Bool[Tensor, " n"]) -> UInt8[np.ndarray, "h w 4"]:
+    """The object's albedo, seen from where most of a region of its surface is visible, with the region in orange."""
+    T_cam_obj, camera = outside_view(best_direction(coverage, region), coverage.points)
+    # A Gaussian belongs to the region if the nearest point with a similar normal does.
+    marked = region[nearest_oriented(asset.gaussians.means, asset.gaussians.normals, coverage)]
+    features = {
+        "albedo": corner_features(asset.material)[0][..., :3],
+        "marked": marked.float()[:, None, None].expand(-1, 4, 1).contiguous(),
+    }
+    fitting = resized(camera, MAP_SIDE)
+    view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, tree.to(fitting, asset.gamma.device), features)
+    colour = torch.tensor(REGION_COLOUR).to(view.alpha) / 255
+    share = 0.75 * view.features["marked"].clamp(0, 1)
+    return _with_alpha((1 - share) * srgb_from_linear(view.features["albedo"]) + share * colour, view.alpha)
 
 
 def confidence_maps(asset: Asset, views: Sequence[RenderedFrame], confidence: Confidence) -> Markup:

@@ -31,7 +31,7 @@ from tumble.export import Preset, confidence_of, extract_mesh, write_textured_me
 from tumble.io import BadFile, files, progress, tree
 from tumble.maths import fibonacci_sphere
 from tumble.poses import PoseQuality, mask_refinement
-from tumble.report import figures, health_card, preset_lights, svg, training_views
+from tumble.report import coverage, figures, health_card, preset_lights, svg, training_views
 from tumble.report.training_views import RenderedFrame
 from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
 
@@ -46,6 +46,7 @@ SECTIONS: dict[str, str] = {
     "frames": "Photos and renders",
     "maps": "Material",
     "light": "Light and motion",
+    "coverage": "Coverage",
     "health": "Health",
     "confidence": "Confidence",
     "timings": "Timings",
@@ -150,6 +151,9 @@ def build(
     confidence = confidence_of(asset, figures.small_camera(asset.camera))
     rows = health_card.card(frames, quality, confidence)
     rating, word, sentence = health_card.overall(rows)
+    covered = coverage.coverage_of(asset, capture)
+    told = coverage.advice(covered, light_turns=asset.trajectory.light == "camera")
+    progress.LOG.info(told.sentence)
     hero = figures.hero_image(scene, views[0])
     lights = {} if glb is None else _live_view_lights(asset, views[0])
     page = TEMPLATES.get_template("page.html").render(
@@ -166,6 +170,9 @@ def build(
         light_caption=LIGHT_CAPTIONS[asset.trajectory.light],
         path=svg.globes(asset.trajectory.camera_positions.cpu().numpy()),
         path_caption=_path_caption(asset),
+        advice=told.sentence,
+        region="" if told.region is None else figures.webp(figures.region_image(asset, covered, told.region)),
+        sides=coverage.by_side(covered),
         n_frames=len(frames),
         rows=[(row, health_card.RATING_LABELS[row.rating], svg.bars(row.bars, row.marks)) for row in rows],
         confidence=figures.confidence_maps(asset, views, confidence),
