@@ -1,6 +1,8 @@
 """Good videos pass the check; each fault is detected and reported with advice."""
 
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,11 +10,15 @@ import numpy as np
 import pytest
 
 from tests.films import scene, written
+from tests.preprocess.test_held_object import landmarks
 from tumble import cli
 from tumble.io import files
 from tumble.preprocess import check as checking
 from tumble.preprocess.check import Finding, check_footage, passes
+from tumble.preprocess.colour_model import hand_coloured_fraction
 from tumble.preprocess.options import FootageOptions
+from tumble.preprocess.survey import Survey, survey_footage
+from tumble.scene import BACKGROUND, OBJECT
 
 
 def findings(pictures: np.ndarray, tmp_path: Path, options: FootageOptions) -> dict[str, Finding]:
@@ -28,7 +34,7 @@ OPTIONS = FootageOptions(box=scene().box(), focal=300.0)
 def test_a_good_video_passes(tmp_path: Path) -> None:
     results = findings(scene().pictures, tmp_path, OPTIONS)
     assert passes(list(results.values()))
-    for subject in ("video", "camera", "masks", "framing", "sharpness", "exposure", "highlights"):
+    for subject in ("video", "camera", "masks", "worst", "framing", "sharpness", "exposure", "highlights"):
         assert results[subject].rating == "good", results[subject]
 
 
@@ -62,6 +68,51 @@ def test_drift_and_blur_are_reported(tmp_path: Path) -> None:
     assert results["sharpness"].rating != "good"
     assert results["exposure"].rating == "warn"
     assert "colours by" in results["exposure"].state
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Survey:
+    """Survey of a film with a hand; its masks are replaced by the true ones."""
+    video = scene(hand=True)
+    path = written(video.pictures, tmp_path_factory.mktemp("film") / "x.mp4")
+    survey = survey_footage(path, FootageOptions(box=video.box(), focal=300.0))
+    return with_masks(survey, np.where(video.object, np.uint8(OBJECT), np.uint8(BACKGROUND)))
+
+
+def with_masks(survey: Survey, labels: np.ndarray, fraction: np.ndarray | float = 0.0) -> Survey:
+    found = (labels == OBJECT).any((1, 2))
+    masks = replace(survey.masks, labels=labels, confidence=found.astype(np.float32), uncertain=~found)
+    return replace(survey, masks=masks, hand_coloured=np.zeros(len(labels), np.float32) + np.float32(fraction))
+
+
+def test_the_two_spoilt_frames_are_named(surveyed: Survey) -> None:
+    """On one the mask is empty; on the other two thirds of it are missing."""
+    assert checking._worst(surveyed) == Finding("worst", "good", "no frame stands out")
+    labels = surveyed.masks.labels.copy()
+    labels[6] = BACKGROUND
+    columns = np.nonzero((labels[14] == OBJECT).any(0))[0]
+    labels[14, :, columns[len(columns) // 3] :] = BACKGROUND
+    worst = checking._worst(with_masks(surveyed, labels))
+    assert worst.rating == "warn"
+    assert re.findall(r"frame (\d+)", worst.state) == ["6", "14"]
+    assert "frame 6: the object is not found" in worst.state
+    assert re.search(r"frame 14: 0\.\d times the area", worst.state)
+    assert "--pick" in worst.advice
+
+
+def test_a_mask_with_a_hand_is_named(surveyed: Survey) -> None:
+    """A frame's mask contains a hand that the other masks leave out."""
+    video = scene(hand=True)
+    hands = [[landmarks(i)] for i in range(len(video.pictures))]
+    labels = surveyed.masks.labels.copy()
+    labels[10][video.hand[10]] = OBJECT
+    inside = labels == OBJECT
+    fraction = hand_coloured_fraction(surveyed.images, inside, hands, surveyed.background)
+    assert fraction[10] == pytest.approx((inside[10] & video.hand[10]).sum() / inside[10].sum(), abs=0.1)
+    assert np.delete(fraction, 10).max() < checking.MAX_HAND_COLOURED
+    worst = checking._worst(with_masks(surveyed, labels, fraction))
+    assert re.findall(r"frame (\d+): \d+ % of the mask has the hand's colours", worst.state) == ["10"]
+    assert hand_coloured_fraction(surveyed.images, inside, [[] for _ in hands], surveyed.background).max() == 0
 
 
 def test_limits_may_rise_or_fall() -> None:

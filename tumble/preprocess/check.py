@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from tumble.io import outputs, progress, video
-from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, video_to_capture
+from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, segmentation, video_to_capture
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.picker import pick_box
 from tumble.preprocess.source import input_kind
@@ -47,6 +47,19 @@ RAY_DISTANCE = (0.4, 0.8)
 """Limits of the median distance of the rays through the mask centres from a common point [radius of a mask]."""
 VIEW_ANGLE = (math.radians(90), math.radians(30))
 """Limits of the largest angle between two views of the object [radians]."""
+
+MIN_HAND_FRAMES = 0.5
+"""Fraction of frames with a detected hand below which none is mentioned: prints and handles pass for hands at times."""
+MAX_HAND_COLOURED = 0.08
+"""Fraction of a mask with the colours of a hand above which a part of a hand is probably taken for the object."""
+AREA_NEIGHBOURS = 3
+"""Number of frames before and after one with whose masks its area is compared."""
+MAX_AREA_CHANGE = 1.6
+"""Ratio of the area of a mask to the median of its neighbours above which, or below the inverse of which, it jumps."""
+N_WORST = 5
+"""Maximum number of frames that are named as the worst."""
+WORST_SPACING = 4
+"""Minimum distance of two named frames; neighbours mostly have the same fault [surveyed frames]."""
 
 CheckRating = Literal["good", "warn", "stop"]
 
@@ -87,7 +100,9 @@ def check_footage(
     selected = keyframes.select_keyframes(survey.rotation, survey.blurs, survey.usable, options.frames)
     kept = [int(i) for i in np.nonzero(survey.usable)[0]] if survey.footage.images else selected
     video_to_capture.write_preview(survey, out / video_to_capture.PREVIEW, kept)
-    findings = [_video(survey), _inputs(survey), _camera(survey), _masks(survey), _border(survey)]
+    findings = [_video(survey), _inputs(survey), _camera(survey), _masks(survey), _worst(survey), _border(survey)]
+    with_hand = float(np.mean([bool(hands) for hands in survey.hands]))
+    findings += [_hand(with_hand)] if with_hand > MIN_HAND_FRAMES else []
     if not kept:
         return [*findings, Finding("frames", "stop", "no usable frame", "draw a box with --pick, or give --masks")]
     return [*findings, _size(survey), *_rotation(survey, kept), _sharpness(survey, kept, options), *_light(survey)]
@@ -145,6 +160,45 @@ def _masks(survey: Survey) -> Finding:
         "check the preview (red borders); --pick a box on a clear frame (--at), give --masks, or use a plain background"
     )
     return _finding("masks", _rate(fraction, UNCERTAIN_FRAMES), state, advice)
+
+
+def _worst(survey: Survey) -> Finding:
+    """The frames with the worst masks, each with the reasons."""
+    faults = [_faults(survey, i) for i in range(len(survey.numbers))]
+    severity = np.array([sum(fault.values()) for fault in faults])
+    named: list[int] = []
+    for i in np.argsort(-severity, kind="stable").tolist():
+        if severity[i] > 0 and len(named) < N_WORST and all(abs(i - j) >= WORST_SPACING for j in named):
+            named.append(i)
+    if not named:
+        return Finding("worst", "good", "no frame stands out")
+    state = "; ".join(f"frame {survey.numbers[i]}: {', '.join(faults[i])}" for i in named)
+    advice = "look at these frames in the preview; correct their masks by clicks with --pick"
+    return Finding("worst", "warn", state, advice)
+
+
+def _faults(survey: Survey, i: int) -> dict[str, float]:
+    """What may be wrong with the mask of a frame, in words, and how much it weighs."""
+    areas = survey.inside.sum((1, 2))
+    if areas[i] == 0:
+        return {"the object is not found": 1.0}
+    faults = {}
+    confidence, hand = float(survey.masks.confidence[i]), float(survey.hand_coloured[i])
+    if hand > MAX_HAND_COLOURED:
+        faults[f"{100 * hand:.0f} % of the mask has the hand's colours"] = 4 * hand
+    if confidence < segmentation.CERTAIN_OVERLAP:
+        faults[f"overlap with the predicted mask only {100 * confidence:.0f} %"] = 1 - confidence
+    around = [areas[j] for j in range(max(i - AREA_NEIGHBOURS, 0), min(i + AREA_NEIGHBOURS + 1, len(areas))) if j != i]
+    ratio = float(areas[i] / max(np.median(around), 1)) if around else 1.0
+    if not 1 / MAX_AREA_CHANGE < ratio < MAX_AREA_CHANGE:
+        faults[f"{ratio:.1f} times the area of the frames around it"] = abs(math.log(ratio)) / 2
+    return faults
+
+
+def _hand(fraction: float) -> Finding:
+    """What can be said of hidden parts before the poses are known, from the fraction of the frames with a hand."""
+    state = f"detected on {100 * fraction:.0f} % of the frames; regrasp, so that it covers no part in all of them"
+    return Finding("hand", "good", f"{state} (the report of a run names such parts)")
 
 
 def _border(survey: Survey) -> Finding:

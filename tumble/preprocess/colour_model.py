@@ -55,6 +55,10 @@ BORDER_WIDTH = 0.04
 """Width of the border of the image at which arms are expected, as a fraction of its longer side."""
 MIN_ARM_PIXELS = 500
 """Minimum number of pixels in all frames from which the colours of arms are learnt."""
+SAMPLED_FRAMES = 3
+"""Interval of the frames whose masks tell the colours of the object."""
+MIN_HAND_COLOUR_LOG_RATIO = 1.5
+"""Log likelihood ratio of hand to object above which a pixel has the colour of a hand."""
 SKIN_YCRCB = (40, 138, 85), (255, 175, 125)
 """Lower and upper limit of Y, Cr, Cb of skin of all tones; wider than skin, because hands are searched for with it."""
 RIM_WIDTH = 2
@@ -222,6 +226,29 @@ def hand_colours(
     moving = (np.concatenate(each) for each in (arms, at_border))
     densities = [density, *(_density(lab) for lab in moving if len(lab) >= MIN_ARM_PIXELS)]
     return np.stack(densities).mean(0)
+
+
+def hand_coloured_fraction(
+    images: UInt8[np.ndarray, "t h w 3"],
+    inside: Bool[np.ndarray, "t h w"],
+    hands: Sequence[Sequence[Hand]],
+    background: Background,
+) -> Float32[np.ndarray, " t"]:
+    """Fraction of each mask whose colours are more likely those of the hands than those of all masks together.
+
+    It finds masks with a part of a hand or an arm, if most of the other masks have none; 0 if no hand was detected.
+    """
+    fractions = np.zeros(len(images), np.float32)
+    if not any(hands):
+        return fractions
+    lab = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2LAB) for image in images])
+    object_ = lab[::SAMPLED_FRAMES][inside[::SAMPLED_FRAMES]]
+    density = _density(object_) if len(object_) else np.zeros(BINS, np.float32)
+    colours = ColourModel(density, hand_colours(images, hands, background), np.zeros(BINS, np.float32))
+    for i, mask in enumerate(inside):
+        if mask.any():
+            fractions[i] = (colours.hand_log_ratio(lab[i])[mask] > MIN_HAND_COLOUR_LOG_RATIO).mean()
+    return fractions
 
 
 def trim_rim(

@@ -271,6 +271,8 @@ class SourceFrame(msgspec.Struct, frozen=True):
     name: str
     source_frame: int | None = None
     """Number of the frame in the video; None for images with a COLMAP model."""
+    hand_coloured: float = 0.0
+    """Fraction of the mask with the colours of the hands."""
 
 
 class Provenance(msgspec.Struct, frozen=True):

@@ -29,6 +29,7 @@ from tumble.preprocess.background import (
     sample_background,
 )
 from tumble.preprocess.clicks import Click, correct_masks
+from tumble.preprocess.colour_model import hand_coloured_fraction
 from tumble.preprocess.footage import Footage, FootageFrame, Lens, open_footage, read_frames, resolve_lens
 from tumble.preprocess.hands import Hand, hand_surroundings, track_hands
 from tumble.preprocess.options import MAX_SURVEY_FRAMES, MIN_SIDE, FootageOptions
@@ -67,6 +68,10 @@ class Survey:
     """The object's position on one frame; None if masks were given."""
     seed_from_motion: bool
     """Whether the seed was found by motion, because neither box nor click was given."""
+    hands: Sequence[Sequence[Hand]]
+    """The hands that were detected in each frame; none if masks were given, or for SAM."""
+    hand_coloured: Float32[np.ndarray, " t"]
+    """Fraction of each mask with the colours of the hands, which is small unless a hand is taken for the object."""
     blurs: Float64[np.ndarray, " t"]
     """Blur of the edges on the object, from `keyframes.edge_blur` [pixels of the footage]."""
     rotation: Float64[np.ndarray, " t"]
@@ -110,10 +115,11 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
             raise BadFile(path, "has masks, which clicks do not correct", "leave out --object and --not-object")
         covered = scan.masks != BACKGROUND
         gains, seed, masks = estimate_gains(scan.images, covered), None, _masks_from_labels(path, scan.masks)
+        hands: list[list[Hand]] = [[] for _ in scan.images]
         images = _compensated(scan.images, gains)
         background = estimate_background(images, covered)
     else:
-        images, gains, background, seed, masks = _segment(path, scan, options)
+        images, gains, background, seed, masks, hands = _segment(path, scan, options)
     inside = masks.labels == OBJECT
     size = (scan.energy.shape[2], scan.energy.shape[1])
     resized = [cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in inside]
@@ -130,6 +136,8 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
         masks=masks,
         seed=seed,
         seed_from_motion=seed is not None and not (options.box or options.click or options.object),
+        hands=hands,
+        hand_coloured=hand_coloured_fraction(images, inside, hands, background),
         blurs=blurs,
         rotation=keyframes.cumulative_rotation(images, inside),
     )
@@ -174,8 +182,8 @@ def downsample_mask(mask: UInt8[np.ndarray, "h w"], height: int, width: int) -> 
 
 def _segment(
     path: Path, scan: _Scan, options: FootageOptions
-) -> tuple[np.ndarray, np.ndarray, Background, Seed, Masks]:
-    """Images without gain drift, their gains, the background, the seed and the masks."""
+) -> tuple[np.ndarray, np.ndarray, Background, Seed, Masks, list[list[Hand]]]:
+    """Images without gain drift, their gains, the background, the seed, the masks and the hands."""
     images = _compensated(scan.images, estimate_gains(scan.images))
     hands = track_hands(images) if options.segmenter == "grabcut" else [[] for _ in images]
     background = estimate_background(images)
@@ -195,7 +203,7 @@ def _segment(
             samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks)
-    return images, gains, background, seed, masks
+    return images, gains, background, seed, masks, hands
 
 
 def _hand_or_skin(images: np.ndarray, hands: Sequence[Sequence[Hand]], background: Background) -> np.ndarray:

@@ -208,6 +208,7 @@ def _frame_record(survey: Survey, i: int, name: str) -> dict[str, Any]:
         "time": float(survey.times[i]),
         "gain": [float(g) for g in survey.gains[i]],
         "mask_confidence": float(survey.masks.confidence[i]),
+        "hand_coloured": float(survey.hand_coloured[i]),
         "blur": float(survey.blurs[i]) if math.isfinite(survey.blurs[i]) else None,
         "turned_degrees": math.degrees(float(survey.rotation[i])),
     }
