@@ -38,7 +38,18 @@ MAY_IMPORT = {
     "inverse_rendering": {"io", "maths", "backends", "scene", "rendering", "engine"},
     "evaluation": {"io", "maths", "scene", "rendering", "datasets"},
     "export": {"io", "maths", "scene", "rendering"},
-    "report": {"io", "maths", "scene", "rendering", "engine", "datasets", "poses", "evaluation", "export"},
+    "report": {
+        "io",
+        "maths",
+        "scene",
+        "rendering",
+        "engine",
+        "datasets",
+        "preprocess",
+        "poses",
+        "evaluation",
+        "export",
+    },
 }
 """Rooms that each room may import, besides itself; the files beside them may import all."""
 INNER_ROOMS = {

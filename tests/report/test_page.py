@@ -25,8 +25,9 @@ from tumble.io.files import BadFile
 from tumble.maths.images import linear_from_srgb, srgb_from_linear, to_srgb8
 from tumble.maths.se3 import SE3
 from tumble.poses.result import Observability, PoseQuality
-from tumble.report import health_card, preset_lights, svg, training_views
+from tumble.report import figures, health_card, preset_lights, svg, training_views, worst_frames
 from tumble.report import page as report
+from tumble.report.worst_frames import AllFrames
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
@@ -105,6 +106,13 @@ def text(page: Path) -> str:
     """Visible text of the page, without markup."""
     body = re.sub(r"<(script|style|title)\b.*?</\1>", "", page.read_text("utf-8"), flags=re.S)
     return html.unescape(re.sub(r"<[^>]+>", " ", body))
+
+
+def test_the_page_names_the_worst_frame_and_what_was_seen(page: Path) -> None:
+    words = " ".join(text(page).split())
+    assert f"0009.png {HOSTILE} mask and reconstruction overlap by" in words
+    assert re.search(r"(All of the surface was seen|[Nn]o frame shows|Hardly any frame shows)", words)
+    assert re.search(r"top \d+% \d+ bottom \d+% \d+", words)
 
 
 def test_the_page_loads_nothing(page: Path) -> None:
@@ -275,6 +283,50 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     assert (lost_frames.value, lost_frames.rating) == ("1 of 10", "warn")
     assert (match.value, match.rating) == ("4.00 px", "bad")
     assert health_card.overall([photo, silhouette, exposure, lost_frames, match])[0] == "bad"
+
+
+def test_the_spoilt_frames_are_shown(asset: Asset, capture: Capture) -> None:
+    """One mask is shifted, after it lost a part that did not matter; another frame has no pose."""
+    shifted, lost = 2, 6
+    masks = capture.masks.clone()
+    masks[shifted] = masks[shifted].roll(SIDE // 4, 0)
+    before = masks.clone()
+    before[shifted, :3, :3] = OBJECT
+    kept = [i for i in range(N) if i != lost]
+    part = dataclasses.replace(asset, trajectory=asset.trajectory.select(kept))
+    after = dataclasses.replace(capture, masks=masks)
+    rendered = list(training_views.frames(training_views.prepare(part), after.select(kept)))
+    everything = AllFrames(dataclasses.replace(capture, masks=before), after)
+    worst, other = worst_frames.worst_frames(everything, rendered)
+    assert (other.name, worst.name) == (capture.names[lost], capture.names[shifted])
+    assert other.reasons == ("no pose was found; the frame was left out",)
+    assert [title for title, _ in other.pictures] == ["mask"]
+    assert re.fullmatch(r"mask and reconstruction overlap by \d\d% only", worst.reasons[0])
+    assert [title for title, _ in worst.pictures] == ["mask before", "mask after"]
+    picture = worst.pictures[1][1]
+    for colour in (worst_frames.MASK_COLOUR, worst_frames.SILHOUETTE_COLOUR):
+        assert (picture == colour).all(-1).sum() > 50
+    html = figures.worst_frames([dataclasses.replace(other, name=HOSTILE)])
+    assert html.count("<img") == 1
+    assert HOSTILE not in html
+    assert "no pose was found" in html
+
+
+def test_a_good_run_has_no_worst_frames(asset: Asset, capture: Capture) -> None:
+    """But for the colours of a hand in one mask, and a mask of a third of its area."""
+    rendered = list(training_views.frames(training_views.prepare(asset), capture))
+    assert worst_frames.worst_frames(AllFrames(capture, capture), rendered) == []
+    handed = AllFrames(capture, capture, {capture.names[1]: 0.2})
+    assert [frame.reasons for frame in worst_frames.worst_frames(handed, rendered)] == [
+        ("20% of the mask has the colours of the hand",)
+    ]
+    masks = capture.masks.clone()
+    rows = torch.where((masks[5] == OBJECT).any(1))[0]
+    masks[5, int(rows[len(rows) // 3]) :] = BACKGROUND
+    small = dataclasses.replace(capture, masks=masks)
+    (frame,) = worst_frames.worst_frames(AllFrames(small, small), rendered)
+    assert frame.name == capture.names[5]
+    assert re.fullmatch(r"0\.[23] times the area of the frames around it", frame.reasons[0])
 
 
 def test_a_small_residual_does_not_hide_a_drift() -> None:

@@ -25,6 +25,7 @@ from tumble.rendering import corner_features, rasterize, render_gbuffer
 from tumble.report import training_views
 from tumble.report.coverage import Coverage, best_direction, nearest_oriented, outside_view
 from tumble.report.training_views import RenderedFrame
+from tumble.report.worst_frames import WorstFrame
 from tumble.scene import Asset, Camera, Environment, opengl_from_opencv
 
 MAP_SIDE = 320
@@ -76,6 +77,22 @@ def comparison(frame: RenderedFrame) -> Markup:
     )
     photo, rendered = (webp(_code_values(image)) for image in (frame.photo, frame.rendered))
     return Markup(template).format(name=frame.name, photo=photo, rendered=rendered, psnr=frame.psnr)
+
+
+def worst_frames(frames: Sequence[WorstFrame]) -> Markup:
+    """Pictures of the worst frames with the reasons; empty without any."""
+    template = Markup(
+        '<figure><div class="{}">{}</div><figcaption class="under"><span>{}</span></figcaption>'
+        "<figcaption>{}</figcaption></figure>"
+    )
+    image = Markup('<img src="{}" alt="{} of {}">')
+    drawn = []
+    for frame in frames:
+        cells = Markup("").join(image.format(webp(picture), title, frame.name) for title, picture in frame.pictures)
+        titles = ", ".join(title for title, _ in frame.pictures) if len(frame.pictures) > 1 else ""
+        name = f"{frame.name} ({titles})" if titles else frame.name
+        drawn.append(template.format("pair" if titles else "single", cells, name, "; ".join(frame.reasons)))
+    return Markup("").join(drawn)
 
 
 def _strip(

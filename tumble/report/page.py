@@ -31,8 +31,10 @@ from tumble.export import Preset, confidence_of, extract_mesh, write_textured_me
 from tumble.io import BadFile, files, progress, tree
 from tumble.maths import fibonacci_sphere
 from tumble.poses import PoseQuality, mask_refinement
-from tumble.report import coverage, figures, health_card, preset_lights, svg, training_views
+from tumble.preprocess import read_provenance
+from tumble.report import coverage, figures, health_card, preset_lights, svg, training_views, worst_frames
 from tumble.report.training_views import RenderedFrame
+from tumble.report.worst_frames import AllFrames
 from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
 
 N_COMPARISONS = 6
@@ -48,6 +50,7 @@ SECTIONS: dict[str, str] = {
     "light": "Light and motion",
     "coverage": "Coverage",
     "health": "Health",
+    "worst": "Worst frames",
     "confidence": "Confidence",
     "timings": "Timings",
     "configuration": "Configuration",
@@ -92,15 +95,19 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
     full_capture = reader_for(path).load(path)
-    tracked, full_capture = mask_refinement.stored_result(out, full_capture)
-    run_capture = frames_of_run(full_capture, asset, run.frame_names(out, len(asset.trajectory)), path)
+    tracked, refined = mask_refinement.stored_result(out, full_capture)
+    made = read_provenance(path) if path.is_dir() else None
+    hand_coloured = {frame.name: frame.hand_coloured for frame in made.frames} if made else {}
+    run_capture = frames_of_run(refined, asset, run.frame_names(out, len(asset.trajectory)), path)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
     assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
     with tempfile.TemporaryDirectory() as folder:
         asset = tree.to(asset, device)
         glb = write_model(asset, Path(folder))
-        build(asset, run_capture, glb, summary, tracked.quality if tracked else None, out / run.REPORT)
+        quality = tracked.quality if tracked else None
+        all_frames = AllFrames(full_capture, refined, hand_coloured)
+        build(asset, run_capture, glb, summary, quality, out / run.REPORT, all_frames=all_frames)
     return out / run.REPORT
 
 
@@ -134,7 +141,14 @@ def write_model(asset: Asset, folder: Path) -> Path | None:
 
 @torch.no_grad()
 def build(
-    asset: Asset, capture: Capture, glb: Path | None, summary: RunSummary, quality: PoseQuality | None, out: Path
+    asset: Asset,
+    capture: Capture,
+    glb: Path | None,
+    summary: RunSummary,
+    quality: PoseQuality | None,
+    out: Path,
+    *,
+    all_frames: AllFrames | None = None,
 ) -> list[health_card.Row]:
     """Write the page; returns the rows of its health card.
 
@@ -143,6 +157,7 @@ def build(
         capture: The asset's training frames, in the order of its trajectory.
         glb: Mesh for the live view; without one the live view is left out.
         quality: Quality of the poses, if they were estimated.
+        all_frames: The frames of `capture` and those without a pose; None if all have one.
     """
     scene = training_views.prepare(asset)
     frames = list(progress.track(training_views.frames(scene, capture), "report: training views", len(capture)))
@@ -175,6 +190,7 @@ def build(
         sides=coverage.by_side(covered),
         n_frames=len(frames),
         rows=[(row, health_card.RATING_LABELS[row.rating], svg.bars(row.bars, row.marks)) for row in rows],
+        worst=figures.worst_frames(worst_frames.worst_frames(all_frames or AllFrames(capture, capture), frames)),
         confidence=figures.confidence_maps(asset, views, confidence),
         timings=_timings(summary.records),
         configuration=_configuration(summary.recipe),
