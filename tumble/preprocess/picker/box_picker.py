@@ -198,7 +198,7 @@ def _review(path: Path, options: FootageOptions) -> Review:
     def corrected(box: Box, object: tuple[Pixel, ...], not_object: tuple[Pixel, ...]) -> Masks:
         known = survey(box)
         clicks = to_clicks(object, not_object, known.numbers, known.scale)
-        return correct_masks(known.images, known.masks, known.background, clicks)
+        return correct_masks(known.images, known.masks, known.background, clicks, known.hands)
 
     return Review(survey, lambda marks: corrected(marks.box, marks.object, marks.not_object))
 
