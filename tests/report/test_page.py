@@ -329,6 +329,18 @@ def test_a_good_run_has_no_worst_frames(asset: Asset, capture: Capture) -> None:
     assert re.fullmatch(r"0\.[23] times the area of the frames around it", frame.reasons[0])
 
 
+def test_the_advice_says_how_far_it_can_be_trusted() -> None:
+    ones = torch.ones(N)
+    observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
+    bad = PoseQuality(0.3 * ones, 50 * ones, ones, ones, 0.5 * ones, ones < 0, torch.tensor(3.0), observability)
+    good = dataclasses.replace(bad, rotation_disagreement=0.01 * ones)
+    assert report._what_to_record("No frame.", good, 0) == report._what_to_record("No frame.", None, 0) == "No frame."
+    assert report._what_to_record("No frame.", good, 3) == "No frame. 3 frames without a pose are not counted."
+    assert report._what_to_record("No frame.", bad, 0).startswith(
+        "The poses are not reliable, so this may be wrong: no"
+    )
+
+
 def test_a_small_residual_does_not_hide_a_drift() -> None:
     ones = torch.ones(N)
     observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))

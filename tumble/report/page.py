@@ -168,7 +168,9 @@ def build(
     rating, word, sentence = health_card.overall(rows)
     covered = coverage.coverage_of(asset, capture)
     told = coverage.advice(covered, light_turns=asset.trajectory.light == "camera")
-    progress.LOG.info(told.sentence)
+    n_lost = len(all_frames.before) - len(capture) if all_frames else 0
+    said = _what_to_record(told.sentence, quality, n_lost)
+    progress.LOG.info(said)
     hero = figures.hero_image(scene, views[0])
     lights = {} if glb is None else _live_view_lights(asset, views[0])
     page = TEMPLATES.get_template("page.html").render(
@@ -185,7 +187,7 @@ def build(
         light_caption=LIGHT_CAPTIONS[asset.trajectory.light],
         path=svg.globes(asset.trajectory.camera_positions.cpu().numpy()),
         path_caption=_path_caption(asset),
-        advice=told.sentence,
+        advice=said,
         region="" if told.region is None else figures.webp(figures.region_image(asset, covered, told.region)),
         sides=coverage.by_side(covered),
         n_frames=len(frames),
@@ -209,6 +211,14 @@ def build(
 def _own(name: str) -> Markup:
     """A file of the package that is inserted as it is."""
     return Markup((resources.files("tumble.report") / "assets" / name).read_text("utf-8"))
+
+
+def _what_to_record(sentence: str, quality: PoseQuality | None, n_lost: int) -> str:
+    """The advice on what to record again, with how far it can be trusted."""
+    if quality is not None and quality.rating == "bad":
+        sentence = f"The poses are not reliable, so this may be wrong: {sentence[0].lower()}{sentence[1:]}"
+    uncounted = "A frame without a pose is" if n_lost == 1 else f"{n_lost} frames without a pose are"
+    return f"{sentence} {uncounted} not counted." if n_lost else sentence
 
 
 def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> dict[str, str]:
