@@ -103,6 +103,6 @@ def test_a_surface_of_crumbs_is_packed_by_xatlas(monkeypatch: pytest.MonkeyPatch
 
 
 def test_pieces_without_number_are_an_error_with_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(atlas, "_place", lambda charts, n: None)
+    monkeypatch.setattr(atlas, "_place", lambda charts, n: [])
     with pytest.raises(ValueError, match="has 1 pieces, too many for a texture; use --preset splat"):
         atlas.pack(np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]]), 256)

@@ -8,12 +8,13 @@ at the largest common scale at which all fit. Long charts are cut in two where t
 
 import math
 from dataclasses import dataclass
+from itertools import takewhile
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+from jaxtyping import Complex, Float, Int
+from scipy import fft
 
 from tumble.export.mesh import Mesh, components, unit_rows, vertex_normals
 from tumble.maths import local_frame
@@ -35,11 +36,11 @@ PROXIMITY = 1 / 32
 """Distance over which the benefit of being close to other charts and to the border decreases by a factor e [side of the
 texture]."""
 ATTEMPTS = (
-    *((longest, filled) for longest in (math.inf, 0.6, 0.35, 0.28) for filled in (0.77, 0.76, 0.75)),
-    *((0.35, filled) for filled in (0.73, 0.7, 0.66, 0.6, 0.5, 0.35, 0.2, 0.05)),
+    *((longest, (0.75, 0.76, 0.77)) for longest in (math.inf, 0.6, 0.35, 0.28)),
+    *((0.35, (filled,)) for filled in (0.73, 0.7, 0.66, 0.6, 0.5, 0.35, 0.2, 0.05)),
 )
-"""Maximum length of a chart [side of the texture at 75 %], and fraction of the texture that the charts cover, in the
-order in which they are tried."""
+"""Maximum length of a chart [side of the texture at 75 %], and fractions of the texture that the charts cover, in the
+order in which they are tried: the last fraction at which the charts fit is used."""
 SUBCELL_BITS = 4
 """Fractional bits of the vertex positions when charts are drawn into the grid."""
 MAX_COST = 8.0
@@ -141,14 +142,15 @@ def pack(
     area = np.abs(a * d - b * c).sum() / 2
     n = min(max(resolution // CELL, MIN_CELLS), MAX_CELLS)
     charts: list[Int[np.ndarray, " _"]] = []
-    for longest, filled in ATTEMPTS:
+    for longest, fractions in ATTEMPTS:
         whole = [np.nonzero(label == name)[0] for name in np.unique(label)]
         charts = [part for chart in whole for part in _cut(corners, chart, longest * math.sqrt(area / 0.75))]
         charts.sort(key=lambda chart: -float(np.ptp(corners[chart].reshape(-1, 2), axis=0).prod()))
-        placed = _place([corners[chart] * (n * math.sqrt(filled / area)) for chart in charts], n)
-        if placed is not None:
+        attempts = (_place([corners[chart] * (n * math.sqrt(x / area)) for chart in charts], n) for x in fractions)
+        placed = list(takewhile(len, attempts))
+        if placed:
             packed, name = np.zeros_like(corners), np.zeros_like(faces)
-            for number, (chart, position) in enumerate(zip(charts, placed, strict=True)):
+            for number, (chart, position) in enumerate(zip(charts, placed[-1], strict=True)):
                 packed[chart], name[chart] = position / n, number
             _, first, index = np.unique(name * len(uv) + faces, return_index=True, return_inverse=True)
             return packed.reshape(-1, 2)[first], index.reshape(-1, 3), faces.ravel()[first]
@@ -167,10 +169,10 @@ def _cut(
     return [part for side in (half, ~half) for part in _cut(corners, chart[side], longest)]
 
 
-def _place(charts: list[Float[np.ndarray, "_ 3 2"]], n: int) -> list[Float[np.ndarray, "_ 3 2"]] | None:
+def _place(charts: list[Float[np.ndarray, "_ 3 2"]], n: int) -> list[Float[np.ndarray, "_ 3 2"]]:
     """Charts, given by the corners of their triangles [cells], moved to free places on a grid of n x n cells.
 
-    None if not all of them fit.
+    Empty if not all of them fit.
     """
     occupied = np.zeros((n, n), np.uint8)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GAP + 1, 2 * GAP + 1))
@@ -178,15 +180,14 @@ def _place(charts: list[Float[np.ndarray, "_ 3 2"]], n: int) -> list[Float[np.nd
     for index, chart in enumerate(charts):
         to_border = np.pad(1 - occupied, 1)
         distance = cv2.distanceTransform(to_border, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
-        fields = torch.from_numpy(np.stack([occupied.astype(np.float32), np.exp(-distance / (PROXIMITY * n))]))
-        spectra = torch.fft.rfft2(fields)
+        spectra = np.asarray(fft.rfft2(np.stack([occupied.astype(np.float32), np.exp(-distance / (PROXIMITY * n))])))
         options = []
         for turn in range(ROTATIONS if index < LARGE_CHARTS else 1):
             shape = _rasterized(chart, 2 * math.pi * turn / ROTATIONS)
             if max(shape.cells.shape) <= n:
                 options.append((*_best_position(spectra, shape.cells, n), shape))
         if not options or max(options, key=lambda option: option[0])[0] == -math.inf:
-            return None
+            return []
         _, row, column, shape = max(options, key=lambda option: option[0])
         height, width = shape.cells.shape
         region = np.zeros_like(occupied)
@@ -214,12 +215,12 @@ def _rasterized(chart: Float[np.ndarray, "f 3 2"], angle: float) -> _Shape:
     corners = corners - corners.reshape(-1, 2).min(0) + 0.5
     width, height = np.ceil(corners.reshape(-1, 2).max(0) + 0.5).astype(int)
     cells = np.zeros((height, width), np.uint8)
-    for triangle in np.rint((corners - 0.5) * (1 << SUBCELL_BITS)).astype(np.int32):
-        cv2.fillConvexPoly(cells, triangle, 1, cv2.LINE_8, SUBCELL_BITS)
+    triangles = np.rint((corners - 0.5) * (1 << SUBCELL_BITS)).astype(np.int32)
+    cv2.fillPoly(cells, triangles, 1, cv2.LINE_8, SUBCELL_BITS)
     return _Shape(corners, cells)
 
 
-def _best_position(spectra: Tensor, cells: np.ndarray, n: int) -> tuple[float, int, int]:
+def _best_position(spectra: Complex[np.ndarray, "2 n _"], cells: np.ndarray, n: int) -> tuple[float, int, int]:
     """Value, row and column of the best position of a shape that touches no occupied cell; -inf if there is none.
 
     The value is the mean proximity of the shape's outline to occupied cells and the border.
@@ -232,10 +233,11 @@ def _best_position(spectra: Tensor, cells: np.ndarray, n: int) -> tuple[float, i
     height, width = cells.shape
     inner = cv2.erode(cells, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     outline = cells - inner
-    kernels = torch.zeros(2, n, n)
-    kernels[:, :height, :width] = torch.from_numpy(np.stack([cells, outline]).astype(np.float32))
-    sums = torch.fft.irfft2(spectra * torch.fft.rfft2(kernels).conj(), s=(n, n))
-    overlap, value = sums[:, : n - height + 1, : n - width + 1]
-    value = torch.where(overlap > 0.5, -math.inf, value / outline.sum())
-    index = int(value.argmax())
-    return float(value.reshape(-1)[index]), *divmod(index, value.shape[1])
+    # One axis after the other: most rows of the kernels are zero, and not all rows of the sums are used.
+    kernels = np.asarray(fft.fft(fft.rfft(np.stack([cells, outline]).astype(np.float32), n), n, axis=1))
+    product = np.multiply(spectra, np.conjugate(kernels, out=kernels), out=kernels)
+    rows = np.asarray(fft.ifft(product, axis=1, overwrite_x=True))[:, : n - height + 1]
+    overlap, value = np.asarray(fft.irfft(rows, n))[..., : n - width + 1]
+    value = np.where(overlap > 0.5, -np.inf, value / outline.sum())
+    row, column = divmod(int(value.argmax()), value.shape[1])
+    return float(value[row, column]), row, column
