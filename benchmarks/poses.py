@@ -85,7 +85,7 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     """A row: matching, stage 1, its scores, and those of stage 2 if `refined`."""
     capture, truth = load(case, root)
     started = time.perf_counter()
-    matches = matching.match_pairs(matching.views_of(capture), neighbours(len(capture)), DRAFT.matcher)
+    matches = matching.match_pairs(matching.views_of(sfm.to_match(capture)), neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()
     if route == "graph":
         tracked = drive(sfm, DRAFT.track, sfm.gather(capture, matches, DRAFT.matcher), seed=0)

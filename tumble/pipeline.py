@@ -235,7 +235,8 @@ def _track(
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
-    matches = matching.match_pairs(matching.views_of(capture), near, recipe.matcher, device=device, cache=cache)
+    views = matching.views_of(sfm.to_match(capture))
+    matches = matching.match_pairs(views, near, recipe.matcher, device=device, cache=cache)
     route = stage_of(recipe.track)
     try:
         with progress.task("observations in all frames"):

@@ -1,10 +1,13 @@
 """Feature tracks of matches counted by hand, and of matches of a known flow."""
 
+import numpy as np
 import pytest
 import torch
 
+from tumble.maths import SO3
 from tumble.poses.sfm import tracks
 from tumble.poses.sfm.tracks import Tracks, chain_matches, concatenate
+from tumble.scene.camera import Camera
 from tumble.scene.match import Match
 
 A = torch.tensor([[1.05, 0.08], [-0.06, 0.97]], dtype=torch.float64)
@@ -124,3 +127,50 @@ def test_correspondences_become_tracks_of_two_observations() -> None:
     assert both.frame.tolist() == [3, 3, 7, 7] * 2
     assert both.point.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
     assert torch.equal(both.uv[2:4], (uv + 10).double())
+
+
+def test_matches_join_tracks_where_they_agree_with_the_poses() -> None:
+    """Two tracks of each of 20 points, in frames 0-1 and 3-4, which frame 2 does not see; a tenth of the matches of
+    frames 0 and 4 is wrong, and all of those of frames 1 and 3 are.
+    """
+    rng = torch.Generator().manual_seed(0)
+    X = 0.3 * torch.randn(20, 3, generator=rng, dtype=torch.float64)
+    turns = torch.linspace(0, 0.8, 5, dtype=torch.float64)[:, None] * torch.tensor([0.2, 1.0, 0.3])
+    R, t = SO3.exp(turns.double()).matrix(), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand(5, 3)
+    camera = Camera.from_fov(0.6, 200, 200)
+    x = torch.einsum("fij,nj->fni", R, X) + t[:, None]
+    focal, principal = camera.fx_fy_cx_cy.double().split(2)
+    uv = x[..., :2] / x[..., 2:] * focal + principal
+    frame = torch.tensor([0, 1, 3, 4]).repeat_interleave(20)
+    point = torch.cat([torch.arange(20), torch.arange(20), 20 + torch.arange(20), 20 + torch.arange(20)])
+    found = Tracks(frame, point, uv[frame, torch.arange(20).repeat(4)])
+    far = uv[4].clone()
+    far[:2] += torch.tensor([30.0, -40.0])
+    matches = [
+        Match(0, 4, uv[0], far, torch.ones(20)),
+        Match(1, 3, uv[1], uv[3].roll(1, 0), torch.ones(20)),
+    ]
+    keypoints = tracks.gather_keypoints(matches, found, camera, 5)
+    right = keypoints.consistent((0, 4), (R[0], t[0]), (R[4], t[4]), 1.0)
+    assert right.tolist() == [False] * 2 + [True] * 18
+    frames = (0, 1, 3, 4)
+    joined, keypoint = keypoints.tracks(frames, R[list(frames)], t[list(frames)], 1.0)
+    assert sorted(torch.bincount(joined.point).tolist()) == [2] * 4 + [4] * 18
+    assert torch.equal(torch.tensor(frames)[joined.frame], torch.from_numpy(keypoints.frame[keypoint]))
+    # Without frames 1 and 3, tracks still go through their other observations.
+    joined, _ = keypoints.tracks((0, 4), R[[0, 4]], t[[0, 4]], 1.0)
+    assert torch.bincount(joined.point).tolist() == [2] * 18
+
+
+def test_correspondences_follow_matches_and_tracks_to_known_points() -> None:
+    """Keypoint a of frame 0 is matched with frame 1; keypoint b of frame 0 and frame 2 are of one track."""
+    found = Tracks(torch.tensor([0, 2]), torch.tensor([0, 0]), torch.tensor([[5.0, 5.0], [7.0, 7.0]]).double())
+    matches = [match(0, 1, [[1.0, 1.0], [3.0, 3.0]], [[2.0, 2.0], [4.0, 4.0]])]
+    keypoints = tracks.gather_keypoints(matches, found, Camera.from_fov(0.6, 20, 20), 3)
+    positions = [tuple(uv) for uv in keypoints.uv.tolist()]
+    X = np.full((len(positions), 3), np.nan)
+    X[positions.index((2.0, 2.0))] = 1
+    X[positions.index((7.0, 7.0))] = 2
+    keypoint, points = keypoints.correspondences(0, (1, 2), X)
+    assert [positions[k] for k in keypoint] == [(1.0, 1.0), (5.0, 5.0)]
+    assert points[:, 0].tolist() == [1, 2]

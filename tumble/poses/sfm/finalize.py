@@ -84,6 +84,9 @@ class Solution:
     """Approximate radius of the object [mean distance]."""
     rotation_disagreement: Float[Tensor, " t"]
     """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]."""
+    confirmed: Bool[Tensor, " t"] | None = None
+    """Frames whose poses matches have confirmed, if something hides a part of the object: the others are lost. None if
+    the object is in full view, where contours and silhouettes decide."""
 
 
 def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: Solution) -> PoseResult:
@@ -102,17 +105,22 @@ def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: 
     known = ~gap.isnan()
     max_gap = MAX_GAP_RATIO * gap[known].median().clamp_min(MIN_MEDIAN_GAP) if bool(known.any()) else torch.inf
     visible = (capture.masks != BACKGROUND).flatten(1).any(1)
-    no_contour = ~contours.reliable.any(1)
-    contradicted = (gap > max_gap) | gap.isnan() | (median > MAX_RESIDUAL)
-    lost = ~visible | no_contour | (contradicted & (inliers < MIN_INLIERS))
-    lost = ~relocalization.longest_smooth_sequence(R, ~lost)
+    if solution.confirmed is not None:
+        lost = ~visible | ~solution.confirmed
+    else:
+        no_contour = ~contours.reliable.any(1)
+        contradicted = (gap > max_gap) | gap.isnan() | (median > MAX_RESIDUAL)
+        lost = ~visible | no_contour | (contradicted & (inliers < MIN_INLIERS))
+        lost = ~relocalization.longest_smooth_sequence(R, ~lost)
     reliable = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < INLIER_THRESHOLD).float()) >= 3
     few = len(frontier_points) < 50
     sphere = _bounding_sphere(torch.cat([frontier_points, X[reliable]]) if few else frontier_points)
     sphere = _better_sphere(capture, solution, sphere, lost)
     R_first, (centre, scale) = R[0], sphere
     T = _in_sphere(solution, sphere)
-    lost, overlap = _reject_by_overlap(capture, _trajectory(T, capture), lost)
+    rejected, overlap = _reject_by_overlap(capture, _trajectory(T, capture), lost)
+    # Where something hides the object, its masks are more doubtful than poses that matches confirm.
+    lost = rejected if solution.confirmed is None else lost
     T = _interpolate_lost(T, lost)
     trajectory = _trajectory(T, capture)
     points = ((X[reliable] - centre) / scale) @ R_first.mT

@@ -8,20 +8,26 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from tumble.poses.sfm import frontier_points, relative_pose
 from tumble.poses.sfm.frontier_points import Contours
 from tumble.poses.sfm.relative_pose import Silhouettes
 from tumble.poses.sfm.tracks import Tracks, chain_matches
-from tumble.scene import Capture, Match
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match
 
 TRACKS_PER_FRAME = 150
 """Number of tracks aimed at in every frame; it determines the distance between tracks."""
 RADIUS_MARGIN = 1.1
 """Assumed radius of the object over the median radius of the spheres that its silhouettes indicate."""
+RIM = 2
+"""Width of the rim around an object in which something that hides it shows [pixels]."""
+MAX_HIDDEN_RIM = 0.25
+"""Fraction of the rim that is unknown, in the median frame, above which the object counts as hidden in part."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,7 @@ class Inputs:
     capture: Capture
     """Images, camera, and masks without the bands of unknown pixels along silhouettes."""
     matches: Sequence[Match] = field(repr=False)
-    """Matches between pairs of frames, each with i < j."""
+    """Matches between pairs of frames, each with i < j, of the object."""
     silhouettes: Silhouettes
     """Position and size of the silhouette in every frame; that of a nearby frame where the mask failed."""
     contours: Contours
@@ -42,26 +48,79 @@ class Inputs:
     """Approximate radius of the object [mean distance]."""
     matcher: str
     """Name of the matcher for loop closure: a file of `matching`."""
+    all_matches: Sequence[Match] = field(default=(), repr=False)
+    """If the object is hidden in part: matches of everything that is not background, a hand for example, as well."""
+
+    @property
+    def hidden(self) -> bool:
+        """Whether the object is hidden in part (`is_hidden`)."""
+        return bool(self.all_matches)
 
 
 def gather(capture: Capture, matches: Sequence[Match], matcher: str) -> Inputs:
     """Extract silhouettes, contours and tracks from a capture and the matches between its frames.
 
+    Args:
+        matches: Matches between the frames of `to_match(capture)`.
+        matcher: Name of the matcher for loop closure.
+
     Raises:
         ValueError: No frame shows the object.
     """
+    hidden = is_hidden(capture)
     capture = replace(capture, masks=frontier_points.fill_boundary_bands(capture.masks))
     silhouettes = relative_pose.silhouettes(capture)
     if not bool(silhouettes.visible.any()):
         raise ValueError("no mask has an object pixel: poses need masks that show the object")
-    area = math.pi * (silhouettes.radius * focal_length(capture) / relative_pose.SPHERE_OVER_DISC).square()
+    sure = [on_object(match, capture.masks) for match in matches] if hidden else matches
+    tracks = tracks_of(sure, silhouettes, capture)
     contours = frontier_points.convex_contours(capture)
     failed = relative_pose.failed_masks(silhouettes)
     contours = replace(contours, reliable=contours.reliable & ~failed[:, None])
     silhouettes = relative_pose.replace_failed(silhouettes, failed)
-    tracks = chain_matches(matches, (area / TRACKS_PER_FRAME).sqrt().clamp_min(2.0))
     radius = RADIUS_MARGIN * float(silhouettes.radius[silhouettes.visible].median())
-    return Inputs(capture, matches, silhouettes, contours, tracks, radius, matcher)
+    return Inputs(capture, sure, silhouettes, contours, tracks, radius, matcher, matches if hidden else ())
+
+
+def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Capture) -> Tracks:
+    """Feature tracks chained from matches."""
+    area = math.pi * (silhouettes.radius * focal_length(capture) / relative_pose.SPHERE_OVER_DISC).square()
+    return chain_matches(matches, (area / TRACKS_PER_FRAME).sqrt().clamp_min(2.0))
+
+
+def is_hidden(capture: Capture) -> bool:
+    """Whether something hides a part of the object in most frames: a wide unknown region adjoins it.
+
+    Masks of films without a hand have narrow unknown bands along the silhouette, which do not count.
+    """
+    fractions = []
+    for mask in frontier_points.fill_boundary_bands(capture.masks).numpy():
+        inside = (mask == OBJECT).astype(np.uint8)
+        rim = np.asarray(cv2.dilate(inside, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8))) > inside
+        if rim.any():
+            fractions.append(float((mask[rim] == UNKNOWN).mean()))
+    return bool(fractions) and float(np.median(fractions)) > MAX_HIDDEN_RIM
+
+
+def shown(capture: Capture) -> Capture:
+    """The capture with everything that is not background in its masks: the object and what hides it."""
+    masks = torch.where(capture.masks == BACKGROUND, capture.masks, torch.full_like(capture.masks, OBJECT))
+    return replace(capture, masks=masks)
+
+
+def to_match(capture: Capture) -> Capture:
+    """The capture whose frames are matched: with what hides the object, if something does."""
+    return shown(capture) if is_hidden(capture) else capture
+
+
+def on_object(match: Match, masks: UInt8[Tensor, "t h w"]) -> Match:
+    """The correspondences of which at least one end lies on an object pixel: both then show the object."""
+    height, width = masks.shape[1:]
+    known = torch.zeros(len(match), dtype=torch.bool)
+    for frame, uv in ((match.i, match.uv_i), (match.j, match.uv_j)):
+        column, row = uv.floor().long().T
+        known |= masks[frame][row.clamp(0, height - 1), column.clamp(0, width - 1)] == OBJECT
+    return match.select(known)
 
 
 def focal_length(capture: Capture) -> float:

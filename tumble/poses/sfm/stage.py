@@ -16,18 +16,20 @@ Unit of length until `finish`: the mean distance between camera and object.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.engine import State
 from tumble.maths import SE3, SO3, angle_between, mean_rotation
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import bundle_adjustment, frontier_points, relative_pose
-from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
+from tumble.poses.sfm import relative_pose, segments
+from tumble.poses.sfm.adjustment import adjust_round, adjust_windows, averaged_windows
+from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.finalize import Solution, pose_result
 from tumble.poses.sfm.loop_closure import loop_closures
 from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres, with_focal_length
 from tumble.poses.sfm.observations import gather as gather
+from tumble.poses.sfm.observations import to_match as to_match
 from tumble.poses.sfm.relocalization import (
     MIN_GAPS,
     POSE_JUMP,
@@ -42,7 +44,7 @@ from tumble.poses.sfm.symmetry import mirror_symmetry
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
 from tumble.scene import Trajectory
 
-VERSION = 11
+VERSION = 12
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -170,7 +172,12 @@ class Relocalize:
     """Scale of the Cauchy loss [pixels]."""
 
 
-Phase = AverageRotations | AdjustWindows | AdjustAll | KeepBest | CloseLoops | Relocalize
+@dataclass(frozen=True)
+class JoinSegments:
+    """Pose the frames of an object that is hidden in part (`segments`); the other frames are lost."""
+
+
+Phase = AverageRotations | AdjustWindows | AdjustAll | KeepBest | CloseLoops | Relocalize | JoinSegments
 
 
 @dataclass(frozen=True)
@@ -182,8 +189,14 @@ class Step:
     """Attempt that the step belongs to: 0 is the first; the others are those of `Config.fallbacks`."""
 
 
-def schedule(cfg: Config) -> list[Step]:
-    """All steps, in order."""
+def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
+    """All steps, in order.
+
+    Args:
+        hidden: Whether something hides a part of the object, which contours alone then do not relocalize.
+    """
+    if hidden:
+        return [*map(Step, (AverageRotations(), JoinSegments(), *map(AdjustAll, cfg.relocalized_scales)))]
     steps: list[Step] = []
     for attempt, sizes in enumerate((cfg.window_sizes, *(fallback.window_sizes for fallback in cfg.fallbacks))):
         phases = [AverageRotations(), *map(AdjustWindows, sizes), *map(AdjustAll, cfg.global_scales)]
@@ -194,7 +207,7 @@ def schedule(cfg: Config) -> list[Step]:
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
-    return len(schedule(cfg))
+    return len(schedule(cfg, hidden=inputs.hidden))
 
 
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
@@ -203,6 +216,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     t = silhouette_centres(inputs.capture, inputs.silhouettes)
     log_focal = torch.zeros((), dtype=torch.float64)
     best = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
+    best["posed"] = torch.ones(len(R), dtype=torch.bool)
     return State(
         0, Poses(R, t, log_focal), None, rng, best | {f"loop_{name}": x for name, x in vars(NO_TRACKS).items()}
     )
@@ -211,7 +225,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 @torch.no_grad()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """Carry out the next step of the schedule; further attempts are skipped once the loss has converged."""
-    now = schedule(cfg)[state.step]
+    now = schedule(cfg, hidden=inputs.hidden)[state.step]
+    cfg = _weighted(cfg, inputs)
     if now.attempt > 0:
         if float(state.memory["loss"]) < cfg.converged_loss:
             return {}
@@ -219,6 +234,11 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
             cfg = replace(cfg, frontier_weight=cfg.fallbacks[now.attempt - 1].frontier_weight)
     state.params, scalars = _run_phase(now.phase, cfg, with_focal_length(inputs, state.params.log_focal), state)
     return scalars
+
+
+def _weighted(cfg: Config, inputs: Inputs) -> Config:
+    """The settings with the weight of contours for an object that is hidden in part, if it is."""
+    return replace(cfg, frontier_weight=segments.FRONTIER_WEIGHT) if inputs.hidden else cfg
 
 
 def _run_phase(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "PhaseResult":
@@ -235,6 +255,8 @@ def _run_phase(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "Phas
             return _close_loops(inputs, state)
         case Relocalize(scale):
             return _relocalize(inputs, state, scale)
+        case JoinSegments():
+            return _join_segments(cfg, inputs, state)
 
 
 # Phases ---------------------------------------------------------------------------------------------------------------
@@ -265,65 +287,58 @@ def _average_rotations(cfg: Config, inputs: Inputs, state: State) -> PhaseResult
 
 def _adjust_windows(cfg: Config, inputs: Inputs, state: State, size: int) -> PhaseResult:
     """Adjust overlapping windows, each also from its mirror image, and average the rotations within them."""
-    n, size = len(inputs.capture), min(size, len(inputs.capture))
-    first = sorted({*range(0, n - size + 1, max(1, size // 4)), n - size})
-    frames = torch.tensor(first)[:, None] + torch.arange(size)
-    tracks, group = _window_tracks(inputs.tracks, frames, cfg.max_window_tracks, state.rng)
-    R = state.params.R[frames]
-    middle = R[:, size // 2, None]
-    # The mirror image (Necker reversal) reverses depth in the rotations relative to the middle frame.
-    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
-    best, best_loss = R, torch.full((len(frames),), torch.inf, dtype=R.dtype)
-    for start in (R, flip @ R @ middle.mT @ flip @ middle):
-        scene = BundleState(
-            start, silhouette_centres(inputs.capture, inputs.silhouettes)[frames], torch.zeros(0, 3, dtype=R.dtype)
-        )
-        for scale in cfg.window_scales:
-            scene, loss = _adjust_round(cfg, inputs, scene, tracks, group, frames, scale)
-        best = torch.where((loss < best_loss)[:, None, None, None], scene.R, best)
-        best_loss = torch.minimum(loss, best_loss)
-    a, b = torch.triu_indices(size, size, 1)
-    relative = best[:, b] @ best[:, a].mT
-    i, j = frames[:, a].flatten(), frames[:, b].flatten()
-    averaged = average_rotations(i, j, relative.flatten(0, 1), torch.ones(len(i), dtype=R.dtype), n_frames=n)
-    return replace(state.params, R=averaged.R_cam_obj), {"loss": best_loss.mean()}
+    windows = adjust_windows(cfg, inputs, state.params.R, state.rng, size=size, stride=max(1, size // 4))
+    R = averaged_windows(windows.frames, windows.best, n_frames=len(inputs.capture))
+    return replace(state.params, R=R), {"loss": windows.loss.amin(1).mean()}
 
 
-def _window_tracks(
-    tracks: Tracks, frames: Int64[Tensor, "g f"], max_tracks: int, rng: torch.Generator
-) -> tuple[Tracks, Int64[Tensor, " n"]]:
-    """The longest tracks of every window, with frames numbered over all windows; also the window of every point."""
-    size = frames.shape[1]
-    parts, groups = [], []
-    for number, first in enumerate(frames[:, 0].tolist()):
-        part = tracks.select((tracks.frame >= first) & (tracks.frame < first + size))
-        if part.n > max_tracks:
-            rank = torch.bincount(part.point) + torch.rand(part.n, generator=rng)
-            chosen = torch.zeros(part.n, dtype=torch.bool)
-            chosen[rank.topk(max_tracks).indices] = True
-            part = part.select(chosen[part.point])
-        parts.append(replace(part, frame=part.frame - first + number * size))
-        groups.append(torch.full((part.n,), number))
-    return concatenate(*parts), torch.cat(groups)
+def _join_segments(cfg: Config, inputs: Inputs, state: State) -> PhaseResult:
+    """Pose the frames that can be understood, and keep their tracks."""
+    part, tracks = segments.segmented_poses(cfg, inputs, segments.wide_matches(inputs), state.params.R, state.rng)
+    if part is None:
+        return state.params, {"posed": 0.0}
+    frames = list(part.frames)
+    R, t = state.params.R.clone(), state.params.t.clone()
+    R[frames], t[frames] = part.R, part.t
+    posed = torch.zeros(len(R), dtype=torch.bool)
+    posed[frames] = True
+    state.memory |= {"posed": posed} | {f"loop_{name}": x for name, x in vars(tracks).items()}
+    return replace(state.params, R=R, t=t), {"posed": float(len(frames))}
 
 
 def adjust_all(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
-    """One round of bundle adjustment of the whole capture, including the focal length if that is only assumed."""
-    poses = state.params
-    frames = torch.arange(len(inputs.capture))[None]
+    """One round of bundle adjustment of all frames with a pose, and of the focal length if that is only assumed."""
+    poses, posed = state.params, _posed(state)
+    frames = torch.nonzero(posed)[:, 0]
     log_focal = torch.zeros(1, dtype=poses.R.dtype) if inputs.capture.focal_assumed else None
-    scene = BundleState(poses.R[None], poses.t[None], torch.zeros(0, 3, dtype=poses.R.dtype), log_focal)
-    tracks = inputs.tracks
-    if len(state.memory.get("loop_point", ())):
-        tracks = concatenate(tracks, Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv"))))
+    scene = BundleState(poses.R[None, posed], poses.t[None, posed], torch.zeros(0, 3, dtype=poses.R.dtype), log_focal)
+    tracks = _all_tracks(inputs, state)
+    if not bool(posed.all()):
+        tracks = tracks.select(posed[tracks.frame])
+        tracks = replace(tracks, frame=(posed.cumsum(0) - 1)[tracks.frame])
     group = torch.zeros(tracks.n, dtype=torch.long)
     # `inputs` have the current focal length; the prior is centred on that of the capture.
     log_focal_prior = -float(poses.log_focal)
-    scene, loss = _adjust_round(cfg, inputs, scene, tracks, group, frames, scale, state.rng, log_focal_prior)
+    scene, loss = adjust_round(cfg, inputs, scene, tracks, group, frames[None], scale, state.rng, log_focal_prior)
+    R, t = poses.R.clone(), poses.t.clone()
+    R[posed], t[posed] = scene.R[0], scene.t[0]
     if scene.log_focal is None:
-        return Poses(scene.R[0], scene.t[0], poses.log_focal), {"loss": loss.mean()}
+        return Poses(R, t, poses.log_focal), {"loss": loss.mean()}
     focal = focal_length(inputs.capture) * scene.log_focal[0].exp()
-    return Poses(scene.R[0], scene.t[0], poses.log_focal + scene.log_focal[0]), {"loss": loss.mean(), "focal": focal}
+    return Poses(R, t, poses.log_focal + scene.log_focal[0]), {"loss": loss.mean(), "focal": focal}
+
+
+def _posed(state: State) -> Bool[Tensor, " t"]:
+    """Which frames have a pose; all of them unless the object is hidden in part."""
+    return state.memory.get("posed", torch.ones(len(state.params.R), dtype=torch.bool))
+
+
+def _all_tracks(inputs: Inputs, state: State) -> Tracks:
+    """Feature tracks and loop closures; for an object that is hidden in part the tracks that matches have joined."""
+    if not len(state.memory.get("loop_point", ())):
+        return inputs.tracks
+    stored = Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv")))
+    return stored if inputs.hidden else concatenate(inputs.tracks, stored)
 
 
 def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
@@ -345,53 +360,6 @@ def _close_loops(inputs: Inputs, state: State) -> PhaseResult:
     for name, x in vars(concatenate(NO_TRACKS, *(two_frame_tracks(match) for match in matches))).items():
         state.memory[f"loop_{name}"] = x
     return state.params, {"loops": float(len(matches))}
-
-
-def _adjust_round(
-    cfg: Config,
-    inputs: Inputs,
-    scene: BundleState,
-    tracks: Tracks,
-    group: Tensor,
-    frames: Int64[Tensor, "g f"],
-    scale: float,
-    rng: torch.Generator | None = None,
-    log_focal_prior: float = 0.0,
-) -> tuple[BundleState, Float[Tensor, " g"]]:
-    """One round of bundle adjustment: find frontier points, triangulate all points, adjust.
-
-    Args:
-        scene: Current poses of all groups; the points are not read.
-        tracks: Observations, with frames numbered over all groups.
-        group: Group of every point.
-        frames: Frames of every group.
-        scale: Scale of the Cauchy loss [pixels].
-        rng: Source of the random choice of frame pairs; None uses all pairs.
-        log_focal_prior: Mean of the prior on the logarithm of the focal length over the camera's.
-
-    Returns:
-        The adjusted scene, and the loss per observation of every group [pixels^2].
-    """
-    g, f = frames.shape
-    R, t, camera = scene.R.flatten(0, 1), scene.t.flatten(0, 1), inputs.capture.camera
-    a, b = torch.triu_indices(f, f, 1)
-    if rng is not None and len(a) > cfg.max_frontier_pairs:
-        chosen = torch.randperm(len(a), generator=rng)[: cfg.max_frontier_pairs]
-        a, b = a[chosen], b[chosen]
-    first = torch.arange(g)[:, None] * f
-    pairs = torch.stack([(first + a).flatten(), (first + b).flatten()], 1)
-    flat = frames.flatten()
-    frontier = frontier_points.frontier_tracks(R, t, camera, inputs.contours[flat], radius=inputs.radius, pairs=pairs)
-    all_tracks = concatenate(tracks, frontier)
-    weight = torch.cat([torch.ones(len(tracks)), torch.full((len(frontier),), cfg.frontier_weight)]).double()
-    group = torch.cat([group, frontier.frame[::2] // f])
-    sigma = cfg.centre_sigma * inputs.silhouettes.radius[frames] * focal_length(inputs.capture)
-    centre, radius = inputs.silhouettes.centre[frames], 1.5 * inputs.radius
-    problem = Problem(camera, all_tracks, group, weight, centre, sigma, cfg.depth_sigma, radius, log_focal_prior)
-    X = bundle_adjustment.triangulate(all_tracks, R, t, camera, inputs.silhouettes.radius[flat])
-    adjusted, loss = bundle_adjustment.adjust(problem, replace(scene, X=X), steps=cfg.iterations, scale=scale)
-    total = torch.zeros(g, dtype=torch.float64).index_add_(0, group[all_tracks.point], weight)
-    return adjusted, loss / total.clamp_min(1)
 
 
 def _relocalize(inputs: Inputs, state: State, scale: float) -> PhaseResult:
@@ -451,10 +419,11 @@ def assess(inputs: Inputs, trajectory: Trajectory) -> PoseResult:
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     """The result: poses in the object's unit and frame, surface points, and the quality of the poses."""
-    disagreement = _rotation_disagreement(cfg, inputs, state)
+    disagreement, posed = _rotation_disagreement(_weighted(cfg, inputs), inputs, state), _posed(state)
     inputs = with_focal_length(inputs, state.params.log_focal)
-    solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement)
-    return pose_result(inputs.capture, inputs.tracks, inputs.contours, solution)
+    solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None)
+    contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])
+    return pose_result(inputs.capture, inputs.tracks.select(posed[inputs.tracks.frame]), contours, solution)
 
 
 def _rotation_disagreement(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:

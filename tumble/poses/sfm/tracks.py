@@ -4,16 +4,21 @@ A *track* is one surface point with its *observations*, the positions at which f
 long tracks: with tracks of two or three frames the poses of a short stretch of video can bend by many degrees. Dense
 matches start at arbitrary positions, so two of them rarely share a pixel. A track is therefore continued by a local
 affine fit to the matches around its current position, and new tracks start where no track passes.
+
+Such tracks end where a hand passes or the object turns away. Matches between frames that are far apart in time connect
+them, but a few wrong ones would join tracks of different points. Which matches are right can be told once the poses of
+both frames are known, by their distance from the epipolar line: `Keypoints` joins tracks for given poses.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.scene import Match
+from tumble.scene import Camera, Match
 
 MATCH_RADIUS = 2.2
 """Distance from a point up to which matches are used to continue its track [pixels]."""
@@ -29,6 +34,10 @@ MIN_LONG_GAP_MATCHES = 60
 """Number of matches from which a pair farther apart is used as well; accidental matches are fewer."""
 MIN_SEPARATION = 0.5
 """Width of the grid cells in which only the oldest track is continued [spacing of new tracks]."""
+KEYPOINT_RESOLUTION = 0.01
+"""Positions that agree to this precision are one keypoint [pixels]."""
+MIN_CONSISTENT = 8
+"""Smallest number of matches of a pair of frames that agree with their poses; fewer agree by chance."""
 
 
 @dataclass(frozen=True)
@@ -174,3 +183,124 @@ def _propagate(match: Match, uv: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n
         weight = near / (1 + (residual / (MATCH_TOLERANCE / 2)).square())
     agreeing, used = ((near > 0) & (residual < MATCH_TOLERANCE)).sum(1), (near > 0).sum(1)
     return uv + fit[:, 0], (used > 0) & (agreeing > 0.7 * used)
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Positions in all frames that matches or tracks refer to, numbered frame by frame."""
+
+    frame: Int64[np.ndarray, " k"]
+    uv: Float[np.ndarray, "k 2"]
+    """Position [pixels]."""
+    pairs: dict[tuple[int, int], Int64[np.ndarray, "m 2"]] = field(repr=False)
+    """Keypoints that were matched, for every pair of frames i < j."""
+    observations: Int64[np.ndarray, "o 2"] = field(repr=False)
+    """Keypoint and track of every observation of a feature track, in ascending order of tracks."""
+    camera: Camera
+    n_frames: int
+
+    def consistent(
+        self, pair: tuple[int, int], pose_i: tuple[Tensor, Tensor], pose_j: tuple[Tensor, Tensor], tolerance: float
+    ) -> Bool[np.ndarray, " m"]:
+        """Which matches of a pair lie within `tolerance` [pixels] of the epipolar lines of its poses."""
+        matched = self.pairs[pair]
+        (R_i, t_i), (R_j, t_j) = ((R.numpy(), t.numpy()) for R, t in (pose_i, pose_j))
+        R = R_j @ R_i.T
+        x, y, z = t_j - R @ t_i
+        focal, principal = self.camera.fx_fy_cx_cy.double().numpy().reshape(2, 2)
+        rays = np.pad((self.uv[matched] - principal) / focal, ((0, 0), (0, 0), (0, 1)), constant_values=1.0)
+        line = rays[:, 0] @ (np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R).T
+        distance = np.abs((line * rays[:, 1]).sum(1)) / np.linalg.norm(line[:, :2] / focal, axis=1).clip(1e-12)
+        return distance < tolerance
+
+    def tracks(
+        self, frames: Sequence[int], R: Float[Tensor, "f 3 3"], t: Float[Tensor, "f 3"], tolerance: float
+    ) -> tuple[Tracks, Int64[np.ndarray, " o"]]:
+        """Tracks through some frames, with frames numbered by their place in `frames`, and each observation's keypoint.
+
+        Args:
+            frames: Frames with a pose, ascending.
+            R: `R_cam_obj` of these frames.
+            t: Object origin in their camera frames.
+            tolerance: Distance from the epipolar line up to which a match joins tracks [pixels].
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        place = {frame: k for k, frame in enumerate(frames)}
+        n = len(self.frame)
+        # Tracks are nodes of the graph too, so that they go on beyond frames that have no pose.
+        edges = [self.observations[np.isin(self.frame[self.observations[:, 0]], frames)] + (0, n)]
+        for (i, j), matched in self.pairs.items():
+            if i in place and j in place:
+                a, b = place[i], place[j]
+                right = self.consistent((i, j), (R[a], t[a]), (R[b], t[b]), tolerance)
+                if right.sum() >= MIN_CONSISTENT:
+                    edges.append(matched[right])
+        edge = np.concatenate(edges)
+        nodes = n + int(self.observations[:, 1].max(initial=-1)) + 1
+        graph = coo_array((np.ones(len(edge), np.int8), (edge[:, 0], edge[:, 1])), shape=(nodes, nodes))
+        point: np.ndarray = connected_components(graph, directed=False)[1].astype(np.int64)
+        used: np.ndarray = np.unique(edge[edge < n])
+        # A point has one observation per frame: several would contradict each other.
+        first: np.ndarray = np.unique(point[used] * self.n_frames + self.frame[used], return_index=True)[1]
+        used = used[first]
+        used = used[np.bincount(point[used], minlength=1)[point[used]] > 1]
+        number = np.unique(point[used], return_inverse=True)[1]
+        frame = np.array([place[k] for k in self.frame[used].tolist()], dtype=np.int64)
+        return Tracks(torch.from_numpy(frame), torch.from_numpy(number), torch.from_numpy(self.uv[used])), used
+
+    def correspondences(
+        self, frame: int, frames: Sequence[int], X: Float[np.ndarray, "k 3"]
+    ) -> tuple[Int64[np.ndarray, " c"], Float[np.ndarray, "c 3"]]:
+        """Keypoints of a frame and the surface points that they may show: those of their matches and of their tracks.
+
+        Args:
+            frame: The frame.
+            frames: Frames with a pose.
+            X: Surface point of every keypoint, object frame; NaN where none is known.
+        """
+        keypoint, source = [], []
+        for other in frames:
+            pair = (min(frame, other), max(frame, other))
+            if other != frame and pair in self.pairs:
+                matched = self.pairs[pair]
+                own = int(frame > other)
+                keypoint.append(matched[:, own])
+                source.append(matched[:, 1 - own])
+        at, track = self.observations.T
+        here = self.frame[at] == frame
+        own_keypoint = np.full(int(track.max(initial=-1)) + 1, -1)
+        own_keypoint[track[here]] = at[here]
+        # One observation of each track suffices, as all of them show the same point.
+        known = ~here & (own_keypoint[track] >= 0) & ~np.isnan(X[at, 0])
+        _, first = np.unique(track[known], return_index=True)
+        keypoint.append(own_keypoint[track[known][first]])
+        source.append(at[known][first])
+        keypoint, points = np.concatenate(keypoint), X[np.concatenate(source)]
+        found = ~np.isnan(points[:, 0])
+        return keypoint[found], points[found]
+
+
+def gather_keypoints(matches: Sequence[Match], tracks: Tracks, camera: Camera, n_frames: int) -> Keypoints:
+    """Number the positions of matches and of tracks.
+
+    Args:
+        matches: Matches of pairs of frames, each with i < j, at most one per pair.
+        tracks: Feature tracks through all frames.
+        camera: Camera of all frames.
+        n_frames: Number of frames.
+    """
+    ends = [(end, uv) for m in matches for end, uv in ((m.i, m.uv_i), (m.j, m.uv_j))]
+    frame = np.concatenate([*(np.full(len(uv), end) for end, uv in ends), tracks.frame.numpy()]).astype(np.int64)
+    uv = np.concatenate([*(uv.double().numpy() for _, uv in ends), tracks.uv.numpy()])
+    key = np.column_stack([frame, np.round(uv / KEYPOINT_RESOLUTION).astype(np.int64)])
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    number = number.reshape(-1)
+    pairs, start = {}, 0
+    for m in matches:
+        pairs[m.i, m.j] = np.column_stack([number[start : start + len(m)], number[start + len(m) :][: len(m)]])
+        start += 2 * len(m)
+    observations = np.column_stack([number[start:], tracks.point.numpy()])
+    observations = observations[np.argsort(observations[:, 1], kind="stable")]
+    return Keypoints(frame[first], uv[first], pairs, observations, camera, n_frames)

@@ -1,0 +1,92 @@
+"""Poses from keypoints and surface points that were projected by a known pose."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.lopsided import tumbling
+from tumble.maths import SO3
+from tumble.poses.sfm import stage
+from tumble.poses.sfm.partial import Observed, Partial, contour_cost
+from tumble.poses.sfm.registration import Joint, solutions
+from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
+
+SCENE = tumbling(12, points=200)
+CAMERA = SCENE.capture.camera
+R = SO3.exp(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64)).matrix().numpy()
+T = np.array([0.1, -0.05, 4.0])
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observed:
+    inputs = stage.gather(SCENE.capture, (), "mixed")
+    return Observed(stage.Config(), inputs, gather_keypoints((), NO_TRACKS, CAMERA, 12))
+
+
+def projected(X: np.ndarray) -> np.ndarray:
+    x = X @ R.T + T
+    focal, principal = CAMERA.fx_fy_cx_cy.double().numpy().reshape(2, 2)
+    return x[:, :2] / x[:, 2:] * focal + principal
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return math.degrees(math.acos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1)))
+
+
+def test_a_pose_is_found_among_wrong_correspondences(observed: Observed) -> None:
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(60, 3)) * 0.4
+    uv = projected(X) + 0.3 * rng.normal(size=(60, 2))
+    uv[:20] += rng.normal(size=(20, 2)) * 30
+    (found_R, found_t), inliers = max(solutions(observed, uv, X), key=lambda each: each[1])
+    assert angle(found_R, R) < 1
+    assert np.abs(found_t - T).max() < 0.05
+    assert 38 <= inliers <= 42
+
+
+def test_few_points_in_a_plane_have_a_mirrored_solution_too(observed: Observed) -> None:
+    rng = np.random.default_rng(1)
+    X = np.column_stack([rng.uniform(-0.15, 0.15, (12, 2)), np.zeros(12)])
+    found = [solution for solution, _ in solutions(observed, projected(X) + 0.2 * rng.normal(size=(12, 2)), X)]
+    assert len(found) == 2
+    angles = sorted(angle(each, R) for each, _ in found)
+    assert angles[0] < 10 < angles[1]
+    normals = [each[:, 2] for each, _ in found]
+    ray = (X.mean(0) @ R.T + T) / np.linalg.norm(X.mean(0) @ R.T + T)
+    # Both planes make the same angle with the line of sight.
+    assert abs(normals[0] @ ray) == pytest.approx(abs(normals[1] @ ray), abs=0.12)
+
+
+def test_too_few_correspondences_have_no_solution(observed: Observed) -> None:
+    X = np.eye(3).repeat(2, 0)
+    assert solutions(observed, projected(X), X) == []
+
+
+def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
+    """The two parts are frames of one capture; the second is then turned by 30 degrees in the object's frame."""
+    pose = SCENE.T_cam_obj
+    scale = float(pose.xyz[:, 2].mean())
+    every = Partial(tuple(range(12)), pose.rotation.matrix().double(), pose.xyz.double() / scale)
+    first, second = every.select(range(6)), every.select(range(6, 12))
+    turn = SO3.exp(torch.tensor([0.3, 0.4, 0.2], dtype=torch.float64)).matrix()
+    right, gaps = contour_cost(observed, first, second)
+    wrong, _ = contour_cost(observed, first, second.moved(turn, 1.0, torch.zeros(3, dtype=torch.float64)))
+    assert gaps > 50
+    assert right < 0.1
+    assert wrong > 5 * right
+    assert Joint(second, 50, 3, right, gaps).accepted
+    assert not Joint(second, 50, 3, 2.0, gaps).accepted
+    assert not Joint(second, 30, 3, right, gaps).accepted
+
+
+def test_a_part_moved_to_another_object_frame_shows_the_same_points() -> None:
+    """A point keeps its position in the camera frame up to the scale."""
+    pose = SCENE.T_cam_obj
+    part = Partial((0, 1), pose.rotation.matrix()[:2].double(), pose.xyz[:2].double())
+    turn, shift = SO3.exp(torch.tensor([0.3, 0.4, 0.2], dtype=torch.float64)).matrix(), torch.tensor([0.1, 0.2, -0.3])
+    moved = part.moved(turn, 1.3, shift.double())
+    x = torch.tensor([0.5, -0.2, 0.7], dtype=torch.float64)
+    x_new = 1.3 * turn @ x + shift.double()
+    assert torch.allclose(moved.R @ x_new + moved.t, 1.3 * (part.R @ x + part.t))

@@ -1,0 +1,128 @@
+"""Poses of an object that a hand hides in part, and for some frames altogether: the hand is an unknown half of it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.lopsided import Tumble, truth, tumbling
+from tumble.evaluation import metrics
+from tumble.maths import SE3, SO3
+from tumble.poses.sfm import segments, stage
+from tumble.poses.sfm.adjustment import Windows
+from tumble.poses.sfm.observations import is_hidden, on_object, to_match
+from tumble.poses.sfm.partial import Partial
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match, Trajectory
+
+QUICK = stage.Config(window_scales=(3.0, 1.0, 0.5), relocalized_scales=(1.0, 0.5))
+N = 30
+REGRASP = (14, 15)
+"""Frames in which the hand covers the object."""
+
+
+def hidden(scene: Tumble) -> Capture:
+    """The right half of the object, as seen in the image, is unknown; during the change of grip most of it."""
+    masks = scene.capture.masks.clone()
+    for k, mask in enumerate(masks):
+        column = torch.nonzero(mask == OBJECT)[:, 1].float()
+        start = column.quantile(0.15 if k in REGRASP else 0.5)
+        mask[(mask == OBJECT) & (torch.arange(mask.shape[1]) >= start)] = UNKNOWN
+    return replace(scene.capture, masks=masks)
+
+
+def matched(scene: Tumble, capture: Capture, pairs: list[tuple[int, int]]) -> list[Match]:
+    """Matches of all that is not background, but none of the frames of the change of grip with their neighbours."""
+    rng, found = torch.Generator().manual_seed(0), []
+    for i, j in pairs:
+        match = scene.match(i, j, rng)
+        across = i in REGRASP or j in REGRASP or (i < REGRASP[0] and j > REGRASP[1] and j - i < 6)
+        found.append(match.select(torch.arange(0 if across else len(match))))
+    return found
+
+
+@pytest.fixture(scope="module")
+def scene() -> Tumble:
+    return tumbling(N, points=300)
+
+
+@pytest.fixture(scope="module")
+def inputs(scene: Tumble) -> stage.Inputs:
+    near = [(t - k, t) for k in (1, 2, 4) for t in range(k, N)]
+    return stage.gather(hidden(scene), matched(scene, hidden(scene), near), "mixed")
+
+
+@pytest.fixture(scope="module")
+def posed(scene: Tumble, inputs: stage.Inputs) -> tuple[Partial, stage.Inputs]:
+    """The poses that segments give, from rotations 25 degrees off."""
+    wide = [(i, j) for i in range(N) for j in range(i + 1, N) if j - i <= 6 or i % 2 == j % 2 == 0]
+    matches = [on_object(m, inputs.capture.masks) for m in matched(scene, inputs.capture, wide)]
+    turn = SO3.exp(0.25 * torch.randn(N, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
+    start = scene.T_cam_obj.rotation.matrix().double() @ turn.matrix()
+    part, tracks = segments.segmented_poses(QUICK, inputs, matches, start, torch.Generator().manual_seed(0))
+    assert part is not None
+    assert set(tracks.frame.tolist()) == set(part.frames)
+    return part, inputs
+
+
+def test_segments_before_and_after_a_change_of_grip_are_joined(scene: Tumble, posed: tuple) -> None:
+    part, _ = posed
+    assert set(range(N)) - set(part.frames) == set(REGRASP)
+    T = SE3.from_rotation_matrix(part.R.float())
+    scores = metrics.rotation_scores(Trajectory(T, "camera"), truth(scene).select(list(part.frames)))
+    assert scores["rotation_median_degrees"] < 1.0
+    assert scores["rotation_below_5_percent"] == 100
+
+
+def test_frames_without_a_pose_are_lost_and_stay_out_of_the_adjustment(posed: tuple) -> None:
+    part, inputs = posed
+    state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))
+    R, t = state.params.R.clone(), state.params.t.clone()
+    R[list(part.frames)], t[list(part.frames)] = part.R, part.t
+    state.params, state.memory["posed"] = replace(state.params, R=R, t=t), torch.zeros(N, dtype=torch.bool)
+    state.memory["posed"][list(part.frames)] = True
+    moved, _ = stage.adjust_all(QUICK, inputs, state, 1.0)
+    assert torch.equal(moved.R[list(REGRASP)], R[list(REGRASP)])
+    assert not torch.equal(moved.R[list(part.frames)], R[list(part.frames)])
+    assert torch.nonzero(stage.finish(QUICK, inputs, state).quality.lost)[:, 0].tolist() == list(REGRASP)
+
+
+def test_only_a_wide_unknown_region_hides_the_object(scene: Tumble) -> None:
+    """Masks of films have narrow unknown bands along the silhouette."""
+    masks = scene.capture.masks.clone()
+    inner = torch.nn.functional.avg_pool2d((masks == OBJECT).float(), 3, 1, 1) == 1
+    masks[(masks == OBJECT) & ~inner] = UNKNOWN
+    assert not is_hidden(scene.capture)
+    assert not is_hidden(replace(scene.capture, masks=masks))
+    assert is_hidden(hidden(scene))
+
+
+def test_what_hides_the_object_is_matched_as_well(scene: Tumble) -> None:
+    capture = to_match(hidden(scene))
+    assert torch.equal(capture.masks == OBJECT, scene.capture.masks == OBJECT)
+    assert not (capture.masks == UNKNOWN).any()
+    assert to_match(scene.capture) is scene.capture
+
+
+def test_a_correspondence_needs_one_end_on_the_object(scene: Tumble) -> None:
+    masks = torch.full((2, 4, 4), BACKGROUND, dtype=torch.uint8)
+    masks[:, :, 2:], masks[0, 1, 1] = UNKNOWN, OBJECT
+    uv = torch.tensor([[1.5, 1.5], [3.5, 1.5]])
+    kept = on_object(Match(0, 1, uv, uv, torch.ones(2)), masks)
+    assert kept.uv_i.tolist() == [[1.5, 1.5]]
+
+
+def windows(losses: list[tuple[float, float]], turns: list[float]) -> Windows:
+    """Windows of four frames, one every two; the rotations of each deviate increasingly by an angle [degrees]."""
+    frames = 2 * torch.arange(len(losses))[:, None] + torch.arange(4)
+    step = torch.deg2rad(torch.tensor(turns, dtype=torch.float64))[:, None] * torch.arange(4)
+    R = SO3.exp(torch.stack([step, 0 * step, 0.1 * frames], -1)).matrix()
+    return Windows(frames, torch.stack([R, R.mT], 1), torch.tensor(losses, dtype=torch.float64))
+
+
+def test_windows_are_used_if_they_are_certain_and_agree_with_a_neighbour() -> None:
+    every = torch.ones(20, dtype=torch.bool)
+    certain, doubtful = (0.1, 0.2), (0.1, 0.11)
+    assert segments._runs(windows([certain] * 4, [0.0] * 4), every) == [[0, 1, 2, 3]]
+    assert segments._runs(windows([certain, certain, doubtful, certain, certain], [0.0] * 5), every) == [[0, 1], [3, 4]]
+    assert segments._runs(windows([certain] * 4, [0.0, 0.0, 30.0, 30.0]), every) == [[0, 1], [2, 3]]
+    assert segments._runs(windows([certain] * 4, [0.0] * 4), ~every) == []

@@ -1,0 +1,150 @@
+"""Rounds of bundle adjustment, of windows of frames or of all, with frontier points found anew in every round."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from tumble.poses.sfm import bundle_adjustment, frontier_points
+from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
+from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres
+from tumble.poses.sfm.rotation_averaging import average_rotations
+from tumble.poses.sfm.tracks import Tracks, concatenate
+
+
+@runtime_checkable
+class Settings(Protocol):
+    """Settings of bundle adjustment: those of `stage.Config`, where they are explained."""
+
+    @property
+    def frontier_weight(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def centre_sigma(self) -> float: ...
+    @property
+    def depth_sigma(self) -> float: ...
+    @property
+    def max_frontier_pairs(self) -> int: ...
+    @property
+    def max_window_tracks(self) -> int: ...
+    @property
+    def window_scales(self) -> tuple[float, ...]: ...
+    @property
+    def global_scales(self) -> tuple[float, ...]: ...
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Overlapping windows of consecutive frames, each adjusted from the current poses and from their mirror image."""
+
+    frames: Int64[Tensor, "g f"]
+    R: Float[Tensor, "g 2 f 3 3"]
+    """`R_cam_obj`, in a frame of each window's own, from either start."""
+    loss: Float[Tensor, "g 2"]
+    """Loss per observation from either start [pixels^2]."""
+
+    @property
+    def best(self) -> Float[Tensor, "g f 3 3"]:
+        """The rotations with the smaller loss."""
+        return self.R[torch.arange(len(self.R)), self.loss.argmin(1)]
+
+
+def adjust_windows(
+    cfg: Settings, inputs: Inputs, R: Float[Tensor, "t 3 3"], rng: torch.Generator, *, size: int, stride: int
+) -> Windows:
+    """Adjust windows of `size` frames, one every `stride` frames, from rotations and from their mirror image."""
+    n, size = len(inputs.capture), min(size, len(inputs.capture))
+    first = sorted({*range(0, n - size + 1, stride), n - size})
+    frames = torch.tensor(first)[:, None] + torch.arange(size)
+    tracks, group = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
+    R = R[frames]
+    middle = R[:, size // 2, None]
+    # The mirror image (Necker reversal) reverses depth in the rotations relative to the middle frame.
+    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
+    found, losses = [], []
+    for start in (R, flip @ R @ middle.mT @ flip @ middle):
+        t = silhouette_centres(inputs.capture, inputs.silhouettes)[frames]
+        scene, loss = BundleState(start, t, torch.zeros(0, 3, dtype=R.dtype)), torch.zeros(len(frames))
+        for scale in cfg.window_scales:
+            scene, loss = adjust_round(cfg, inputs, scene, tracks, group, frames, scale)
+        found.append(scene.R)
+        losses.append(loss)
+    return Windows(frames, torch.stack(found, 1), torch.stack(losses, 1))
+
+
+def averaged_windows(
+    frames: Int64[Tensor, "g f"], R: Float[Tensor, "g f 3 3"], *, n_frames: int
+) -> Float[Tensor, "t 3 3"]:
+    """Rotations of all frames whose relative rotations are the mean of those within windows."""
+    a, b = torch.triu_indices(frames.shape[1], frames.shape[1], 1)
+    relative = (R[:, b] @ R[:, a].mT).flatten(0, 1)
+    i, j = frames[:, a].flatten(), frames[:, b].flatten()
+    return average_rotations(i, j, relative, torch.ones(len(i), dtype=R.dtype), n_frames=n_frames).R_cam_obj
+
+
+def adjust_round(
+    cfg: Settings,
+    inputs: Inputs,
+    scene: BundleState,
+    tracks: Tracks,
+    group: Tensor,
+    frames: Int64[Tensor, "g f"],
+    scale: float,
+    rng: torch.Generator | None = None,
+    log_focal_prior: float = 0.0,
+) -> tuple[BundleState, Float[Tensor, " g"]]:
+    """One round of bundle adjustment: find frontier points, triangulate all points, adjust.
+
+    Args:
+        scene: Current poses of all groups; the points are not read.
+        tracks: Observations, with frames numbered over all groups.
+        group: Group of every point.
+        frames: Frames of every group.
+        scale: Scale of the Cauchy loss [pixels].
+        rng: Source of the random choice of frame pairs; None uses all pairs.
+        log_focal_prior: Mean of the prior on the logarithm of the focal length over the camera's.
+
+    Returns:
+        The adjusted scene, and the loss per observation of every group [pixels^2].
+    """
+    g, f = frames.shape
+    R, t, camera = scene.R.flatten(0, 1), scene.t.flatten(0, 1), inputs.capture.camera
+    a, b = torch.triu_indices(f, f, 1)
+    if rng is not None and len(a) > cfg.max_frontier_pairs:
+        chosen = torch.randperm(len(a), generator=rng)[: cfg.max_frontier_pairs]
+        a, b = a[chosen], b[chosen]
+    first = torch.arange(g)[:, None] * f
+    pairs = torch.stack([(first + a).flatten(), (first + b).flatten()], 1)
+    flat = frames.flatten()
+    frontier = frontier_points.frontier_tracks(R, t, camera, inputs.contours[flat], radius=inputs.radius, pairs=pairs)
+    all_tracks = concatenate(tracks, frontier)
+    weight = torch.cat([torch.ones(len(tracks)), torch.full((len(frontier),), cfg.frontier_weight)]).double()
+    group = torch.cat([group, frontier.frame[::2] // f])
+    sigma = cfg.centre_sigma * inputs.silhouettes.radius[frames] * focal_length(inputs.capture)
+    centre, radius = inputs.silhouettes.centre[frames], 1.5 * inputs.radius
+    problem = Problem(camera, all_tracks, group, weight, centre, sigma, cfg.depth_sigma, radius, log_focal_prior)
+    X = bundle_adjustment.triangulate(all_tracks, R, t, camera, inputs.silhouettes.radius[flat])
+    adjusted, loss = bundle_adjustment.adjust(problem, replace(scene, X=X), steps=cfg.iterations, scale=scale)
+    total = torch.zeros(g, dtype=torch.float64).index_add_(0, group[all_tracks.point], weight)
+    return adjusted, loss / total.clamp_min(1)
+
+
+def window_tracks(
+    tracks: Tracks, frames: Int64[Tensor, "g f"], max_tracks: int, rng: torch.Generator
+) -> tuple[Tracks, Int64[Tensor, " n"]]:
+    """The longest tracks of every window, with frames numbered over all windows; also the window of every point."""
+    size = frames.shape[1]
+    parts, groups = [], []
+    for number, first in enumerate(frames[:, 0].tolist()):
+        part = tracks.select((tracks.frame >= first) & (tracks.frame < first + size))
+        if part.n > max_tracks:
+            rank = torch.bincount(part.point) + torch.rand(part.n, generator=rng)
+            chosen = torch.zeros(part.n, dtype=torch.bool)
+            chosen[rank.topk(max_tracks).indices] = True
+            part = part.select(chosen[part.point])
+        parts.append(replace(part, frame=part.frame - first + number * size))
+        groups.append(torch.full((part.n,), number))
+    return concatenate(*parts), torch.cat(groups)
