@@ -58,6 +58,15 @@ def test_rotations_add_up_along_the_path() -> None:
     assert (np.diff(total) >= 0).all()
 
 
+def test_a_frame_without_texture_does_not_end_the_rotation() -> None:
+    """The hand of the first frame hides the texture; that frame counts as an average one."""
+    spheres = [sphere(yaw) for yaw in np.linspace(0, 0.6, 13)]
+    images, inside = np.stack([each[0] for each in spheres]), np.stack([each[1] for each in spheres])
+    images[0] = 90
+    total = keyframes.cumulative_rotation(images, inside)
+    assert total[-1] == pytest.approx(0.6, rel=0.25)
+
+
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
 @pytest.mark.parametrize("contrast", [40, 160])
 def test_edge_blur_is_the_width_of_an_edge_at_any_contrast(sigma: float, contrast: int) -> None:
