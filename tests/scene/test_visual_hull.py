@@ -1,5 +1,6 @@
 """The visual hull of an ellipsoid recorded from all sides approximates that ellipsoid."""
 
+import dataclasses
 import math
 
 import pytest
@@ -71,6 +72,26 @@ def test_unknown_pixels_carve_nothing() -> None:
     ticks = (torch.arange(8) + 0.5) / 8 * 2 - 1
     sphere = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).norm(dim=-1) <= 1
     torch.testing.assert_close(carved, sphere.float())
+
+
+def test_a_hand_that_never_lets_go_is_left_out_but_not_what_it_hides() -> None:
+    """A ball on the side of the ellipsoid moves with it, and hides it in part, as an unknown region."""
+    capture, trajectory = silhouettes()
+    ball, radius, masks = CENTER + torch.tensor([0.0, 0.55, 0.0]), 0.3, capture.masks.clone()
+    for i, mask in enumerate(masks):
+        T_obj_cam = trajectory.T_cam_obj[i].inverse()
+        o, d = T_obj_cam.xyz - ball, T_obj_cam.rotation @ capture.camera.directions()
+        hit = (d * o).sum(-1).square() > (d * d).sum(-1) * ((o * o).sum() - radius**2)
+        in_front = trajectory.T_cam_obj.rotation[i].matrix()[2, 1] < 0
+        mask[hit & ((mask == BACKGROUND) | in_front)] = UNKNOWN
+    cells = visual_hull.carve(dataclasses.replace(capture, masks=masks), trajectory, resolution=64) > 0.5
+    ticks = (torch.arange(64) + 0.5) / 64 * 2 - 1
+    x = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1)
+    level = ((x - CENTER) / AXES).norm(dim=-1)
+    in_ball = (x - ball).norm(dim=-1) < radius - 0.05
+    assert cells[level < 0.85].all()
+    protruding = in_ball & (level > 1.3)
+    assert cells[protruding].float().mean() < 0.1
 
 
 def test_a_few_wrong_masks_are_tolerated() -> None:

@@ -1,17 +1,27 @@
 """The visual hull on a voxel grid, and oriented points on its surface from which the Gaussians are initialised.
 
-Object frame, object radius 1. UNKNOWN pixels count as foreground, so that they carve nothing.
+Object frame, object radius 1. UNKNOWN pixels count as foreground, so that they carve nothing. What most frames show as
+unknown, such as a hand that never lets go, is left out where it protrudes from the rest.
 """
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv3d, grid_sample, normalize
+from torch.nn.functional import conv3d, grid_sample, max_pool2d, normalize
 
-from tumble.scene.capture import BACKGROUND, Capture
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.scene.trajectory import Trajectory
+
+MIN_SURE_FRACTION = 0.5
+"""Fraction of the frames that show a cell as object or as something unknown, in which it is object, below which it is
+doubtful whether the cell belongs to the object."""
+WIDE = 5
+"""Width from which an unknown region counts as something before the object [pixels]; bands along silhouettes are
+narrower."""
+HULL_MARGIN = 2.0
+"""Distance up to which doubtful cells may lie outside the convex hull of the others [cells]."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,47 @@ def carve(
             old = smallest[k].index_select(0, left)
             smallest[k, left], value = torch.minimum(old, value), torch.maximum(old, value)
         left = left[smallest[-1].index_select(0, left) > 0]
+    hidden = _wide_unknown(capture)
+    if bool(hidden.any()):
+        protrudes = _protruding(x_obj[left], _sure_fraction(capture, trajectory, x_obj[left], hidden), 2 / resolution)
+        smallest[-1, left[protrudes]] = 0
     return smallest[-1].reshape(resolution, resolution, resolution)
+
+
+def _wide_unknown(capture: Capture) -> Bool[Tensor, "t h w"]:
+    """Unknown pixels except those of narrow bands (morphological opening)."""
+    known = (capture.masks != UNKNOWN).float()[:, None]
+    eroded = max_pool2d(known, WIDE, 1, WIDE // 2) == 0
+    return max_pool2d(eroded.float(), WIDE, 1, WIDE // 2)[:, 0] > 0
+
+
+def _sure_fraction(
+    capture: Capture, trajectory: Trajectory, x_obj: Float[Tensor, "n 3"], hidden: Bool[Tensor, "t h w"]
+) -> Float[Tensor, " n"]:
+    """Fraction of the frames that show each point as object or hidden, in which it is object; 1 if there are none."""
+    size = torch.tensor([capture.camera.width, capture.camera.height], device=x_obj.device)
+    sure, doubtful = torch.zeros_like(x_obj[:, 0]), torch.zeros_like(x_obj[:, 0])
+    for frame in range(len(trajectory)):
+        uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj).floor().long()
+        inside = ((uv >= 0) & (uv < size)).all(-1)
+        column, row = torch.minimum(uv.clamp_min(0), size - 1).T
+        sure += inside & (capture.masks[frame][row, column] == OBJECT)
+        doubtful += inside & hidden[frame][row, column]
+    return torch.where(sure + doubtful > 0, sure / (sure + doubtful).clamp_min(1), 1.0)
+
+
+def _protruding(x_obj: Float[Tensor, "n 3"], sure: Float[Tensor, " n"], spacing: float) -> Bool[Tensor, " n"]:
+    """Doubtful cells outside the convex hull of the others."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    doubtful = sure < MIN_SURE_FRACTION
+    try:
+        planes = torch.from_numpy(ConvexHull(x_obj[~doubtful].cpu().numpy()).equations).to(x_obj)
+    except (QhullError, ValueError):  # too few cells, or all in a plane
+        return torch.zeros_like(doubtful)
+    outside = torch.zeros_like(doubtful)
+    outside[doubtful] = (x_obj[doubtful] @ planes[:, :3].T + planes[:, 3]).amax(1) > HULL_MARGIN * spacing
+    return outside
 
 
 def sample_surface(inside: Float[Tensor, "x y z"], n: int, rng: torch.Generator) -> OrientedPoints:
