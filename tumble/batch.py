@@ -1,0 +1,231 @@
+"""Many runs: the rows of a benchmark suite, and the captures of a batch, on this machine or on a Ray cluster."""
+
+import dataclasses
+import resource
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tumble import actions, bench, pipeline
+from tumble.bench import CaptureTask, Case, Outcome, SuiteRow, Workers
+from tumble.engine import loop, run
+from tumble.evaluation import read_with_truth
+from tumble.io import files, one_line, outputs, progress
+from tumble.preprocess import FootageOptions
+from tumble.recipes import METHODS, QUALITIES, SMOKE, Recipe
+from tumble.rendering import usable_device
+from tumble.scene import content_key
+
+MARK = "bench.json"
+"""File by which the folder of a benchmark is recognised."""
+RUNS = "runs"
+"""Folder of the runs in the folder of a benchmark."""
+LOGS = "logs"
+"""Folder of what the processes have printed."""
+RECIPES = {"smoke": SMOKE, **QUALITIES}
+"""Recipes by the name that a suite gives."""
+KILOBYTE_UNITS = 1 if sys.platform == "darwin" else 1024
+"""Unit of the operating system's figure of peak memory [bytes]."""
+
+
+@dataclass(frozen=True)
+class RowTask:
+    """A case to be measured."""
+
+    case: Case
+    data: Path | None
+    out: Path
+    device: str
+
+    @property
+    def name(self) -> str:
+        return self.case.name
+
+
+@dataclass(frozen=True)
+class RunTask:
+    """A capture or footage to be reconstructed."""
+
+    capture: Path
+    out: Path
+    recipe: Recipe
+    options: FootageOptions
+    poses: Literal["given", "estimate"]
+    device: str
+
+    @property
+    def name(self) -> str:
+        return self.out.name
+
+
+# Suites ---------------------------------------------------------------------------------------------------------------
+
+
+def make_captures(cases: Sequence[Case], out: Path, data: Path | None, workers: Workers) -> Iterable[Outcome]:
+    """Render the captures of some cases that are missing; yields each with its folder.
+
+    Raises:
+        BadFile: `out` holds something else, or an object or light is missing.
+    """
+    bench.require_inputs(cases, data)
+    _claim(out)
+    tasks = [CaptureTask(case, data, out) for case in cases]
+    distinct = list({task.name: task for task in tasks}.values())
+    return _tracked(bench.execute(bench.make_capture, distinct, workers, out / LOGS), "captures", len(distinct))
+
+
+def run_cases(
+    cases: Sequence[Case], out: Path, data: Path | None, workers: Workers, *, device: str = "cpu", again: bool = False
+) -> Iterable[SuiteRow]:
+    """Measure the cases that have no row of the current code yet; yields their rows, which are written.
+
+    Args:
+        out: Folder of the benchmark.
+        data: Folder with the objects and lights of the suite.
+        again: Also measure those that have failed.
+
+    Raises:
+        BadFile: `out` holds something else, or an object or light is missing.
+        ValueError: There is no such device, recipe or method.
+    """
+    usable_device(device)
+    bench.require_inputs(cases, data)
+    todo = [(case, bench.row_file(out, _empty_row(case, device))) for case in cases]
+    _claim(out)
+    tasks = []
+    for case, path in todo:
+        if not path.is_file() or (again and "error" in bench.read_row(path)):
+            tasks.append(RowTask(case, data, out, device))
+    progress.LOG.info("%d of %d rows are there already", len(cases) - len(tasks), len(cases))
+    for outcome in _tracked(bench.execute(measure, tasks, workers, out / LOGS), "rows", len(tasks)):
+        row, picture = outcome.result or (_empty_row(outcome.task.case, device), b"")
+        if outcome.error:
+            row["error"] = outcome.error
+        path = bench.row_file(out, row)
+        if picture:
+            files.write_atomically(path.with_suffix(".webp"), lambda partial, data=picture: partial.write_bytes(data))
+        files.write_json(path, row)
+        yield row
+
+
+def summary_line(row: SuiteRow) -> str:
+    """A row in one line: its name, and its main scores or why there are none."""
+    if "error" in row:
+        return one_line(f"{row['name']}: {row['error']}")
+    scores = row.get("regions", {}).get("shared", {})
+    found = [
+        f"{part} {scores[key]:.1f} dB" for part in ("albedo", "relit") if (key := f"{part}.psnr_fg_srgb") in scores
+    ]
+    return f"{row['name']}: {', '.join(found)}, {row.get('seconds', {}).get('run', 0):.0f} s"
+
+
+def recipe_of(case: Case) -> Recipe:
+    """The recipe of a case.
+
+    Raises:
+        ValueError: There is no such recipe or method.
+    """
+    if case.recipe not in RECIPES or case.method not in METHODS:
+        wrong, choices = (case.recipe, RECIPES) if case.recipe not in RECIPES else (case.method, METHODS)
+        raise ValueError(f"there is no {wrong!r}; choose among {', '.join(choices)}")
+    return METHODS[case.method](dataclasses.replace(RECIPES[case.recipe], seed=case.seed))
+
+
+def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
+    """Render the capture of a case if it is missing, reconstruct it, and score the result; returns row and picture."""
+    case, row = task.case, _empty_row(task.case, task.device)
+    capture = bench.make_capture(CaptureTask(case, task.data, task.out))
+    where = task.out / RUNS / bench.row_file(task.out, row).stem
+    pipeline.reconstruct(capture, where, recipe_of(case), poses=case.poses, device=usable_device(task.device))
+    seconds = sum({r["name"]: r["seconds"] for r in run.log_records(where) if r.get("event") == "done"}.values())
+    started = time.perf_counter()
+    report = actions.evaluate_run(where, capture, device=task.device)
+    known = read_with_truth(capture)
+    row["capture"] = content_key(known.capture)
+    row["seconds"] = bench.rounded({"run": seconds, "score": time.perf_counter() - started})
+    row["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILOBYTE_UNITS // 2**20
+    row["regions"] = {region: bench.rounded(scores) for region, scores in report["regions"].items()}
+    row["light"], row["poses"] = bench.rounded(report["light"]), bench.rounded(report["poses"])
+    row["albedo_scale"], row["notes"] = report["albedo_scale"], report["notes"]
+    if known.truth.light is not None:
+        row["directionality"] = round(known.truth.light.directionality(), 3)
+    return row, bench.picture_of(capture, where / run.PREDICTION, report)
+
+
+def _empty_row(case: Case, device: str) -> SuiteRow:
+    machine = bench.machine_class(usable_device(device))
+    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe_of(case)), machine=machine)
+
+
+def _claim(out: Path) -> None:
+    outputs.claim_folder(out, MARK, fix="choose another folder with -o")
+    if not (out / MARK).exists():
+        files.write_json(out / MARK, bench.current_code())
+
+
+def _tracked(outcomes: Iterable[Outcome], name: str, total: int) -> Iterable[Outcome]:
+    """The outcomes, in a task with one line in the log for each."""
+    for outcome in progress.track(outcomes, name, total):
+        progress.LOG.info("%s: %s", outcome.task.name, outcome.error or "done")
+        yield outcome
+
+
+def report_suite(name: str, out: Path) -> Path:
+    """Write the JSON document, the Markdown tables and the HTML page of a suite; returns the path of the page.
+
+    Args:
+        name: A suite, or the JSON document of an earlier report, from which the other two are written again.
+        out: Folder of the benchmark.
+
+    Raises:
+        BadFile: There is no such suite, or a row is damaged.
+    """
+    if name.endswith(".json"):
+        results = bench.read_results(Path(name))
+    else:
+        suite = bench.read_suite(name)
+        results = bench.results_of(
+            Path(name).stem, suite, bench.cases_of(suite), bench.read_rows(out), bench.current_code()
+        )
+    _claim(out)
+    stem = out / results["name"]
+    markdown, page = bench.markdown_of(results), bench.page_of(results, out)
+    files.write_json(stem.with_suffix(".json"), results)
+    for suffix, text in ((".md", markdown), (".html", page)):
+        files.write_atomically(stem.with_suffix(suffix), lambda partial, text=text: partial.write_text(text, "utf-8"))
+    return stem.with_suffix(".html")
+
+
+# Batches --------------------------------------------------------------------------------------------------------------
+
+
+def run_batch(
+    captures: Sequence[Path],
+    out: Path,
+    recipe: Recipe,
+    options: FootageOptions,
+    workers: Workers,
+    *,
+    poses: Literal["given", "estimate"] = "given",
+    device: str = "cpu",
+) -> Iterable[Outcome[Any, Path]]:
+    """Reconstruct captures or footage, each in `out/<its name>`; yields each with the path of its report.
+
+    Raises:
+        ValueError: Two of them have the same name, or there is no such device.
+    """
+    usable_device(device)
+    tasks = [RunTask(path, out / path.resolve().stem, recipe, options, poses, device) for path in captures]
+    names = [task.name for task in tasks]
+    if repeated := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"several captures have the name {min(repeated)}: rename them, or run them one by one")
+    return _tracked(bench.execute(reconstruct_one, tasks, workers, out / LOGS), "captures", len(tasks))
+
+
+def reconstruct_one(task: RunTask) -> Path:
+    """One run of a batch; returns the path of its report."""
+    how: dict[str, Any] = {"poses": task.poses, "device": task.device}
+    return actions.run_capture(task.capture, task.out, task.recipe, task.options, **how)
