@@ -77,31 +77,39 @@ def make_captures(cases: Sequence[Case], out: Path, data: Path | None, workers: 
     return _tracked(bench.execute(bench.make_capture, distinct, workers, out / LOGS), "captures", len(distinct))
 
 
-def run_cases(
-    cases: Sequence[Case], out: Path, data: Path | None, workers: Workers, *, device: str = "cpu", again: bool = False
-) -> Iterable[SuiteRow]:
-    """Measure the cases that have no row of the current code yet; yields their rows, which are written.
+def missing_rows(
+    cases: Sequence[Case], out: Path, data: Path | None, *, device: str = "cpu", again: bool = False
+) -> list[RowTask]:
+    """The cases without a row of the current code.
 
     Args:
         out: Folder of the benchmark.
         data: Folder with the objects and lights of the suite.
-        again: Also measure those that have failed.
+        again: Also those whose row says that they failed.
 
     Raises:
-        BadFile: `out` holds something else, or an object or light is missing.
+        BadFile: An object or light is missing, or a row is damaged.
         ValueError: There is no such device, recipe or method.
     """
-    usable_device(device)
     bench.require_inputs(cases, data)
-    todo = [(case, bench.row_file(out, _empty_row(case, device))) for case in cases]
-    _claim(out)
     tasks = []
-    for case, path in todo:
+    for case in cases:
+        path = bench.row_file(out, _empty_row(case, device))
         if not path.is_file() or (again and "error" in bench.read_row(path)):
             tasks.append(RowTask(case, data, out, device))
     progress.LOG.info("%d of %d rows are there already", len(cases) - len(tasks), len(cases))
+    return tasks
+
+
+def run_rows(tasks: Sequence[RowTask], out: Path, workers: Workers) -> Iterable[SuiteRow]:
+    """Measure rows and write them; yields each.
+
+    Raises:
+        BadFile: `out` holds something else.
+    """
+    _claim(out)
     for outcome in _tracked(bench.execute(measure, tasks, workers, out / LOGS), "rows", len(tasks)):
-        row, picture = outcome.result or (_empty_row(outcome.task.case, device), b"")
+        row, picture = outcome.result or (_empty_row(outcome.task.case, outcome.task.device), b"")
         if outcome.error:
             row["error"] = outcome.error
         path = bench.row_file(out, row)

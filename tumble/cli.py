@@ -338,7 +338,8 @@ def bench(
             failed += bool(outcome.error)
             print(outcome.result or f"{outcome.task.name}: {_line(outcome.error)}", flush=True)
     if action == "run":
-        for row in batch.run_cases(cases, out, data, workers, device=device, again=again):
+        tasks = batch.missing_rows(cases, out, data, device=device, again=again)
+        for row in batch.run_rows(tasks, out, workers):
             failed += "error" in row
             print(batch.summary_line(row), flush=True)
     if failed:

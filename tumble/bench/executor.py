@@ -20,7 +20,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 RETRIES = 1
 """How often a task is started again whose process was killed or whose machine was lost."""
 CORES_PER_TASK = 2
-"""Cores of this machine for each task that runs at the same time, by default: a task computes on several threads."""
+"""Cores for each task, which computes on several threads: on a cluster, and by default on this machine."""
 
 
 @runtime_checkable
@@ -164,7 +164,7 @@ def _on_ray(function: Callable[[T], R], tasks: Sequence[T], workers: Workers) ->
     try:
         # A process serves one task, so that its peak memory is its own.
         remote = ray.remote(
-            num_cpus=CORES_PER_TASK if workers.jobs == 0 else (os.cpu_count() or 1) / workers.jobs,
+            num_cpus=min(CORES_PER_TASK, os.cpu_count() or 1),
             num_gpus=int(workers.gpu),
             max_retries=RETRIES,
             max_calls=1,
