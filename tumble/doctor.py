@@ -123,7 +123,11 @@ def _atlas() -> DoctorFinding:
 
 
 def _extras() -> Iterator[DoctorFinding]:
-    for extra, module, package in (("view", "viser", "viser"), ("cuda", "warp", "warp-lang")):
+    for extra, module, package in (
+        ("view", "viser", "viser"),
+        ("cuda", "warp", "warp-lang"),
+        ("cluster", "ray", "ray"),
+    ):
         if importlib.util.find_spec(module) is None:
             yield DoctorFinding(f"extra {extra}", "not installed", f"optional: pip install 'tumble[{extra}]'")
         else:
