@@ -294,13 +294,13 @@ def evaluate(
 
 def bench(
     action: Positional[Literal["list", "make", "run", "report"]],
-    suite: Positional[str] = "",
+    suite: Annotated[Positional[str], arg(metavar="[SUITE]", help_behavior_hint="")] = "",
     /,
     out: Folder = Path("runs/bench"),
     data: OptionalData = None,
-    method: tuple[str, ...] = (),
-    only: tuple[str, ...] = (),
-    seeds: tuple[int, ...] = (),
+    method: Annotated[tuple[str, ...], arg(metavar="NAME...", help_behavior_hint="")] = (),
+    only: Annotated[tuple[str, ...], arg(metavar="WORD...", help_behavior_hint="")] = (),
+    seeds: Annotated[tuple[int, ...], arg(metavar="N...", help_behavior_hint="")] = (),
     again: bool = False,
     jobs: Jobs = 0,
     address: Address = "",
