@@ -72,9 +72,9 @@ def make_captures(cases: Sequence[Case], out: Path, data: Path | None, workers: 
     """
     bench.require_inputs(cases, data)
     _claim(out)
-    tasks = [CaptureTask(case, data, out) for case in cases]
+    tasks = [CaptureTask(case, data and data.resolve(), out.resolve()) for case in cases]
     distinct = list({task.name: task for task in tasks}.values())
-    return _tracked(bench.execute(bench.make_capture, distinct, workers, out / LOGS), "captures", len(distinct))
+    return progress.track(bench.execute(bench.make_capture, distinct, workers, out / LOGS), "captures", len(distinct))
 
 
 def missing_rows(
@@ -96,7 +96,8 @@ def missing_rows(
     for case in cases:
         path = bench.row_file(out, _empty_row(case, device))
         if not path.is_file() or (again and "error" in bench.read_row(path)):
-            tasks.append(RowTask(case, data, out, device))
+            # Machines of a cluster need whole paths.
+            tasks.append(RowTask(case, data and data.resolve(), out.resolve(), device))
     progress.LOG.info("%d of %d rows are there already", len(cases) - len(tasks), len(cases))
     return tasks
 
@@ -108,7 +109,7 @@ def run_rows(tasks: Sequence[RowTask], out: Path, workers: Workers) -> Iterable[
         BadFile: `out` holds something else.
     """
     _claim(out)
-    for outcome in _tracked(bench.execute(measure, tasks, workers, out / LOGS), "rows", len(tasks)):
+    for outcome in progress.track(bench.execute(measure, tasks, workers, out / LOGS), "rows", len(tasks)):
         row, picture = outcome.result or (_empty_row(outcome.task.case, outcome.task.device), b"")
         if outcome.error:
             row["error"] = outcome.error
@@ -174,18 +175,11 @@ def _claim(out: Path) -> None:
         files.write_json(out / MARK, bench.current_code())
 
 
-def _tracked(outcomes: Iterable[Outcome], name: str, total: int) -> Iterable[Outcome]:
-    """The outcomes, in a task with one line in the log for each."""
-    for outcome in progress.track(outcomes, name, total):
-        progress.LOG.info("%s: %s", outcome.task.name, outcome.error or "done")
-        yield outcome
-
-
 def report_suite(name: str, out: Path) -> Path:
-    """Write the JSON document, the Markdown tables and the HTML page of a suite; returns the path of the page.
+    """Write the JSON document, the Markdown tables, the plots and the page of a suite; returns the path of the page.
 
     Args:
-        name: A suite, or the JSON document of an earlier report, from which the other two are written again.
+        name: A suite, or the JSON document of an earlier report, from which the others are written again.
         out: Folder of the benchmark.
 
     Raises:
@@ -199,12 +193,13 @@ def report_suite(name: str, out: Path) -> Path:
             Path(name).stem, suite, bench.cases_of(suite), bench.read_rows(out), bench.current_code()
         )
     _claim(out)
-    stem = out / results["name"]
-    markdown, page = bench.markdown_of(results), bench.page_of(results, out)
-    files.write_json(stem.with_suffix(".json"), results)
-    for suffix, text in ((".md", markdown), (".html", page)):
-        files.write_atomically(stem.with_suffix(suffix), lambda partial, text=text: partial.write_text(text, "utf-8"))
-    return stem.with_suffix(".html")
+    texts = {".md": bench.markdown_of(results), ".html": bench.page_of(results, out)}
+    texts = {f"{results['name']}{suffix}": text for suffix, text in texts.items()}
+    texts |= {plot.file: plot.svg for plot in bench.line_plots(results)}
+    files.write_json(out / f"{results['name']}.json", results)
+    for file, text in texts.items():
+        files.write_atomically(out / file, lambda partial, text=text: partial.write_text(text, "utf-8"))
+    return out / f"{results['name']}.html"
 
 
 # Batches --------------------------------------------------------------------------------------------------------------
@@ -226,11 +221,14 @@ def run_batch(
         ValueError: Two of them have the same name, or there is no such device.
     """
     usable_device(device)
-    tasks = [RunTask(path, out / path.resolve().stem, recipe, options, poses, device) for path in captures]
+    tasks = [
+        RunTask(path.resolve(), out.resolve() / path.resolve().stem, recipe, options, poses, device)
+        for path in captures
+    ]
     names = [task.name for task in tasks]
     if repeated := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"several captures have the name {min(repeated)}: rename them, or run them one by one")
-    return _tracked(bench.execute(reconstruct_one, tasks, workers, out / LOGS), "captures", len(tasks))
+    return progress.track(bench.execute(reconstruct_one, tasks, workers, out / LOGS), "captures", len(tasks))
 
 
 def reconstruct_one(task: RunTask) -> Path:

@@ -1,12 +1,13 @@
 """Tables follow from the JSON document alone; means, spreads and tests have values known from elsewhere."""
 
 import math
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tumble.bench import page, plot, tables
+from tumble.bench import markdown, page, plot, tables
 from tumble.bench.code import Code
 from tumble.bench.rows import SuiteResults, SuiteRow, read_results
 from tumble.io import files
@@ -45,7 +46,7 @@ OBJECTS = [f"o{i}" for i in range(10)]
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
 def test_a_committed_report_reproduces_its_tables(path: Path) -> None:
-    assert path.with_suffix(".md").read_text("utf-8") == tables.markdown_of(read_results(path))
+    assert path.with_suffix(".md").read_text("utf-8") == markdown.markdown_of(read_results(path))
 
 
 def test_a_suite_is_committed() -> None:
@@ -79,6 +80,9 @@ def test_means_are_over_objects_and_the_spread_is_over_seeds() -> None:
     assert table.headings[:2] == ("objects", "albedo object [dB]")
     # 25 and 28 are the means of the seeds.
     assert table.lines == [("2", f"26.5 ± {math.sqrt(4.5):.1f}")]
+    objects = tables.object_table(results(rows))
+    assert objects.lines == [("a", "21.0 ± 1.4"), ("b", "32.0 ± 2.8")]
+    assert tables.object_table(results(rows[:1])).lines == []
 
 
 def test_stale_and_failed_rows_are_shown_and_are_in_no_mean() -> None:
@@ -86,7 +90,7 @@ def test_stale_and_failed_rows_are_shown_and_are_in_no_mean() -> None:
     rows = [row("a", "handheld", 0, 30.0), row("a", "dome", 0, 20.0, code=other)]
     failed = row("b", "dome", 0, 0.0, error="BadFile: too | few")
     del failed["regions"]
-    text = tables.markdown_of(results([*rows, failed]))
+    text = markdown.markdown_of(results([*rows, failed]))
     assert tables.mean_table(results(rows)).lines == [("1", "30.0")]
     assert tables.comparisons(results(rows)) == []
     assert "1 failed, 1 stale" in text
@@ -112,12 +116,14 @@ def test_plots_have_a_line_for_each_setting_over_the_varied_values() -> None:
         for views in (100, 25, 400):
             one = row("a", setting, 0, 20.0 + views / 100)
             rows.append({**one, "labels": {**one["labels"], "views": views}})
-    ((title, drawn),) = plot.line_plots(results(rows, plot="views"))
-    assert title == "albedo object [dB] by views"
+    (found,) = plot.line_plots(results(rows, plot="views"))
+    assert (found.title, found.file) == ("albedo object [dB] by views", "t-albedo-psnr_fg_srgb.svg")
+    drawn = ElementTree.tostring(ElementTree.fromstring(found.svg)).decode()
     places = [drawn.index(f">{views}<") for views in (25, 100, 400)]
     assert places == sorted(places)
-    assert drawn.count("<path") == 2
-    assert drawn.count("<circle") == 6
+    assert (drawn.count(":path"), drawn.count(":circle")) == (2, 6)
+    assert all(drawn.count(f">{name}<") == 1 for name in ("dome", "handheld"))
+    assert f"]({found.file})" in markdown.markdown_of(results(rows, plot="views"))
 
 
 @pytest.mark.parametrize("change", [{"name": "../../x"}, {"format": 0}, {"rows": 1}])

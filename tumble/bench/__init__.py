@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from tumble.bench.captures import CaptureTask, data_folder, make_capture, require_inputs
     from tumble.bench.code import current_code, machine_class
     from tumble.bench.executor import Outcome, Workers, execute
+    from tumble.bench.markdown import markdown_of
     from tumble.bench.page import page_of
     from tumble.bench.pictures import picture_of
+    from tumble.bench.plot import line_plots
     from tumble.bench.rows import (
         SuiteRow,
         read_results,
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
         row_of,
     )
     from tumble.bench.suite import Case, cases_of, read_suite, suite_names
-    from tumble.bench.tables import markdown_of
 
 __all__ = [
     "Case",
@@ -37,6 +38,7 @@ __all__ = [
     "current_code",
     "data_folder",
     "execute",
+    "line_plots",
     "machine_class",
     "make_capture",
     "markdown_of",
@@ -72,8 +74,10 @@ __getattr__ = lazy_getattr(
             "Workers",
             "execute",
         ),
+        "markdown": ("markdown_of",),
         "page": ("page_of",),
         "pictures": ("picture_of",),
+        "plot": ("line_plots",),
         "rows": (
             "SuiteRow",
             "read_results",
@@ -90,6 +94,5 @@ __getattr__ = lazy_getattr(
             "read_suite",
             "suite_names",
         ),
-        "tables": ("markdown_of",),
     },
 )

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from tumble import __version__
 from tumble.bench import tables
+from tumble.bench.markdown import facts
 from tumble.bench.plot import line_plots
 from tumble.bench.rows import ROWS, SuiteResults, SuiteRow
 from tumble.bench.tables import METRICS, Table
@@ -50,7 +51,7 @@ def page_of(results: SuiteResults, out: Path) -> str:
     script = Markup((resources.files("tumble.bench") / "assets" / "sort.js").read_text("utf-8"))
     return TEMPLATES.get_template("suite.html").render(
         results=results,
-        facts=tables.facts(results),
+        facts=facts(results),
         tables=[_with_commands(table, results) for table in tables.tables_of(results)],
         pictures=_pictures(results, out / ROWS),
         plots=line_plots(results),

@@ -2,8 +2,9 @@
 
 import statistics
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from tumble.bench import tables
 from tumble.bench.rows import SuiteResults
@@ -17,8 +18,18 @@ WIDTH, HEIGHT, MARGIN = 420, 240, 44
 Line = list[tuple[int, float]]
 
 
-def line_plots(results: SuiteResults) -> list[tuple[str, Markup]]:
-    """Title and plot of each score: means over objects and seeds, one line per setting, material and so on."""
+@dataclass(frozen=True)
+class LinePlot:
+    """A plot of one score."""
+
+    title: str
+    file: str
+    """Name of its file beside the tables."""
+    svg: Markup
+
+
+def line_plots(results: SuiteResults) -> list[LinePlot]:
+    """A plot of each score: means over objects and seeds, one line per setting, material and so on."""
     along = results["suite"]["plot"]
     rows = [row for row in tables.usable_rows(results) if along in row["labels"]]
     if not along or not rows:
@@ -36,7 +47,8 @@ def line_plots(results: SuiteResults) -> list[tuple[str, Markup]]:
                     name = ", ".join(map(str, group)) or "all"
                     lines.setdefault(name, []).append((values.index(value), statistics.fmean(found)))
         if lines:
-            plots.append((f"{tables.METRICS[key][0]} by {along}", _plot(lines, [str(value) for value in values])))
+            title, file = f"{tables.METRICS[key][0]} by {along}", f"{results['name']}-{key.replace('.', '-')}.svg"
+            plots.append(LinePlot(title, file, _plot(lines, [str(value) for value in values])))
     return plots
 
 
@@ -60,6 +72,8 @@ def _plot(lines: dict[str, Line], names: Sequence[str]) -> Markup:
         steps = " L".join(f"{x(i):.1f} {y(score):.1f}" for i, score in line)
         dots = "".join(f'<circle cx="{x(i):.1f}" cy="{y(s):.1f}" r="3" fill="{colour}"/>' for i, s in line)
         parts.append(Markup(f'<path d="M{steps}" fill="none" stroke="{colour}" stroke-width="2"/>{dots}'))
-        end = text(x(line[-1][0]) + 8, y(line[-1][1]) + 4, "start", escape(name))
-        parts.append(end.replace("<text", f'<text style="fill:{colour}"', 1))
-    return Markup('<svg viewBox="0 0 {} {}" role="img">{}</svg>').format(WIDTH, HEIGHT, Markup("").join(parts))
+        label = Markup('<text x="{:.0f}" y="{:.0f}" style="fill:{}">{}</text>')
+        parts.append(label.format(x(line[-1][0]) + 8, y(line[-1][1]) + 4, colour, name))
+    return Markup(
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {} {}" font-family="sans-serif" font-size="11">{}</svg>'
+    ).format(WIDTH, HEIGHT, Markup("").join(parts))

@@ -69,11 +69,8 @@ class PairedDifference:
 
 def tables_of(results: SuiteResults) -> list[Table]:
     """All tables of a report, the comparisons first."""
-    return [
-        table
-        for table in (comparison_table(results), mean_table(results), row_table(results), problem_table(results))
-        if table.lines
-    ]
+    makers = (comparison_table, mean_table, object_table, row_table, problem_table)
+    return [table for make in makers if (table := make(results)).lines]
 
 
 def value_of(row: SuiteRow, key: str) -> float | None:
@@ -199,18 +196,26 @@ def comparison_table(results: SuiteResults) -> Table:
 def mean_table(results: SuiteResults) -> Table:
     """One line per setting, material and so on: means over objects, with the spread over seeds."""
     rows = usable_rows(results)
-    labels = varied_labels(rows, of_object(results))
-    keys = _keys(rows)
+    labels, keys = varied_labels(rows, of_object(results)), _keys(rows)
     lines = []
     for group, members in grouped(rows, labels).items():
         n = len({row["labels"]["object"] for row in members})
-        cells = [_mean_and_spread(members, key) for key in keys]
-        lines.append((*map(str, group), str(n), *cells))
+        lines.append((*map(str, group), str(n), *(_mean_and_spread(members, key) for key in keys)))
     about = (
         "Means over objects; after ±, their standard deviation over seeds. Object: over the object's pixels; "
         "picture: over the whole image. Unscaled albedo is compared without the albedo scale, in linear values."
     )
     return Table("Means", about, (*labels, "objects", *(METRICS[key][0] for key in keys)), lines)
+
+
+def object_table(results: SuiteResults) -> Table:
+    """One line per object, setting, material and so on, with the spread over seeds; empty if there is one seed."""
+    rows = usable_rows(results)
+    labels, keys = ["object", *varied_labels(rows, ("object", "seed"))], _keys(rows)
+    groups = grouped(rows, labels).items() if len(grouped(rows, ("seed",))) > 1 else ()
+    lines = [(*map(str, group), *(_mean_and_spread(members, key) for key in keys)) for group, members in groups]
+    about = "Means over seeds; after ±, the standard deviation over seeds."
+    return Table("Objects", about, (*labels, *(METRICS[key][0] for key in keys)), lines)
 
 
 def _keys(rows: Sequence[SuiteRow]) -> list[str]:
@@ -265,41 +270,3 @@ def problem_table(results: SuiteResults) -> Table:
 
 def _text(reason: str) -> str:
     return reason.replace("|", "/")
-
-
-# Markdown -------------------------------------------------------------------------------------------------------------
-
-
-def markdown_of(results: SuiteResults) -> str:
-    """The report as Markdown."""
-    name, suite = results["name"], results["suite"]
-    parts = [
-        f"# {suite['title']}",
-        facts(results),
-        f"`tumble bench run {name}` measures all rows, `tumble bench run {name}"
-        f" --only NAME` one of them, and `tumble bench report {name}` writes this file.",
-    ]
-    for table in tables_of(results):
-        rule = "|" + "---|" * len(table.headings)
-        lines = ["| " + " | ".join(line) + " |" for line in (table.headings, *table.lines)]
-        parts += [f"## {table.title}", table.about, "\n".join([lines[0], rule, *lines[1:]])]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def facts(results: SuiteResults) -> str:
-    """What the rows were measured with, in sentences."""
-    rows, code, suite = results["rows"], results["code"], results["suite"]
-    stale = sum(is_stale(row, results) for row in rows)
-    failed = sum("error" in row for row in rows)
-    machines = "; ".join(sorted({row["machine"] for row in rows})) or NOTHING
-    sentences = [
-        f"{len(rows)} of {len(results['cases'])} rows: {failed} failed, {stale} stale (measured with other code).",
-        f"Code: version {code['version']}, commit {code['commit'] or 'unknown'}, sources {code['fingerprint']}.",
-        f"Machine: {machines}.",
-    ]
-    if suite["half"] == "tune":
-        sentences.append("Objects of this suite were used to choose constants of the method.")
-    if suite["half"] == "report":
-        frozen = f"were frozen at commit {suite['frozen']}" if suite["frozen"] else "are not frozen yet"
-        sentences.append(f"No constant of the method was chosen on these objects; the constants {frozen}.")
-    return " ".join(sentences)
