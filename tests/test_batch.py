@@ -100,6 +100,15 @@ def test_rows_of_other_code_are_stale_in_the_report(
     assert markdown.read_text("utf-8") == before
 
 
+def test_a_report_can_be_of_a_selection_of_rows(
+    measured: Path, suite: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "bench", "report", suite, "-o", str(measured), "--only", "given", "--seeds", "0", "1") == 0
+    text = (measured / "pot.md").read_text("utf-8")
+    assert "1 of 2 rows: 0 failed" in text
+    assert "| pot-room-handheld-original-given-tumble-seed1 | not measured |" in text
+
+
 def test_a_missing_data_folder_is_named_with_the_fix_before_anything_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

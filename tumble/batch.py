@@ -27,8 +27,8 @@ LOGS = "logs"
 """Folder of what the processes have printed."""
 RECIPES = {"smoke": SMOKE, **QUALITIES}
 """Recipes by the name that a suite gives."""
-KILOBYTE_UNITS = 1 if sys.platform == "darwin" else 1024
-"""Unit of the operating system's figure of peak memory [bytes]."""
+MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024
+"""Unit in which the operating system counts peak memory [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,8 @@ def run_rows(tasks: Sequence[RowTask], out: Path, workers: Workers) -> Iterable[
         if outcome.error:
             row["error"] = outcome.error
         path = bench.row_file(out, row)
+        if outcome.error and path.is_file() and "error" not in bench.read_row(path):
+            continue  # another command has measured it meanwhile
         if picture:
             files.write_atomically(path.with_suffix(".webp"), lambda partial, data=picture: partial.write_bytes(data))
         files.write_json(path, row)
@@ -155,7 +157,7 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     known = read_with_truth(capture)
     row["capture"] = content_key(known.capture)
     row["seconds"] = bench.rounded({"run": seconds, "score": time.perf_counter() - started})
-    row["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILOBYTE_UNITS // 2**20
+    row["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT // 2**20
     row["regions"] = {region: bench.rounded(scores) for region, scores in report["regions"].items()}
     row["light"], row["poses"] = bench.rounded(report["light"]), bench.rounded(report["poses"])
     row["albedo_scale"], row["notes"] = report["albedo_scale"], report["notes"]
@@ -175,12 +177,13 @@ def _claim(out: Path) -> None:
         files.write_json(out / MARK, bench.current_code())
 
 
-def report_suite(name: str, out: Path) -> Path:
+def report_suite(name: str, out: Path, **selection: Any) -> Path:
     """Write the JSON document, the Markdown tables, the plots and the page of a suite; returns the path of the page.
 
     Args:
         name: A suite, or the JSON document of an earlier report, from which the others are written again.
         out: Folder of the benchmark.
+        selection: See `bench.cases_of`.
 
     Raises:
         BadFile: There is no such suite, or a row is damaged.
@@ -189,9 +192,8 @@ def report_suite(name: str, out: Path) -> Path:
         results = bench.read_results(Path(name))
     else:
         suite = bench.read_suite(name)
-        results = bench.results_of(
-            Path(name).stem, suite, bench.cases_of(suite), bench.read_rows(out), bench.current_code()
-        )
+        cases, rows = bench.cases_of(suite, **selection), bench.read_rows(out)
+        results = bench.results_of(Path(name).stem, suite, cases, rows, bench.current_code())
     _claim(out)
     texts = {".md": bench.markdown_of(results), ".html": bench.page_of(results, out)}
     texts = {f"{results['name']}{suffix}": text for suffix, text in texts.items()}

@@ -182,7 +182,7 @@ def batch(
     from tumble.bench import Workers
     from tumble.recipes import QUALITIES
 
-    workers = Workers(jobs, address, device != "cpu")
+    workers = Workers(jobs, address, gpu=device == "cuda")
     recipe = replace(QUALITIES[quality], seed=seed)
     failed = 0
     for outcome in run_batch(captures, out, recipe, options, workers, poses=poses, device=device):
@@ -325,11 +325,12 @@ def bench(
         for name in bench.suite_names():
             print(f"{name:17} {len(bench.cases_of(bench.read_suite(name))):4} rows  {bench.read_suite(name).title}")
         return
+    selection = {"seeds": seeds, "methods": method, "only": only}
     if action == "report":
-        print(batch.report_suite(suite, out))
+        print(batch.report_suite(suite, out, **selection))
         return
-    cases = bench.cases_of(bench.read_suite(suite), seeds=seeds, methods=method, only=only)
-    workers, data = bench.Workers(jobs, address, device != "cpu"), bench.data_folder(data)
+    cases = bench.cases_of(bench.read_suite(suite), **selection)
+    workers, data = bench.Workers(jobs, address, gpu=device == "cuda"), bench.data_folder(data)
     failed = 0
     if action == "list":
         print("\n".join(case.name for case in cases))

@@ -78,6 +78,7 @@ def test_the_directionality_in_a_suite_is_that_of_the_light(shared_data: Path) -
         (HEAD + OBJECT + '[[rows]]\nsetting = "dome"', "Expected `array`, got `str`"),
         (HEAD + '[[object]]\nenv = "room"\n[[rows]]\nviews = [8]', "missing required field `model`"),
         ("colour = 1\n" + HEAD + OBJECT + "[[rows]]\nviews = [8]", "has an unknown key 'colour'"),
+        (HEAD + OBJECT + OBJECT + 'up = "z"\n[[rows]]\nviews = [8]', "several rows with the name pot-room-handheld"),
         ("title = ", "is not a suite"),
     ],
 )

@@ -105,7 +105,7 @@ def test_the_page_escapes_what_rows_say_and_names_the_command_of_each(tmp_path: 
     html = page.page_of(results(rows, title=HOSTILE, plot="object"), tmp_path)
     assert html.count("<script>") == 1
     assert "<img src=x" not in html
-    assert "tumble bench run t --only a-dome-0" in html
+    assert "tumble bench run t --method tumble --seeds 0 --only a-dome-0" in html
     assert "src=http" not in html
     assert "@import" not in html
 

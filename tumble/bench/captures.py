@@ -93,7 +93,7 @@ def make_capture(task: CaptureTask) -> Path:
         ChildProcessError: The capture could not be rendered.
     """
     folder = task.out / CAPTURES / f"{task.name}-{_key(task)[:10]}"
-    with _exclusive(folder.with_suffix(".lock")):
+    with _exclusive(folder.parent / f"{folder.name}.lock"):
         if not (folder / "transforms.json").is_file():
             rendering = _Rendering(task, folder)
             (outcome,) = in_processes(_render, [rendering], 1, task.out / "logs")

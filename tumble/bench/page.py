@@ -67,7 +67,11 @@ def _with_commands(table: Table, results: SuiteResults) -> Table:
     rows = [row for row in results["rows"] if "error" not in row]
     if table.headings[-1] != "code":
         return table
-    commands = [f"tumble bench run {results['name']} --only {row['name']}" for row in rows]
+    commands = [
+        f"tumble bench run {results['name']} --method {row['labels']['method']} --seeds {row['labels']['seed']} "
+        f"--only {row['name']}"
+        for row in rows
+    ]
     # The last column says whether a row is stale, by which the template chooses its colour.
     lines = [(*line[:-1], command, line[-1]) for line, command in zip(table.lines, commands, strict=True)]
     return dataclasses.replace(table, headings=(*table.headings[:-1], "command", "code"), lines=lines)

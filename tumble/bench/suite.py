@@ -118,7 +118,9 @@ def read_suite(name: str) -> Suite:
         if unknown := document.keys() - {part.name for part in dataclasses.fields(Suite)}:
             raise ValueError(f"has an unknown key {min(unknown)!r}")
         suite = msgspec.convert(document, Suite)
-        cases_of(suite)
+        names = [case.name for case in cases_of(suite)]
+        if repeated := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"has several rows with the name {min(repeated)}")
     except (ValueError, TypeError) as error:
         raise BadFile(path, f"is not a suite: {error}", FIX) from None
     return suite
