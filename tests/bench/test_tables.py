@@ -126,7 +126,18 @@ def test_plots_have_a_line_for_each_setting_over_the_varied_values() -> None:
     assert f"]({found.file})" in markdown.markdown_of(results(rows, plot="views"))
 
 
-@pytest.mark.parametrize("change", [{"name": "../../x"}, {"format": 0}, {"rows": 1}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "../../x"},
+        {"format": 0},
+        {"rows": 1},
+        {"suite": {}},
+        {"rows": [{**row("a", "dome", 0, 1.0), "labels": {"object": "a"}}]},
+        {"rows": [{**row("a", "dome", 0, 1.0), "labels": {"object": ["a"]}}]},
+        {"rows": [{**row("a", "dome", 0, 1.0), "poses": {"poses.rotation_median_degrees": "<b>"}}]},
+    ],
+)
 def test_a_json_file_that_is_no_report_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
     files.write_json(tmp_path / "r.json", {**results([]), **change})
     with pytest.raises(BadFile, match=r"r\.json.*give the JSON file that tumble bench report has written"):

@@ -80,7 +80,7 @@ def _with_commands(table: Table, results: SuiteResults) -> Table:
 def _pictures(results: SuiteResults, folder: Path) -> dict[str, list[Shot]]:
     """Pictures of the first seed, by what else distinguishes the rows."""
     rows = tables.usable_rows(results)
-    first = min((row["labels"]["seed"] for row in rows), default=0)
+    first = next((row["labels"]["seed"] for row in rows), None)
     rows = [row for row in rows if row["labels"]["seed"] == first]
     titles = [name for name in ("object", *tables.varied_labels(rows, ("object",))) if name not in SIDE_BY_SIDE]
     captions = [name for name in tables.varied_labels(rows) if name in SIDE_BY_SIDE] or ["setting"]

@@ -35,7 +35,8 @@ def line_plots(results: SuiteResults) -> list[LinePlot]:
     if not along or not rows:
         return []
     values = list(dict.fromkeys(row["labels"][along] for row in rows))
-    values = sorted(values) if all(isinstance(value, int | float) for value in values) else values
+    numbers = [value for value in values if isinstance(value, int | float)]
+    values = sorted(numbers) if len(numbers) == len(values) else values
     labels = tables.varied_labels(rows, (*tables.of_object(results), along))
     plots = []
     for key in PLOTTED:

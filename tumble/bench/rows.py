@@ -6,7 +6,7 @@ The picture of a row lies beside it, with the same name.
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
@@ -20,6 +20,8 @@ DIGITS = 4
 """Decimals of the scores in a row."""
 WRONG_ROW = "remove it; tumble bench run measures it again"
 """Fix for a damaged row."""
+LABELS = ("object", "light", "setting", "material", "poses", "method", "seed")
+"""Labels of every row."""
 FORMAT = 1
 """Version of the layout of a report's JSON document."""
 
@@ -30,7 +32,7 @@ class SuiteRow(TypedDict):
     name: str
     key: str
     """Key of the case."""
-    labels: dict[str, Any]
+    labels: dict[str, str | float | int | None]
     """What distinguishes the case from others, by heading."""
     case: dict[str, Any]
     """The whole case, with all options of its capture."""
@@ -45,16 +47,34 @@ class SuiteRow(TypedDict):
     """Hash of the frames, masks, camera and poses that were reconstructed."""
     directionality: NotRequired[float]
     """Length of the mean direction of the capture's light, weighted by luminance: 0 uniform, 1 one small lamp."""
-    seconds: NotRequired[dict[str, float]]
+    seconds: NotRequired[dict[str, float | None]]
     """Duration of the run (the sum of its stages) and of its evaluation [s]."""
     peak_memory_MiB: NotRequired[int]
     """Maximum memory of the process of the run and its evaluation [MiB]."""
-    regions: NotRequired[dict[str, dict[str, float]]]
+    regions: NotRequired[dict[str, dict[str, float | None]]]
     """Scores by region of evaluation views and key (docs/metrics.md)."""
     light: NotRequired[dict[str, float | None]]
-    poses: NotRequired[dict[str, Any]]
+    poses: NotRequired[dict[str, float | None]]
     albedo_scale: NotRequired[list[float] | None]
     notes: NotRequired[list[str]]
+
+
+class ComparedSets(TypedDict):
+    """A comparison of a suite; see `suite.Comparison`."""
+
+    title: str
+    ahead: dict[str, str | float | int | None]
+    behind: dict[str, str | float | int | None]
+
+
+class SuiteFacts(TypedDict):
+    """What a report says about its suite; see `suite.Suite`."""
+
+    title: str
+    half: str
+    frozen: str
+    plot: str
+    compare: list[ComparedSets]
 
 
 class SuiteResults(TypedDict):
@@ -62,8 +82,7 @@ class SuiteResults(TypedDict):
 
     format: int
     name: str
-    suite: dict[str, Any]
-    """Title, half, commit of the freeze, comparisons, and label of the plot."""
+    suite: SuiteFacts
     cases: list[str]
     """Names of all cases of the suite."""
     code: Code
@@ -112,12 +131,11 @@ def results_of(name: str, suite: Suite, cases: Sequence[Case], rows: Sequence[Su
         before = latest.get(row["key"])
         if before is None or not _is_current(before, code) or _is_current(row, code):
             latest[row["key"]] = row
-    about = dataclasses.asdict(suite)
-    kept = ("title", "half", "frozen", "compare", "plot")
+    about: Any = dataclasses.asdict(suite)
     return {
         "format": FORMAT,
         "name": name,
-        "suite": {key: about[key] for key in kept},
+        "suite": {key: about[key] for key in SuiteFacts.__annotations__},  # type: ignore
         "cases": [case.name for case in cases],
         "code": code,
         # The labels depend on what else is in the suite; a row may have been measured for another one.
@@ -137,6 +155,9 @@ def read_results(path: Path) -> SuiteResults:
         raise BadFile(path, f"is of a suite with the name {results['name']!r}, which is no word", fix)
     if results["format"] != FORMAT:
         raise BadFile(path, f"has format {results['format']}; this version reads {FORMAT}", fix)
+    for row in results["rows"]:
+        if missing := [name for name in LABELS if name not in row["labels"]]:
+            raise BadFile(path, f"has a row without the label {missing[0]!r}", fix)
     return results
 
 
@@ -149,6 +170,7 @@ def is_stale(row: SuiteRow, results: SuiteResults) -> bool:
     return not _is_current(row, results["code"])
 
 
-def rounded(scores: dict[str, Any]) -> dict[str, Any]:
-    """Scores with few decimals."""
-    return {key: round(value, DIGITS) if isinstance(value, float) else value for key, value in scores.items()}
+def rounded(scores: Mapping[str, Any]) -> dict[str, float | None]:
+    """Scores with few decimals; what is no number is left out."""
+    kept = {key: value for key, value in scores.items() if value is None or isinstance(value, int | float)}
+    return {key: round(value, DIGITS) if isinstance(value, float) else value for key, value in kept.items()}

@@ -144,7 +144,7 @@ def _difference(
     for a, b in pairs:
         values = value_of(a, key), value_of(b, key)
         if values[0] is not None and values[1] is not None:
-            by_object.setdefault(a["labels"]["object"], []).append((values[0], values[1]))
+            by_object.setdefault(str(a["labels"]["object"]), []).append((values[0], values[1]))
     if not by_object:
         return None
     means = {name: [statistics.fmean(side) for side in zip(*both, strict=True)] for name, both in by_object.items()}
