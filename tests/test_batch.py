@@ -134,8 +134,13 @@ def test_a_batch_reconstructs_each_capture_and_reports_the_one_that_fails(measur
 
 
 def test_captures_of_a_batch_need_different_names(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="several captures have the name mug"):
-        batch.run_batch([Path("a/mug.mp4"), Path("b/mug")], tmp_path, SMOKE, FootageOptions(), batch.Workers())
+    (tmp_path / "mug.mp4").touch()
+    (tmp_path / "mug").mkdir()
+    (tmp_path / "mug.v2").mkdir()
+    captures = [tmp_path / "mug.mp4", tmp_path / "mug.v2", tmp_path / "mug"]
+    with pytest.raises(ValueError, match="several captures have the name mug:"):
+        batch.run_batch(captures, tmp_path, SMOKE, FootageOptions(), batch.Workers())
+    assert batch.run_batch(captures[:2], tmp_path, SMOKE, FootageOptions(), batch.Workers()), "not started yet"
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:

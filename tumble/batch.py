@@ -72,7 +72,7 @@ def make_captures(cases: Sequence[Case], out: Path, data: Path | None, workers: 
     """
     bench.require_inputs(cases, data)
     _claim(out)
-    tasks = [CaptureTask(case, data and data.resolve(), out.resolve()) for case in cases]
+    tasks = [CaptureTask(case, data and data.absolute(), out.absolute()) for case in cases]
     distinct = list({task.name: task for task in tasks}.values())
     return progress.track(bench.execute(bench.make_capture, distinct, workers, out / LOGS), "captures", len(distinct))
 
@@ -89,15 +89,15 @@ def missing_rows(
 
     Raises:
         BadFile: An object or light is missing, or a row is damaged.
-        ValueError: There is no such device, recipe or method.
+        ValueError: There is no such recipe or method.
     """
     bench.require_inputs(cases, data)
     tasks = []
     for case in cases:
-        path = bench.row_file(out, _empty_row(case, device))
+        path = bench.row_file(out, _empty_row(case))
         if not path.is_file() or (again and "error" in bench.read_row(path)):
             # Machines of a cluster need whole paths.
-            tasks.append(RowTask(case, data and data.resolve(), out.resolve(), device))
+            tasks.append(RowTask(case, data and data.absolute(), out.absolute(), device))
     progress.LOG.info("%d of %d rows are there already", len(cases) - len(tasks), len(cases))
     return tasks
 
@@ -107,10 +107,12 @@ def run_rows(tasks: Sequence[RowTask], out: Path, workers: Workers) -> Iterable[
 
     Raises:
         BadFile: `out` holds something else.
+        ValueError: This machine is to compute, and has no such device.
     """
+    _check_devices({task.device for task in tasks}, workers)
     _claim(out)
     for outcome in progress.track(bench.execute(measure, tasks, workers, out / LOGS), "rows", len(tasks)):
-        row, picture = outcome.result or (_empty_row(outcome.task.case, outcome.task.device), b"")
+        row, picture = outcome.result or (_empty_row(outcome.task.case), b"")
         if outcome.error:
             row["error"] = outcome.error
         path = bench.row_file(out, row)
@@ -147,10 +149,11 @@ def recipe_of(case: Case) -> Recipe:
 
 def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     """Render the capture of a case if it is missing, reconstruct it, and score the result; returns row and picture."""
-    case, row = task.case, _empty_row(task.case, task.device)
+    case, row, device = task.case, _empty_row(task.case), usable_device(task.device)
+    row["machine"] = bench.machine_class(device)
     capture = bench.make_capture(CaptureTask(case, task.data, task.out))
     where = task.out / RUNS / bench.row_file(task.out, row).stem
-    pipeline.reconstruct(capture, where, recipe_of(case), poses=case.poses, device=usable_device(task.device))
+    pipeline.reconstruct(capture, where, recipe_of(case), poses=case.poses, device=device)
     seconds = sum({r["name"]: r["seconds"] for r in run.log_records(where) if r.get("event") == "done"}.values())
     started = time.perf_counter()
     report = actions.evaluate_run(where, capture, device=task.device)
@@ -166,9 +169,15 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     return row, bench.picture_of(capture, where / run.PREDICTION, report)
 
 
-def _empty_row(case: Case, device: str) -> SuiteRow:
-    machine = bench.machine_class(usable_device(device))
-    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe_of(case)), machine=machine)
+def _empty_row(case: Case) -> SuiteRow:
+    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe_of(case)))
+
+
+def _check_devices(names: Iterable[str], workers: Workers) -> None:
+    """Raise `ValueError` if this machine is to compute and lacks a device; a cluster's machines may have others."""
+    for name in names:
+        if not workers.address:
+            usable_device(name)
 
 
 def _claim(out: Path) -> None:
@@ -222,14 +231,13 @@ def run_batch(
     Raises:
         ValueError: Two of them have the same name, or there is no such device.
     """
-    usable_device(device)
-    tasks = [
-        RunTask(path.resolve(), out.resolve() / path.resolve().stem, recipe, options, poses, device)
-        for path in captures
-    ]
-    names = [task.name for task in tasks]
+    _check_devices({device}, workers)
+    paths = [path.absolute() for path in captures]
+    names = [path.stem if path.is_file() else path.name for path in paths]
     if repeated := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"several captures have the name {min(repeated)}: rename them, or run them one by one")
+    folders = [out.absolute() / name for name in names]
+    tasks = [RunTask(*each, recipe, options, poses, device) for each in zip(paths, folders, strict=True)]
     return progress.track(bench.execute(reconstruct_one, tasks, workers, out / LOGS), "captures", len(tasks))
 
 

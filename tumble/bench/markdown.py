@@ -27,7 +27,7 @@ def facts(results: SuiteResults) -> str:
     rows, code, suite = results["rows"], results["code"], results["suite"]
     stale = sum(is_stale(row, results) for row in rows)
     failed = sum("error" in row for row in rows)
-    machines = "; ".join(sorted({row["machine"] for row in rows})) or tables.NOTHING
+    machines = "; ".join(sorted({row["machine"] for row in rows if row["machine"]})) or tables.NOTHING
     sentences = [
         f"{len(rows)} of {len(results['cases'])} rows: {failed} failed, {stale} stale (measured with other code).",
         f"Code: version {code['version']}, commit {code['commit'] or 'unknown'}, sources {code['fingerprint']}.",
