@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tumble import batch, recipes
 from tumble.bench import suite as suites
 from tumble.io.files import BadFile
 from tumble.scene.environment import Environment
@@ -29,6 +30,19 @@ def test_the_cases_of_a_bundled_suite_have_distinct_names_and_keys(name: str) ->
             assert any(side.items() <= case.labels.items() for case in cases), "a comparison without rows"
 
 
+def test_every_recipe_and_method_of_a_suite_exists_and_every_ablation_is_in_the_suite_of_ablations() -> None:
+    chosen = {name: suites.cases_of(suites.read_suite(name)) for name in suites.suite_names()}
+    for case in (case for cases in chosen.values() for case in cases):
+        assert case.recipe in batch.RECIPES
+        assert case.method in recipes.METHODS
+    assert {case.method for case in chosen["ablations"]} == {"tumble", *recipes.ABLATIONS}
+
+
+def test_table_3_uses_the_captures_of_table_1() -> None:
+    one, three = (suites.cases_of(suites.read_suite(f"paper-table{n}")) for n in (1, 3))
+    assert {case.options for case in three} == {case.options for case in one}
+
+
 def test_table_1_has_ten_objects_in_all_settings() -> None:
     suite = suites.read_suite("paper-table1")
     cases = suites.cases_of(suite, seeds=[0])
@@ -37,6 +51,13 @@ def test_table_1_has_ten_objects_in_all_settings() -> None:
     assert {case.options.resolution for case in cases} == {128}
     estimated = {case.options.setting for case in cases if case.poses == "estimate"}
     assert estimated == {"turntable", "handheld"}
+
+
+def test_few_hand_held_views_are_taken_from_the_motion_of_all_400() -> None:
+    cases = suites.cases_of(suites.read_suite("views"))
+    lengths = {case.options.views * case.options.stride for case in cases if case.options.setting == "handheld"}
+    assert lengths == {400}
+    assert {case.options.stride for case in cases if case.options.setting == "dome"} == {1}
 
 
 def test_only_seeds_and_methods_select_cases() -> None:
