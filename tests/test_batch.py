@@ -11,6 +11,8 @@ from tests.test_cli import run
 from tumble import batch
 from tumble.bench import captures, code, rows
 from tumble.bench.suite import cases_of, read_suite
+from tumble.engine import loop
+from tumble.io import files
 from tumble.io.files import BadFile
 from tumble.preprocess import FootageOptions
 from tumble.recipes import SMOKE
@@ -76,6 +78,27 @@ def test_a_failed_row_says_why_and_is_measured_again_only_on_demand(measured: Pa
     cases = cases_of(read_suite(suite))
     assert batch.missing_rows(cases, measured, None) == []
     assert [task.name for task in batch.missing_rows(cases, measured, None, again=True)] == [failed[0]["name"]]
+
+
+def test_a_method_in_a_file_is_measured_again_when_the_file_changes(suite: str, tmp_path: Path) -> None:
+    own, folder = tmp_path / "own.py", tmp_path / "out"
+    own.write_text("from dataclasses import replace\ndef method(recipe):\n    return replace(recipe, matcher='sift')\n")
+    (case,) = cases_of(read_suite(suite), methods=[str(own)], only=["given"])
+    assert case.name == "pot-room-handheld-original-given-own-seed0"
+    recipe = batch.recipe_of(case)
+    assert (recipe.matcher, recipe.decompose) == ("sift", SMOKE.decompose)
+    row = rows.row_of(case, code.current_code(), recipe=loop.fingerprint(recipe, own.read_text()))
+    files.write_json(rows.row_file(folder, row), row)
+    assert batch.missing_rows([case], folder, None) == []
+    own.write_text(own.read_text() + "# a change\n")
+    assert [task.case for task in batch.missing_rows([case], folder, None)] == [case]
+
+
+def test_an_unknown_method_is_refused_with_the_known_ones(suite: str, tmp_path: Path) -> None:
+    (tmp_path / "empty.py").touch()
+    for name, message in (("magic", "choose among tumble, average"), (str(tmp_path / "empty.py"), "has no function")):
+        with pytest.raises(ValueError, match=message):
+            batch.missing_rows(cases_of(read_suite(suite), methods=[name]), tmp_path / "out", None)
 
 
 def test_rows_of_other_code_are_stale_in_the_report(

@@ -1,10 +1,11 @@
 """Many runs: the rows of a benchmark suite, and the captures of a batch, on this machine or on a Ray cluster."""
 
 import dataclasses
+import importlib.util
 import resource
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -94,8 +95,11 @@ def missing_rows(
     bench.require_inputs(cases, data)
     tasks = []
     for case in cases:
-        path = bench.row_file(out, _empty_row(case))
-        if not path.is_file() or (again and "error" in bench.read_row(path)):
+        wanted = _empty_row(case)
+        path = bench.row_file(out, wanted)
+        found = bench.read_row(path) if path.is_file() else None
+        # A method in a file of the user may have changed.
+        if found is None or found["recipe"] != wanted["recipe"] or (again and "error" in found):
             # Machines of a cluster need whole paths.
             tasks.append(RowTask(case, data and data.absolute(), out.absolute(), device))
     progress.LOG.info("%d of %d rows are there already", len(cases) - len(tasks), len(cases))
@@ -141,10 +145,31 @@ def recipe_of(case: Case) -> Recipe:
     Raises:
         ValueError: There is no such recipe or method.
     """
-    if case.recipe not in RECIPES or case.method not in METHODS:
-        wrong, choices = (case.recipe, RECIPES) if case.recipe not in RECIPES else (case.method, METHODS)
-        raise ValueError(f"there is no {wrong!r}; choose among {', '.join(choices)}")
-    return METHODS[case.method](dataclasses.replace(RECIPES[case.recipe], seed=case.seed))
+    if case.recipe not in RECIPES:
+        raise ValueError(f"there is no recipe {case.recipe!r}; choose among {', '.join(RECIPES)}")
+    return method_of(case.method)(dataclasses.replace(RECIPES[case.recipe], seed=case.seed))
+
+
+def method_of(name: str) -> Callable[[Recipe], Recipe]:
+    """A method by its name in `METHODS`, or the function `method` of a Python file, which may be a stage itself.
+
+    Raises:
+        ValueError: There is neither.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    path, module = Path(name), f"method_{Path(name).stem}"
+    if path.suffix != ".py" or not path.is_file():
+        raise ValueError(f"there is no method {name!r}; choose among {', '.join(METHODS)}, or give a Python file")
+    if module not in sys.modules:
+        spec = importlib.util.spec_from_file_location(module, path)
+        assert spec is not None and spec.loader is not None, "a Python file"  # noqa: PT018
+        # A stage is found by the name of its module, which has to be listed for that.
+        sys.modules[module] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[module])
+    if not hasattr(sys.modules[module], "method"):
+        raise ValueError(f"{name} has no function `method` that takes a recipe and returns one")
+    return sys.modules[module].method
 
 
 def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
@@ -152,7 +177,7 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     case, row, device = task.case, _empty_row(task.case), usable_device(task.device)
     row["machine"] = bench.machine_class(device)
     capture = bench.make_capture(CaptureTask(case, task.data, task.out))
-    where = task.out / RUNS / bench.row_file(task.out, row).stem
+    where = task.out / RUNS / f"{bench.row_file(task.out, row).stem}-{row['recipe'][:8]}"
     pipeline.reconstruct(capture, where, recipe_of(case), poses=case.poses, device=device)
     seconds = sum({r["name"]: r["seconds"] for r in run.log_records(where) if r.get("event") == "done"}.values())
     started = time.perf_counter()
@@ -170,7 +195,8 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
 
 
 def _empty_row(case: Case) -> SuiteRow:
-    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe_of(case)))
+    source = Path(case.method).read_text("utf-8") if case.method.endswith(".py") else ""
+    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe_of(case), source))
 
 
 def _check_devices(names: Iterable[str], workers: Workers) -> None:

@@ -44,6 +44,7 @@ class Case:
     """Seed of the hand-held motion, of the path tracer and of all random numbers of the method."""
     poses: Literal["given", "estimate"] = "given"
     method: str = "tumble"
+    """Name of the method, or a Python file with it."""
     varied: tuple[str, ...] = ()
     """Options, besides those in `labels`, that differ between cases of the suite."""
 
@@ -57,7 +58,7 @@ class Case:
             "material": self.options.material,
         }
         others = {name: getattr(self.options, name) for name in self.varied}
-        return {**first, **others, "poses": self.poses, "method": self.method, "seed": self.seed}
+        return {**first, **others, "poses": self.poses, "method": Path(self.method).stem, "seed": self.seed}
 
     @property
     def name(self) -> str:
