@@ -15,7 +15,7 @@ $(STAMP): pyproject.toml
 	  { echo "tumble needs Python 3.11, 3.12 or 3.13: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	@$(BIN)/python -c 'import sys' 2>/dev/null || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[synth,cuda,view,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[synth,cuda,view,cluster,dev]'
 	@touch $@
 
 demo: install

@@ -4,6 +4,7 @@ A stage is a module with VERSION, Config, length, init, step and finish. This fi
 by its Config.
 
 $ python -m examples.swap_a_stage OUT                   (minutes on two CPU cores)
+$ tumble bench run smoke --method examples/swap_a_stage.py
 """
 
 import sys
@@ -54,6 +55,11 @@ def finish(cfg: Config, inputs: decompose.Inputs, state: State) -> tumble.Asset:
         trajectory=refined.trajectory,
         camera=inputs.capture.camera,
     )
+
+
+def method(recipe: tumble.Recipe) -> tumble.Recipe:
+    """The recipe with this stage in it, for benchmark suites."""
+    return replace(recipe, decompose=Config())
 
 
 def main(out: Path, recipe: tumble.Recipe = tumble.DRAFT) -> dict[str, float]:

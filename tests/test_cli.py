@@ -24,7 +24,8 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
 
 
 @pytest.mark.parametrize(
-    "command", ["doctor", "synth", "check", "run", "view", "relight", "export", "report", "evaluate", "demo"]
+    "command",
+    ["doctor", "synth", "check", "run", "view", "relight", "export", "report", "evaluate", "bench", "batch", "demo"],
 )
 def test_every_command_explains_itself(
     command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

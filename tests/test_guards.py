@@ -50,6 +50,7 @@ MAY_IMPORT = {
         "evaluation",
         "export",
     },
+    "bench": {"io", "maths", "backends", "scene", "engine", "synthetic", "evaluation", "report"},
 }
 """Rooms that each room may import, besides itself; the files beside them may import all."""
 INNER_ROOMS = {

@@ -18,6 +18,7 @@ Each folder is a room: one part of the method, whose `__init__` lists what other
     report              the report.html of a run, with its health card
     evaluation          metrics, and scores of predictions against ground truth
     synthetic           captures with ground truth, path traced by Mitsuba
+    bench               benchmark suites as data, rows of scores, their tables and page; many tasks at the same time
 
 Used by all of these:
 
@@ -27,8 +28,8 @@ Used by all of these:
     maths, io           rotations, directions, spherical harmonics, images; files, video, safetensors, weights
 
 Files beside the rooms: `pipeline` (the stages in order), `recipes` (their settings), `actions` (relight, export,
-evaluate), `cli`, `demo`, `doctor`, `viewer` with `viewer_access`. `tests/test_guards.py` lists which room may import
-which.
+evaluate), `batch` (many runs, suites), `cli`, `demo`, `doctor`, `viewer` with `viewer_access`. `tests/test_guards.py`
+lists which room may import which.
 """
 
 from typing import TYPE_CHECKING

@@ -36,7 +36,20 @@ Device = Annotated[
     arg(help="Where to compute. cuda: on an NVIDIA GPU, which no test has run on yet. auto: on one if there is one."),
 ]
 OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
+OptionalData = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
+
+
+Jobs = Annotated[int, arg(metavar="N", help="Number at the same time on this machine. 0: one for every two cores.")]
+Address = Annotated[
+    str,
+    arg(
+        metavar="HOST:PORT",
+        help="Run on the Ray cluster with this address instead (extra `cluster`); local: start one on this machine. "
+        "Its machines must have this package and, under the same paths, the files that are named here.",
+        help_behavior_hint="",
+    ),
+]
 
 
 def doctor() -> None:
@@ -141,6 +154,44 @@ def run(
     print(run_capture(capture, out, recipe, options, poses=poses, up=up, pick=pick, device=device))
 
 
+def batch(
+    captures: Positional[tuple[Path, ...]],
+    /,
+    options: Annotated[FootageOptions, arg(name="")],
+    out: Folder,
+    quality: Literal["draft", "standard", "paper"] = "draft",
+    poses: Literal["given", "estimate"] = "given",
+    jobs: Jobs = 0,
+    address: Address = "",
+    device: Device = "cpu",
+    seed: int = 0,
+) -> None:
+    """Reconstruct many videos or captures, as `run` does each; exit code 1 if one of them fails.
+
+    Args:
+        captures: Videos, folders of images, or capture folders.
+        options: How videos and images are converted to captures.
+        out: Folder of the run directories, which have the names of the captures. Repeating the command resumes.
+        quality: See `run`.
+        poses: See `run`.
+        seed: Seed of all random numbers.
+    """
+    from dataclasses import replace
+
+    from tumble.batch import run_batch
+    from tumble.bench import Workers
+    from tumble.recipes import QUALITIES
+
+    workers = Workers(jobs, address, gpu=device == "cuda")
+    recipe = replace(QUALITIES[quality], seed=seed)
+    failed = 0
+    for outcome in run_batch(captures, out, recipe, options, workers, poses=poses, device=device):
+        failed += bool(outcome.error)
+        print(outcome.result or f"{outcome.task.name}: {_line(outcome.error)}", flush=True)
+    if failed:
+        raise SystemExit(1)
+
+
 def view(run: Positional[Path], /, host: str = "127.0.0.1", port: int = 8080) -> None:
     """Show a run in the browser, also while it is running: cameras, Gaussians, maps, light. Needs the extra `view`.
 
@@ -241,6 +292,62 @@ def evaluate(
     print((out or score_folder(prediction)) / "report.json")
 
 
+def bench(
+    action: Positional[Literal["list", "make", "run", "report"]],
+    suite: Annotated[Positional[str], arg(metavar="[SUITE]", help_behavior_hint="")] = "",
+    /,
+    out: Folder = Path("runs/bench"),
+    data: OptionalData = None,
+    method: Annotated[tuple[str, ...], arg(metavar="NAME...", help_behavior_hint="")] = (),
+    only: Annotated[tuple[str, ...], arg(metavar="WORD...", help_behavior_hint="")] = (),
+    seeds: Annotated[tuple[int, ...], arg(metavar="N...", help_behavior_hint="")] = (),
+    again: bool = False,
+    jobs: Jobs = 0,
+    address: Address = "",
+    device: Device = "cpu",
+) -> None:
+    """Measure a benchmark suite: captures with ground truth, one row of scores for each, tables and a page.
+
+    Args:
+        action: list: list the suites, or the rows of SUITE. make: render its captures. run: measure the rows that are
+            missing. report: write SUITE.json, SUITE.md and SUITE.html from the rows.
+        suite: Name of a suite, or a .toml file. For report also the .json file of an earlier report.
+        out: Folder of captures, runs and rows. Repeating the command continues.
+        data: Folder with the suite's objects and lights, in meshes/ and hdri/. Default: $TUMBLE_BENCH_DATA.
+        method: Methods to run instead of the suite's: tumble, average, an ablation of tumble/recipes.py, or a Python
+            file with your own (docs/benchmarks.md).
+        only: Words that the name of a row must all contain.
+        seeds: Seeds instead of the suite's.
+        again: Measure rows again that have failed.
+    """
+    from tumble import batch, bench
+
+    if action == "list" and not suite:
+        for name in bench.suite_names():
+            print(f"{name:17} {len(bench.cases_of(bench.read_suite(name))):4} rows  {bench.read_suite(name).title}")
+        return
+    selection = {"seeds": seeds, "methods": method, "only": only}
+    if action == "report":
+        print(batch.report_suite(suite, out, **selection))
+        return
+    cases = bench.cases_of(bench.read_suite(suite), **selection)
+    workers, data = bench.Workers(jobs, address, gpu=device == "cuda"), bench.data_folder(data)
+    failed = 0
+    if action == "list":
+        print("\n".join(case.name for case in cases))
+    if action == "make":
+        for outcome in batch.make_captures(cases, out, data, workers):
+            failed += bool(outcome.error)
+            print(outcome.result or f"{outcome.task.name}: {_line(outcome.error)}", flush=True)
+    if action == "run":
+        tasks = batch.missing_rows(cases, out, data, device=device, again=again)
+        for row in batch.run_rows(tasks, out, workers):
+            failed += "error" in row
+            print(batch.summary_line(row), flush=True)
+    if failed:
+        raise SystemExit(1)
+
+
 def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = "", /) -> None:
     """Download the weights of an optional matching network, or list the networks.
 
@@ -273,7 +380,7 @@ def demo(out: Folder = Path("runs/demo"), device: Device = "cpu") -> None:
 
 VERSION_HELP = "tumble --version prints the version."
 """End of the help text, about an option that is not one of a command."""
-COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, demo, weights)
+COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, bench, batch, demo, weights)
 
 
 def main() -> None:

@@ -123,7 +123,8 @@ def _atlas() -> DoctorFinding:
 
 
 def _extras() -> Iterator[DoctorFinding]:
-    for extra, module, package in (("view", "viser", "viser"), ("cuda", "warp", "warp-lang")):
+    extras = {"view": ("viser", "viser"), "cuda": ("warp", "warp-lang"), "cluster": ("ray", "ray")}
+    for extra, (module, package) in extras.items():
         if importlib.util.find_spec(module) is None:
             yield DoctorFinding(f"extra {extra}", "not installed", f"optional: pip install 'tumble[{extra}]'")
         else:

@@ -4,6 +4,7 @@ DRAFT: minutes on two CPU cores. STANDARD: meant for one GPU. SMOKE: seconds, fo
 the paper are functions from a recipe to a recipe. What experiments said about the values stands in docs/method.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -207,7 +208,7 @@ def _replace_decompose(recipe: Recipe, **changes: Any) -> Recipe:
     return replace(recipe, decompose=replace(recipe.decompose, **changes))
 
 
-ABLATIONS = {
+ABLATIONS: dict[str, Callable[[Recipe], Recipe]] = {
     "static-colour": static_colour,
     "no-visibility": no_visibility,
     "no-indirect": no_indirect,
@@ -218,3 +219,14 @@ ABLATIONS = {
     "mean-colour": mean_colour,
     "no-specular-fit": no_specular_fit,
 }
+"""Ablations and baselines by name."""
+
+
+def unchanged(recipe: Recipe) -> Recipe:
+    """The method itself."""
+    return recipe
+
+
+METHODS: dict[str, Callable[[Recipe], Recipe]] = {"tumble": unchanged, "average": mean_colour, **ABLATIONS}
+"""What a row of a benchmark suite can run, by the value of `--method`: the method, baselines, ablations. The floor is
+"average", the mean colour over the frames as albedo."""

@@ -148,3 +148,12 @@ def test_invalid_maps_are_rejected_with_the_rule(tmp_path: Path, pixels: np.ndar
     files.write_exr(tmp_path / "light.exr", pixels)
     with pytest.raises(BadFile, match=rf"light\.exr: .*{rule}"):
         Environment.read(tmp_path / "light.exr")
+
+
+def test_directionality_is_0_for_uniform_light_a_third_for_1_plus_y_and_1_for_a_lamp() -> None:
+    """The mean direction of 1 + y: the integral of y (1 + y) over the sphere is 4 pi / 3, that of 1 + y is 4 pi."""
+    y = texel_directions(64, 128)[..., 1:2].expand(-1, -1, 3)
+    lamp = torch.zeros(64, 128, 3)
+    lamp[20, 30] = 1e6
+    for radiance, expected in ((torch.ones(8, 16, 3), 0.0), (1 + y, 1 / 3), (lamp, 1.0)):
+        assert Environment.from_radiance(radiance).directionality() == pytest.approx(expected, abs=1e-3)

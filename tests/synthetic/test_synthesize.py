@@ -16,6 +16,7 @@ from tumble.datasets import folder  # noqa: E402
 from tumble.io import files, video  # noqa: E402
 from tumble.io.files import BadFile  # noqa: E402
 from tumble.maths import images  # noqa: E402
+from tumble.maths.directions import fibonacci_sphere  # noqa: E402
 from tumble.maths.se3 import SE3, SO3  # noqa: E402
 from tumble.scene.camera import Camera  # noqa: E402
 from tumble.scene.environment import Environment  # noqa: E402
@@ -230,8 +231,6 @@ def test_a_handheld_trajectory_rotates_5_to_12_degrees_per_frame_and_shows_all_s
     assert steps(T_cam_obj).min() >= 5 - 1e-6
     assert steps(T_cam_obj).max() <= 12 + 1e-6
     views = T_cam_obj.inverse().xyz / T_cam_obj.inverse().xyz.norm(dim=-1, keepdim=True)
-    from tumble.maths.directions import fibonacci_sphere
-
     nearest = (views @ fibonacci_sphere(200).double().T).amax(0)
     # The view nearest to each direction is within 60 degrees, mostly much closer, also for directions from below.
     assert nearest.min() > math.cos(math.radians(60))
@@ -242,6 +241,18 @@ def test_a_handheld_trajectory_rotates_5_to_12_degrees_per_frame_and_shows_all_s
     axes = SO3(T_cam_obj.wxyz[1:]) @ SO3(T_cam_obj.wxyz[:-1]).inverse()
     bend = torch.nn.functional.cosine_similarity(axes.log()[1:], axes.log()[:-1], dim=-1)
     assert bend.median() > math.cos(math.radians(30)), "the axis of a smooth trajectory changes slowly"
+
+
+def test_a_stride_takes_few_frames_of_a_long_motion_which_then_show_more_sides() -> None:
+    few = trajectories.trajectory("handheld", 10, DISTANCE, seed=3, stride=16)
+    assert torch.equal(few.wxyz, trajectories.handheld(160, DISTANCE, seed=3).wxyz[::16])
+    directions = fibonacci_sphere(200).double()
+
+    def largest_gap(T_cam_obj: SE3) -> float:
+        positions = torch.nn.functional.normalize(T_cam_obj.inverse().xyz, dim=-1)
+        return math.degrees(math.acos(float((positions @ directions.T).amax(0).min())))
+
+    assert largest_gap(few) < 70 < 100 < largest_gap(trajectories.handheld(10, DISTANCE, seed=3))
 
 
 def test_the_turntable_rotates_about_the_vertical_seen_from_25_degrees_above() -> None:
@@ -405,6 +416,9 @@ def test_a_roughness_sweep_changes_only_roughness(pebble: Path, tmp_path: Path) 
         ({"relight": ("a/sun.hdr", "b/sun.hdr")}, "the file names of the relight maps must differ"),
         ({"roughness": 0.0}, "roughness"),
         ({"views": 0}, "views"),
+        ({"stride": 0}, "stride"),
+        ({"stride": 2, "setting": "dome"}, "a stride needs --setting handheld"),
+        ({"stride": 2, "hand": True}, "a stride needs --setting handheld"),
     ],
 )
 def test_the_error_for_an_invalid_option_has_its_name(change: dict, message: str) -> None:

@@ -1,10 +1,15 @@
 """Report of a run: results, quality measures and a live relighting view in one self-contained HTML file."""
 
-from tumble.report.figures import panorama, small_camera
-from tumble.report.page import write_report
+from tumble.report import preset_lights
+from tumble.report.figures import panorama, small_camera, webp_file
+from tumble.report.page import script_hash, style_sheet, write_report
 
 __all__ = [
     "panorama",
+    "preset_lights",
+    "script_hash",
     "small_camera",
+    "style_sheet",
+    "webp_file",
     "write_report",
 ]

@@ -186,9 +186,14 @@ def panorama(environment: Environment, height: int) -> UInt8[np.ndarray, "{heigh
 
 def webp(image: UInt8[np.ndarray, "h w c"]) -> str:
     """An image as a data URL."""
+    return "data:image/webp;base64," + base64.b64encode(webp_file(image)).decode()
+
+
+def webp_file(image: UInt8[np.ndarray, "h w c"]) -> bytes:
+    """An image as a WebP file."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "WEBP", quality=90, method=4)
-    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+    return file.getvalue()
 
 
 def _code_values(values: Float[Tensor, "h w c"]) -> UInt8[np.ndarray, "h w c"]:

@@ -197,7 +197,7 @@ def build(
         timings=_timings(summary.records),
         configuration=_configuration(summary.recipe),
         version=__version__,
-        css=_own("page.css"),
+        css=style_sheet(),
         buttons=[(key, name, figures.webp(figures.panorama(light, 64))) for key, (name, light) in lights.items()],
         live_view=None if glb is None else _live_view(asset, views[0], glb.read_bytes(), lights),
     )
@@ -206,6 +206,11 @@ def build(
 
 
 # The page -------------------------------------------------------------------------------------------------------------
+
+
+def style_sheet() -> Markup:
+    """Style sheet of the page, for other pages that look like it."""
+    return _own("page.css")
 
 
 def _own(name: str) -> Markup:
@@ -346,10 +351,10 @@ def _live_view(
     return {
         "about": {"fov": fov, "object_to_camera": [w, -z, y, -x]},
         "parts": {key: base64.b64encode(data).decode() for key, data in parts.items()},
-        "scripts": {_sha256(script): script for script in (_own("three.js"), _own("panel.js"))},
+        "scripts": {script_hash(script): script for script in (_own("three.js"), _own("panel.js"))},
     }
 
 
-def _sha256(script: str) -> str:
+def script_hash(script: str) -> str:
     """Hash of a script as a content security policy writes it."""
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"

@@ -74,6 +74,13 @@ class Environment:
         """Integral of the radiance over the sphere."""
         return (self.radiance * self._solid_angles()[..., None]).sum((0, 1))
 
+    def directionality(self) -> float:
+        """Length of the mean direction, weighted by luminance: 0 for uniform light, 1 for a single small lamp."""
+        d_env = texel_directions(*self.log_radiance.shape[:2]).to(self.log_radiance)
+        luminance = self.radiance @ d_env.new_tensor([0.2126, 0.7152, 0.0722]) * self._solid_angles()
+        mean = (d_env * luminance[..., None]).sum((0, 1)) / luminance.sum()
+        return float(torch.linalg.vector_norm(mean))
+
     def upsampled(self) -> "Environment":
         """The map with twice the resolution: bilinear in radiance, scaled so that `integral` is preserved exactly."""
         h, w, _ = self.log_radiance.shape

@@ -21,6 +21,8 @@ class SynthOptions:
     turntable: the object rotates about the vertical; handheld: it rotates about changing axes."""
     views: int = 64
     """Number of training frames."""
+    stride: int = 1
+    """Only with --setting handheld: render every so manieth frame of the motion, which is then so many times longer."""
     resolution: int = 128
     """Height and width of all images [pixels]."""
     fov: float = 30.0
@@ -68,6 +70,7 @@ class SynthOptions:
     def __post_init__(self) -> None:
         in_range = {
             "views": self.views >= 1,
+            "stride": self.stride >= 1,
             "resolution": 8 <= self.resolution <= 4096 and self.resolution % 2 == 0,
             "fov": 1 <= self.fov <= 120,
             "samples": self.samples >= 1 and self.truth_samples >= 1,
@@ -81,6 +84,8 @@ class SynthOptions:
             raise ValueError(f"{invalid[0]} is out of range: {getattr(self, invalid[0])} (see tumble synth --help)")
         if self.hand and self.setting != "handheld":
             raise ValueError(f"a hand does not hold the object in the setting {self.setting}: use --setting handheld")
+        if self.stride > 1 and (self.setting != "handheld" or self.hand or self.film):
+            raise ValueError("a stride needs --setting handheld, without a hand and a film, which need every frame")
         if self.setting == "dome" and (self.film or self.background != "none"):
             raise ValueError("the camera of a dome moves: a film or a background needs another --setting")
         stems = [Path(name).stem for name in self.relight]

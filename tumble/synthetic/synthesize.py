@@ -166,7 +166,7 @@ def _context(parts: pathtracer.ObjectModel, out: Path, options: SynthOptions) ->
     shapes = pathtracer.mitsuba_shapes(parts, options.material, options.roughness)
     unlit = pathtracer.unlit_scenes(parts, options.roughness)
     distance = distance_for(math.radians(options.fov))
-    poses = trajectory(options.setting, options.views, distance, seed=options.seed)
+    poses = trajectory(options.setting, options.views, distance, seed=options.seed, stride=options.stride)
     around = surroundings(parts, poses, options, distance)
     layers = None if around is None else pathtracer.layer_scene((parts.named_parts(), *around.at(0.0, poses[0])))
     return _RenderContext(options, parts, camera, out, shapes, unlit, poses, around, layers)

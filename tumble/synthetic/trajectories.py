@@ -116,12 +116,17 @@ def _view_coverage(wxyz: Float[Tensor, "n t 4"]) -> Float[Tensor, " n"]:
     return (views @ fibonacci_sphere(128).to(wxyz).T).amax(1).amin(1)
 
 
-def trajectory(setting: str, n: int, distance: float, *, seed: int) -> SE3:
-    """`T_cam_obj` of the `n` training frames of a setting; only "handheld" depends on the seed."""
+def trajectory(setting: str, n: int, distance: float, *, seed: int, stride: int = 1) -> SE3:
+    """`T_cam_obj` of the `n` training frames of a setting.
+
+    Args:
+        seed: Seed of the hand-held motion.
+        stride: Every how many frames of the hand-held motion a training frame is taken.
+    """
     paths: dict[str, Callable[[], SE3]] = {
         "dome": lambda: dome(n, distance),
         "turntable": lambda: turntable(n, distance),
-        "handheld": lambda: handheld(n, distance, seed=seed),
+        "handheld": lambda: handheld(n * stride, distance, seed=seed)[::stride],
     }
     return paths[setting]()
 
