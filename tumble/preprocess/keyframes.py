@@ -35,16 +35,22 @@ MIN_PIXELS = 30
 def cumulative_rotation(
     images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]
 ) -> Float64[np.ndarray, " t"]:
-    """Angle by which the object has rotated since the first frame, summed along the path [radians]; never decreases."""
+    """Angle by which the object has rotated since the first frame, summed along the path [radians]; never decreases.
+
+    Where too little texture shows to measure it, the object is assumed to rotate as fast as in the median of the frames.
+    """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    total, anchor, base = np.zeros(len(images)), 0, 0.0
+    increase, anchor, since = np.zeros(len(images)), 0, 0.0
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     for i in range(1, len(images)):
         angle = rotation_between(dis, grays[anchor], grays[i], inside[anchor], inside[i])
-        total[i] = max(total[i - 1], base + angle)
-        if angle > ANCHOR_ROTATION or inside[anchor].sum() < MIN_PIXELS:
-            anchor, base = i, total[i]
-    return total
+        increase[i] = np.maximum(angle - since, 0.0)
+        since = np.fmax(since, angle)
+        if math.isnan(angle) or angle > ANCHOR_ROTATION:
+            anchor, since = i, 0.0
+    measured = ~np.isnan(increase)
+    increase[~measured] = np.median(increase[measured])
+    return increase.cumsum()
 
 
 def rotation_between(
@@ -54,12 +60,14 @@ def rotation_between(
     inside_a: Bool[np.ndarray, "h w"],
     inside_b: Bool[np.ndarray, "h w"],
 ) -> float:
-    """Small rotation of the object between two frames [radians]; 0 where there is too little texture to measure it."""
+    """Small rotation of the object between two frames [radians]; NaN with too little texture in the first one, or too
+    few pixels of the object in the second, to measure it.
+    """
     x, y = cv2.Sobel(gray_a, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray_a, cv2.CV_32F, 0, 1, scale=1 / 8)
     core = cv2.erode(inside_a.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     textured = core & (np.hypot(x, y) > MIN_GRADIENT)
     if min(textured.sum(), inside_b.sum()) < MIN_PIXELS:
-        return 0.0
+        return math.nan
     flow = dis.calc(gray_a, gray_b, np.zeros((*gray_a.shape, 2), np.float32))[textured]
     shift = _centre(inside_b) - _centre(inside_a)
     radius = math.sqrt(float(inside_a.sum()) / math.pi)
