@@ -22,9 +22,12 @@ from tumble.backends import (
     TRACE_SIGMAS,
     TRACE_T_MIN,
     VISIBLE,
+    GlossyGaussians,
     Hits,
+    LightTables,
     Lobes,
     Rendering,
+    SurfaceSamples,
     _native,
     threads,
 )
@@ -36,7 +39,7 @@ from tumble.backends._cpu_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Shade, scratch, set_pointers
+from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
     "blockers",
@@ -49,6 +52,7 @@ __all__ = [
     "material_terms",
     "rasterize",
     "ready",
+    "relight",
     "sh_shade",
     "shade",
     "trace",
@@ -439,3 +443,45 @@ def _lookup_launch(tensors: Any, **more: Tensor) -> tuple[Lookup, list[Tensor]]:
     struct = Lookup(n=len(directions), levels=levels, height=height, width=width)
     named = {"stack": stack, "directions": directions, "roughness": roughness}
     return struct, set_pointers(struct, named | more)
+
+
+@torch.no_grad()
+def relight(
+    bvh: CpuBvh,
+    surface: SurfaceSamples,
+    light: LightTables,
+    gaussians: GlossyGaussians | None,
+    R_env_obj: Float[Tensor, "3 3"],
+    n_brdf: int,
+    f0: float,
+) -> Float[Tensor, "p 3"]:
+    """See `RelightKernel`."""
+    padded = torch.nn.functional.pad(surface.lattice.T, (0, _native.library().lanes()))
+    out = torch.empty_like(surface.albedo)
+    struct = Relight(
+        bvh=ctypes.addressof(bvh.bvh),
+        n_points=len(out),
+        n_brdf=n_brdf,
+        n_samples=len(surface.lattice),
+        stride=padded.shape[1],
+        threads=threads(),
+        height=light.radiance.shape[0],
+        width=light.radiance.shape[1],
+        rows=light.density.shape[0],
+        columns=light.density.shape[1],
+        row_buckets=len(light.row_guide) - 1,
+        column_buckets=light.column_guide.shape[1] - 1,
+        f0=f0,
+        roughness_min=ROUGHNESS_MIN,
+    )
+    named = {**surface._asdict(), **light._asdict(), "lattice": padded, "R": R_env_obj}
+    named["light"] = named.pop("radiance")
+    if gaussians is not None:
+        struct.levels, struct.stack_height, struct.stack_width, _ = gaussians.stack.shape
+        struct.table_size = len(gaussians.table)
+        named |= {"gaussian_normals": gaussians.normals, "gaussian_roughness": gaussians.roughness}
+        named |= {"radiance": gaussians.radiance, "stack": gaussians.stack, "table": gaussians.table}
+    kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, out=out)
+    _native.library().relight_points(ctypes.byref(struct))
+    del kept
+    return out
