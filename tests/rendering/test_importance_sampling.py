@@ -9,7 +9,7 @@ from torch import Tensor
 from tests.rendering.test_shading import CAMERA, F0, grey, lamp, rms, transfer_vectors, uniform, visible_sphere
 from tests.surfaces import GAMMA, look_at, sphere, torus
 from tumble import backends
-from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_solid_angles
+from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_directions, texel_solid_angles
 from tumble.rendering import importance_sampling, shading
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import rasterize
@@ -73,6 +73,15 @@ def test_a_fine_map_is_sampled_by_averages_of_its_texels(monkeypatch: pytest.Mon
     integral = sampler.environment.integral()
     # The texel covers a thirtieth of the sampled cells: 16384 samples leave an error of 5 %.
     torch.testing.assert_close((sampler.environment.lookup(d) / sampler.pdf(d)).mean(0), integral, rtol=0.1, atol=0)
+
+
+@pytest.mark.parametrize("rows", [1, 6])
+def test_the_density_is_that_of_lookups_in_the_map(rows: int) -> None:
+    """Across the seam and the poles too; of a map of one row, all rows of cells lie beside a pole."""
+    environment = Environment.from_radiance(torch.rand(rows, 2 * rows, 3, generator=torch.Generator().manual_seed(0)))
+    density = importance_sampling.light_sampler(environment).density
+    expected = environment.lookup(texel_directions(*density.shape)).mean(-1)
+    torch.testing.assert_close(density / density.mean(), expected / expected.mean(), rtol=1e-4, atol=0)
 
 
 def test_few_and_many_numbers_find_the_same_bins() -> None:

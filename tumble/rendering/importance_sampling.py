@@ -12,10 +12,11 @@ from functools import cached_property
 import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from tumble import backends
 from tumble.backends import GlossyGaussians, LightTables, SurfaceSamples
-from tumble.maths import equirect_from_direction, fibonacci_sphere, texel_directions, texel_solid_angles
+from tumble.maths import equirect_from_direction, fibonacci_sphere, texel_solid_angles
 from tumble.rendering import brdf
 from tumble.rendering.prefiltered_light import Prefiltered
 from tumble.rendering.shading import Bounce, Surface, reflectance_table, specular
@@ -27,7 +28,7 @@ MAX_RAYS = 1 << 18
 CELL_ROWS = 512
 """Target number of rows of a light sampler's cells; maps with as many rows or more get twice as many, which is two
 million cells in all."""
-ROW_BUCKETS, COLUMN_BUCKETS = 1024, 64
+ROW_BUCKETS, COLUMN_BUCKETS = 1024, 256
 """Numbers of intervals of the guides to the rows of cells and to the cells of a row (`LightTables`); powers of two."""
 BOUNCE_DIRECTIONS = 256
 """Directions in which the light is sampled for the diffuse indirect radiance."""
@@ -110,13 +111,20 @@ def light_sampler(environment: Environment) -> LightSampler:
     h, w, _ = environment.log_radiance.shape
     # Averages of a finer map are also nonzero wherever the map is nonzero.
     coarse = environment if h <= CELL_ROWS else environment.resampled(CELL_ROWS, w * CELL_ROWS // h)
-    h, w, _ = coarse.log_radiance.shape
-    h, w = (x * max(2, min(8, CELL_ROWS // h)) for x in (h, w))
-    like = {"dtype": environment.log_radiance.dtype, "device": environment.log_radiance.device}
-    brightness = coarse.lookup(texel_directions(h, w, **like)).mean(-1)
-    power = brightness.double() * texel_solid_angles(h, w, dtype=torch.float64, device=like["device"])
+    brightness = _enlarged(coarse.radiance.mean(-1), max(2, min(8, CELL_ROWS // coarse.radiance.shape[0])))
+    area = texel_solid_angles(*brightness.shape, dtype=torch.float64, device=brightness.device)
+    power = brightness.double() * area
     density = brightness / power.sum().to(brightness)
     return LightSampler(environment, density, power.flatten().cumsum(0) / power.sum())
+
+
+def _enlarged(texels: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "{factor}*h {factor}*w"]:
+    """Bilinear lookups in an equirectangular map (`scene.bilinear`) at the texel centres of a finer one."""
+    across_pole = texels[[0, -1]].roll(texels.shape[1] // 2, 1)
+    padded = torch.cat([across_pole[:1], texels, across_pole[1:]])
+    padded = torch.cat([padded[:, -1:], padded, padded[:, :1]], 1)
+    finer = interpolate(padded[None, None], scale_factor=factor, mode="bilinear", align_corners=False)[0, 0]
+    return finer[factor:-factor, factor:-factor]
 
 
 @dataclass(frozen=True)

@@ -80,14 +80,12 @@ INLINE void scattered(const Relight& s, const Relit& o, int j, vf* w) {
     for (int i = 0; i < 3; i++) w[i] = pick(diffuse, w[i], twice * w[i] - o.v[i]);
 }
 
-// Index of the first of the ascending numbers x[low .. high - 1] above a value, else high.
+// Index of the first of the ascending numbers x[low .. high - 1] above a value, else high; without branches to predict.
 INLINE int first_above(const double* x, double value, int low, int high) {
-    while (low < high) {
-        int middle = (low + high) / 2;
-        if (x[middle] > value)
-            high = middle;
-        else
-            low = middle + 1;
+    for (int count = high - low; count > 0;) {
+        int half = (count + 1) / 2;
+        low += x[low + half - 1] > value ? 0 : half;
+        count -= half;
     }
     return low;
 }
@@ -95,23 +93,33 @@ INLINE int first_above(const double* x, double value, int low, int high) {
 // `LightSampler.sample` in the object frame. A guide holds the first bin above each of evenly spaced numbers.
 INLINE void towards_light(const Relight& s, const Relit& o, int j, vf* w) {
     float row_at[LANES], column_at[LANES], height[LANES], sine2[LANES], turns[LANES];
+    double value[LANES], down[LANES];
+    int row[LANES];
+    const int* guide[LANES];
     store(row_at, uniform_at(s, o, 1, j)), store(column_at, uniform_at(s, o, 2, j));
+    // The numbers that the cells are searched in are far apart in memory, and are therefore requested beforehand.
     for (int l = 0; l < LANES; l++) {
         double u = row_at[l];
-        int bucket = (int)(u * s.row_buckets), row = s.row_guide[bucket], last = s.row_guide[bucket + 1];
-        while (row < last && s.cumulative[(i64)(row + 1) * s.columns - 1] <= u) row++;
-        row = imin2(row, s.rows - 1);
-        double start = row ? s.cumulative[(i64)row * s.columns - 1] : 0;
-        double width = s.cumulative[(i64)(row + 1) * s.columns - 1] - start, down = width > 0 ? (u - start) / width : 0;
-        u = start + column_at[l] * width;
-        const int* guide = s.column_guide + row * (s.column_buckets + 1) + (int)(column_at[l] * s.column_buckets);
-        int cell = imin2(first_above(s.cumulative, u, guide[0], guide[1]), s.rows * s.columns - 1);
-        start = cell ? s.cumulative[cell - 1] : 0, width = s.cumulative[cell] - start;
-        double along = width > 0 ? (u - start) / width : 0;
-        along = along < 0 ? 0 : along > 1 ? 1 : along, down = down > 1 ? 1 : down;
+        int bucket = (int)(u * s.row_buckets), r = s.row_guide[bucket], last = s.row_guide[bucket + 1];
+        while (r < last && s.cumulative[(i64)(r + 1) * s.columns - 1] <= u) r++;
+        row[l] = r = imin2(r, s.rows - 1);
+        double start = r ? s.cumulative[(i64)r * s.columns - 1] : 0;
+        double width = s.cumulative[(i64)(r + 1) * s.columns - 1] - start;
+        down[l] = width > 0 ? (u - start) / width : 0, value[l] = start + column_at[l] * width;
+        guide[l] = s.column_guide + r * (s.column_buckets + 1) + (int)(column_at[l] * s.column_buckets);
+        __builtin_prefetch(guide[l]);
+    }
+    for (int l = 0; l < LANES; l++)
+        __builtin_prefetch(s.cumulative + guide[l][0]), __builtin_prefetch(s.cumulative + guide[l][1]);
+    for (int l = 0; l < LANES; l++) {
+        int r = row[l], cell = first_above(s.cumulative, value[l], guide[l][0], guide[l][1]);
+        cell = imin2(cell, s.rows * s.columns - 1);
+        double start = cell ? s.cumulative[cell - 1] : 0, width = s.cumulative[cell] - start;
+        double along = width > 0 ? (value[l] - start) / width : 0;
+        along = along < 0 ? 0 : along > 1 ? 1 : along, down[l] = down[l] > 1 ? 1 : down[l];
         // Rounding may give a cell of another row.
-        int column = imax2(0, imin2(cell - row * s.columns, s.columns - 1));
-        double cosine = s.cosines[row] + (s.cosines[row + 1] - s.cosines[row]) * down;
+        int column = imax2(0, imin2(cell - r * s.columns, s.columns - 1));
+        double cosine = s.cosines[r] + (s.cosines[r + 1] - s.cosines[r]) * down[l];
         height[l] = cosine, sine2[l] = 1 - cosine * cosine, turns[l] = (column + along) / s.columns - 0.5;
     }
     vf sine, cosine, radius = vsqrt(vmax(load(sine2), vf{})), d[3];
