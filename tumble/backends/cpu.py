@@ -73,8 +73,10 @@ WIDE = 16
 """Children of a node, and Gaussians of a leaf, in `native/bvh.h`."""
 LEVELS = 8
 """Maximum number of levels of the tree in `native/bvh.h`."""
-LEAF = 14 * 16
+LEAF = 20 * 16
 """Numbers of a leaf in `native/bvh.h`."""
+LEAF_FIELDS = 15
+"""Numbers of a Gaussian that are computed for its leaf."""
 NODE = 10 * 16
 """Numbers of a node in `native/bvh.h`."""
 FEATURES_PER_PASS = 16
@@ -258,8 +260,8 @@ def build(
     set_pointers(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
     memory = set_pointers(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
     work = set_pointers(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
-    W = torch.empty(n * 9)
-    _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(W.data_ptr()))
+    fields = torch.empty(n * LEAF_FIELDS)
+    _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(fields.data_ptr()))
     del work
     return CpuBvh(t, memory)
 

@@ -78,10 +78,10 @@ API void raster_adjoint(Raster* r) {
     }
 }
 
-API void bvh_build(Bvh* t, float* W) {
-    leaf_fields(*t, W);
+API void bvh_build(Bvh* t, float* fields) {
+    leaf_fields(*t, fields);
     sort_by_halving(*t);
-    fill_tree(*t, W);
+    fill_tree(*t, fields);
 }
 
 API void rays_trace(const Rays* r) {

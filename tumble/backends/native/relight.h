@@ -175,11 +175,11 @@ INLINE void weigh(const Relight& s, const Relit& o, int j, Samples& batch) {
 }
 
 // Traces the rays of a batch; adds their light, and lists those that hit Gaussians.
-static void trace_batch(const Relight& s, const float* origin, const Samples& batch, Occluded& occluded, float* sum) {
+static void trace_batch(const Relight& s, const Near* near, const float* origin, const Samples& batch, Occluded& occluded, float* sum) {
     occluded.count = 0;
     for (int i = 0; i < batch.count; i++) {
         float d[3] = {batch.w[0][i], batch.w[1][i], batch.w[2][i]}, T = 1, out[3] = {};
-        int hit = trace_ray(*s.bvh, ray_at(origin, d), s.radiance, &T, out);
+        int hit = trace_ray(*s.bvh, near, ray_at(origin, d), s.radiance, &T, out);
         for (int ch = 0; ch < 3; ch++) sum[ch] += T * batch.value[ch][i] + batch.weight[ch][i] * out[ch];
         if (hit < 0 || !s.stack) continue;
         int to = occluded.count++;
@@ -231,9 +231,11 @@ INLINE void add_specular(const Relight& s, const Occluded& o, int j, vf* sum) {
 static void relight_share(const Relight& s, int share) {
     Samples batch;
     Occluded occluded;
+    Near buffer;
     clear(&batch, sizeof batch), clear(&occluded, sizeof occluded);
     for (i64 p = share; p < s.n_points; p += s.threads) {
         Relit o = relit_at(s, p);
+        const Near* near = collect_near(*s.bvh, s.origins + 3 * p, o.n, buffer) ? &buffer : nullptr;
         float sum[3] = {};
         vf specular[3] = {};
         for (int first = 0; first < s.n_samples; first += SAMPLES_AT_ONCE) {
@@ -242,7 +244,7 @@ static void relight_share(const Relight& s, int share) {
             keep_above(o, first, middle, batch, [&](int j, vf* w) { scattered(s, o, j, w); });
             keep_above(o, middle, last, batch, [&](int j, vf* w) { towards_light(s, o, j, w); });
             for (int j = 0; j < batch.count; j += LANES) weigh(s, o, j, batch);
-            trace_batch(s, s.origins + 3 * p, batch, occluded, sum);
+            trace_batch(s, near, s.origins + 3 * p, batch, occluded, sum);
             for (int j = 0; j < occluded.count; j += LANES) add_specular(s, occluded, j, specular);
         }
         for (int ch = 0; ch < 3; ch++) s.out[3 * p + ch] = sum[ch] + sum_of(specular[ch]);
