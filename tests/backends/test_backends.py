@@ -287,12 +287,12 @@ def test_visibility_is_that_of_traced_rays_whether_few_or_many_gaussians_are_abo
     means, quats = torch.randn(8000, 3, generator=rng), torch.randn(8000, 4, generator=rng)
     scales = 0.01 + 0.02 * torch.rand(8000, 3, generator=rng)
     tree = backend.build(0.4 * means, quats, scales, torch.rand(8000, generator=rng))
-    normals = normalize(torch.randn(60, 3, generator=rng), dim=-1)
-    points = torch.linspace(-1, 1, 60)[:, None] * normals + 0.1 * torch.randn(60, 3, generator=rng)
+    normals = normalize(torch.randn(600, 3, generator=rng), dim=-1)
+    points = torch.linspace(-1, 1, 600)[:, None] * normals + 0.1 * torch.randn(600, 3, generator=rng)
     directions = cases.fibonacci(64).float()
     found = _brute.unpack(backend.visible(tree, points, normals, directions), 64)
-    hits = backend.trace(tree, points.repeat_interleave(64, 0), directions.repeat(60, 1), points[:0])
-    expected = (normals @ directions.T > 0) & (hits.transmittance.reshape(60, 64) >= backends.VISIBLE)
+    hits = backend.trace(tree, points.repeat_interleave(64, 0), directions.repeat(600, 1), points[:0])
+    expected = (normals @ directions.T > 0) & (hits.transmittance.reshape(600, 64) >= backends.VISIBLE)
     assert 0.1 < expected.float().mean() < 0.4
     # Products of transmittances in another order may fall on the other side of the limit.
     assert (found != expected).sum() <= 1
