@@ -81,6 +81,11 @@ def fit(samples: Samples, n: int, roughness_index: int, specular_scale: float) -
         specular_scale: Initial specular scale.
     """
 
+    # Sums by Gaussian take half the time if its pixels are neighbours in memory.
+    order = samples.gaussian.argsort(stable=True)
+    gaussian, diffuse, photo = (x[order] for x in (samples.gaussian, samples.diffuse, samples.photo))
+    samples = Samples(gaussian, diffuse, samples.specular[:, order], photo)
+
     def errors(specular: Tensor, min_albedo: float) -> Tensor:
         return torch.stack([fit_error(samples, specular, scale, n, min_albedo)[0] for scale in SPECULAR_SCALES])
 
@@ -116,12 +121,14 @@ def fit_error(
     y = samples.photo
     # The derivative of sRGB's curve, finite at black.
     sensitivity = 1.055 / 2.4 * y.clamp(0.004, 1) ** (1 / 2.4 - 1) * (y < CLIPPED)
-    weight, error = sensitivity.square(), y
+    squared, diffuse = sensitivity.square(), y - scale * specular
+    weight, error = squared, y
     for _ in range(REWEIGHTINGS):
-        albedo = _albedos(samples, weight, y - scale * specular, n).clamp_min(min_albedo)
-        error = (y - albedo[samples.gaussian] * samples.diffuse - scale * specular) * sensitivity
-        weight = sensitivity.square() / (error.abs() + ERROR_FLOOR)
-    return error.abs().mean(), weight
+        albedo = _albedos(samples, weight, diffuse, n).clamp_min(min_albedo)
+        modelled = albedo.index_select(0, samples.gaussian).mul_(samples.diffuse)
+        error = torch.sub(diffuse, modelled, out=modelled).mul_(sensitivity).abs_()
+        weight = squared / (error + ERROR_FLOOR)
+    return error.mean(), weight
 
 
 def _albedos(
@@ -132,8 +139,8 @@ def _albedos(
     def sum_by_gaussian(values: Tensor) -> Tensor:
         return values.new_zeros(n, 3).index_add(0, samples.gaussian, values)
 
-    x = samples.diffuse
-    return sum_by_gaussian(weight * x * radiance) / sum_by_gaussian(weight * x * x).clamp_min(1e-9)
+    weighted = weight * samples.diffuse
+    return sum_by_gaussian(weighted * radiance) / sum_by_gaussian(weighted * samples.diffuse).clamp_min(1e-9)
 
 
 @torch.no_grad()
