@@ -120,8 +120,9 @@ def light_sampler(environment: Environment) -> LightSampler:
 
 def _enlarged(texels: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "{factor}*h {factor}*w"]:
     """Bilinear lookups in an equirectangular map (`scene.bilinear`) at the texel centres of a finer one."""
-    across_pole = texels[[0, -1]].roll(texels.shape[1] // 2, 1)
-    padded = torch.cat([across_pole[:1], texels, across_pole[1:]])
+    # The neighbour of a row across a pole is that row, half a revolution away.
+    above, below = (row.roll(texels.shape[1] // 2, 1) for row in (texels[:1], texels[-1:]))
+    padded = torch.cat([above, texels, below])
     padded = torch.cat([padded[:, -1:], padded, padded[:, :1]], 1)
     finer = interpolate(padded[None, None], scale_factor=factor, mode="bilinear", align_corners=False)[0, 0]
     return finer[factor:-factor, factor:-factor]
