@@ -21,6 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 from tumble import backends
+from tumble.backends import cuda
 
 DEVICE = torch.device("meta")
 """The simulated device."""
@@ -119,6 +120,9 @@ class Kernels:
         self._gpu = gpu
 
     def __getattr__(self, verb: str) -> Callable[..., Any]:
+        if not hasattr(cuda, verb):
+            raise AttributeError(f"the kernels of a GPU include no {verb}")
+
         def call(*arguments: Any) -> Any:
             if torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in arguments):
                 return self._differentiable(verb, *arguments)

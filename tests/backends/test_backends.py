@@ -279,6 +279,25 @@ def test_unpack_inverts_pack() -> None:
     assert words[0, 0].item() & 0xFFFFFFFF == sum(1 << j for j in range(32) if bits[0, j])
 
 
+def test_visibility_is_that_of_traced_rays_whether_few_or_many_gaussians_are_above_a_point(
+    backend: backends.Backend,
+) -> None:
+    """Points at the rim of a cloud of 8000 Gaussians, which looks inwards, along the rim, or outwards."""
+    rng = torch.Generator().manual_seed(0)
+    means, quats = torch.randn(8000, 3, generator=rng), torch.randn(8000, 4, generator=rng)
+    scales = 0.01 + 0.02 * torch.rand(8000, 3, generator=rng)
+    tree = backend.build(0.4 * means, quats, scales, torch.rand(8000, generator=rng))
+    normals = normalize(torch.randn(600, 3, generator=rng), dim=-1)
+    points = torch.linspace(-1, 1, 600)[:, None] * normals + 0.1 * torch.randn(600, 3, generator=rng)
+    directions = cases.fibonacci(64).float()
+    found = _brute.unpack(backend.visible(tree, points, normals, directions), 64)
+    hits = backend.trace(tree, points.repeat_interleave(64, 0), directions.repeat(600, 1), points[:0])
+    expected = (normals @ directions.T > 0) & (hits.transmittance.reshape(600, 64) >= backends.VISIBLE)
+    assert 0.1 < expected.float().mean() < 0.4
+    # Products of transmittances in another order may fall on the other side of the limit.
+    assert (found != expected).sum() <= 1
+
+
 def test_a_convex_object_hardly_shadows_itself(backend: backends.Backend) -> None:
     """Mean visibility above the horizon exceeds 0.985 at points of the rendered surface of a sphere of Gaussians."""
     n, size = 4000, 48

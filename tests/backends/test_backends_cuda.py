@@ -117,11 +117,11 @@ def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any
 def test_every_kernel_compiles_for_a_gpu_without_having_one(kernels: Any, tmp_path: Path) -> None:
     import warp
 
-    from tumble.backends import _warp_adjoint, _warp_composite, _warp_project, _warp_shade, _warp_trace
+    from tumble.backends import _warp_composite, _warp_project, _warp_shade, _warp_trace
 
     if 90 not in warp.get_cuda_supported_archs():
         pytest.skip("this build of Warp has no compiler for sm_90")
-    modules = [warp.get_module(file.__name__) for file in (_warp_project, _warp_adjoint, _warp_trace, _warp_shade)]
+    modules = [warp.get_module(file.__name__) for file in (_warp_project, _warp_trace, _warp_shade)]
     factories = _warp_composite.forward, _warp_composite.adjoint
     modules += [make(channels).module for make in factories for channels in _warp_composite.WIDTHS]
     for module in modules:

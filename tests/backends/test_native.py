@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from tests.backends import cases, test_backends
+from tests.rendering import test_importance_sampling
 from tumble import backends
 from tumble.backends import _cache, _native, reference
 
@@ -294,6 +295,7 @@ def exercise() -> None:
     test_backends.test_features_of_corners_and_their_gradients_are_those_of_the_reference(cpu, 37)
     test_backends.test_bounces_and_their_gradients_are_those_of_the_reference(cpu, 37)
     test_backends.test_terms_of_materials_and_their_gradients_are_those_of_the_reference(cpu, 12, 13)
+    test_importance_sampling.test_the_kernel_computes_what_the_operations_do(70, True)
     # Both are computed in float32.
     assert max(cases.difference(a, b) for a, b in zip(*results, strict=True)) < 1e-3
 

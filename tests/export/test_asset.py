@@ -91,8 +91,8 @@ def test_the_glb_follows_the_gltf_layout(folder: Path) -> None:
     assert 900 < indices["count"] / 3 <= SMALL.triangles
     starts = [document["bufferViews"][image["bufferView"]]["byteOffset"] for image in document["images"]]
     assert all(binary[start : start + 8] == b"\x89PNG\r\n\x1a\n" for start in starts)
-    # The header of the compressed data (RFC 1950) tells the level: 2 for 6, 3 for the slow ones.
-    assert all(binary[binary.index(b"IDAT", start) + 5] >> 6 == 2 for start in starts)
+    # The header of the compressed data (RFC 1950) tells the effort: 0 for runs only, 2 for level 6.
+    assert all(binary[binary.index(b"IDAT", start) + 5] >> 6 == 0 for start in starts)
     assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 

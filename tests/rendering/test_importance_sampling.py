@@ -8,7 +8,8 @@ from torch import Tensor
 
 from tests.rendering.test_shading import CAMERA, F0, grey, lamp, rms, transfer_vectors, uniform, visible_sphere
 from tests.surfaces import GAMMA, look_at, sphere, torus
-from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_solid_angles
+from tumble import backends
+from tumble.maths.directions import fibonacci_sphere, random_rotation, texel_directions, texel_solid_angles
 from tumble.rendering import importance_sampling, shading
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import rasterize
@@ -72,6 +73,15 @@ def test_a_fine_map_is_sampled_by_averages_of_its_texels(monkeypatch: pytest.Mon
     integral = sampler.environment.integral()
     # The texel covers a thirtieth of the sampled cells: 16384 samples leave an error of 5 %.
     torch.testing.assert_close((sampler.environment.lookup(d) / sampler.pdf(d)).mean(0), integral, rtol=0.1, atol=0)
+
+
+@pytest.mark.parametrize("rows", [1, 6])
+def test_the_density_is_that_of_lookups_in_the_map(rows: int) -> None:
+    """Across the seam and the poles too; of a map of one row, all rows of cells lie beside a pole."""
+    environment = Environment.from_radiance(torch.rand(rows, 2 * rows, 3, generator=torch.Generator().manual_seed(0)))
+    density = importance_sampling.light_sampler(environment).density
+    expected = environment.lookup(texel_directions(*density.shape)).mean(-1)
+    torch.testing.assert_close(density / density.mean(), expected / expected.mean(), rtol=1e-4, atol=0)
 
 
 def test_few_and_many_numbers_find_the_same_bins() -> None:
@@ -158,3 +168,57 @@ def test_the_sample_pattern_is_even_along_all_axes() -> None:
         counts = torch.histc(pattern[:, axis], 16, 0, 1)
         # Random numbers would give 32 +- 5.6, so one of the 16 bins would probably exceed 42.
         assert (counts - 32).abs().max() <= 8
+
+
+def by_kernel_and_by_operations(
+    environment: Environment, n_brdf: int, n_light: int, *, glossy: bool, n_points: int = 300
+) -> tuple[Tensor, Tensor]:
+    """A torus with much occlusion under a rotated light: by the CPU kernel, and by its definition."""
+    gaussians, T_cam_obj = torus(1000), look_at([2, 1, 3])
+    surface = shading.surface(rasterize(gaussians, GAMMA, T_cam_obj, CAMERA, {}), T_cam_obj, CAMERA, alpha_min=0.95)
+    generator = torch.Generator().manual_seed(1)
+    R, tracer = random_rotation(generator), build_tracer(gaussians, GAMMA)
+    lattice = importance_sampling._lattice(n_brdf + n_light).float()
+    albedo, roughness = torch.rand(1000, 3, generator=generator), torch.rand(1000, 1, generator=generator)
+    origins = tracer.ray_origins(surface.points, surface.normals)
+    points = (x[:n_points] for x in (origins[::3], surface.normals[::3], surface.views[::3], albedo, roughness))
+    samples = backends.SurfaceSamples(*points, torch.rand(n_points, 3, generator=generator), lattice)
+    bounce = gaussian_light = None
+    if glossy:
+        diffuse = Bounce(albedo.flip(0), transfer_vectors(gaussians))
+        bounce = importance_sampling.GlossyBounce(diffuse, roughness.flip(0), prefilter(environment))
+        gaussian_light = importance_sampling._glossy_gaussians(bounce, tracer, R)
+    light, kernel = importance_sampling.light_sampler(environment), backends.relight_kernel(backends.load("cpu"))
+    assert kernel is not None
+    found = kernel(tracer.bvh, samples, light.tables, gaussian_light, R, n_brdf, 0.04)
+    return found, importance_sampling.relight_by_operations(
+        samples, light, R, tracer, n_brdf, 0.04, bounce, gaussian_light
+    )
+
+
+@pytest.mark.parametrize("glossy", [False, True])
+@pytest.mark.parametrize("rows", [16, 128])
+def test_the_kernel_computes_what_the_operations_do(rows: int, glossy: bool) -> None:
+    """Batches are cut at 256 samples, and neither kind of samples fills whole vectors; 128 rows exceed the stack's."""
+    radiance = torch.rand(rows, 2 * rows, 3, generator=torch.Generator().manual_seed(0)) ** 4
+    radiance[rows // 3, rows] = 200.0
+    found, expected = by_kernel_and_by_operations(Environment.from_radiance(radiance), 37, 301, glossy=glossy)
+    # Rounding moves some of the samples across edges: of texels' cells, of Gaussians, of the horizon.
+    assert rms(found - expected) < 5e-4 * rms(expected)
+    assert (found - expected).abs().median() < 1e-5 * rms(expected)
+
+
+@pytest.mark.parametrize(("n_brdf", "n_light", "n_points"), [(1, 0, 5), (0, 1, 5), (700, 3, 2), (8, 8, 0)])
+def test_the_kernel_takes_any_number_of_samples_and_points(n_brdf: int, n_light: int, n_points: int) -> None:
+    found, expected = by_kernel_and_by_operations(one_texel(), n_brdf, n_light, glossy=True, n_points=n_points)
+    torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-5)
+
+
+def test_the_kernel_gives_the_same_with_two_threads() -> None:
+    before = torch.get_num_threads()
+    results = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        results.append(by_kernel_and_by_operations(uniform(), 20, 20, glossy=True)[0])
+    torch.set_num_threads(before)
+    assert torch.equal(*results)

@@ -19,7 +19,7 @@ ENTRY_POINTS = (
     *("rays_trace", "rays_visible", "rays_blockers", "shade_forward", "shade_adjoint"),
     *("sh_shade_forward", "sh_shade_adjoint", "image_loss", "gaussian_loss"),
     *("lookup_forward", "lookup_backward", "material_forward", "material_adjoint"),
-    *("bounce_forward", "bounce_adjoint", "material_loss"),
+    *("bounce_forward", "bounce_adjoint", "material_loss", "relight_points"),
 )
 """Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (

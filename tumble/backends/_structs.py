@@ -155,9 +155,24 @@ class MaterialImage(ctypes.Structure):
     ]
 
 
+class Relight(ctypes.Structure):
+    """`Relight` of `native/relight.h`: arguments of Monte Carlo shading."""
+
+    _fields_ = [
+        *_pointers("bvh origins normals views albedo roughness shift lattice"),
+        *_pointers("light density cumulative cosines row_guide column_guide"),
+        *_pointers("R radiance gaussian_normals gaussian_roughness stack table"),
+        *_ints("n_points n_brdf n_samples stride threads"),
+        *_ints("height width rows columns row_buckets column_buckets"),
+        *_ints("levels stack_height stack_width table_size"),
+        *_floats("f0 roughness_min"),
+        *_pointers("out"),
+    ]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
-    *(Lookup, Activation, Indirect, MaterialImage),
+    *(Lookup, Activation, Indirect, MaterialImage, Relight),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

@@ -22,9 +22,12 @@ from tumble.backends import (
     TRACE_SIGMAS,
     TRACE_T_MIN,
     VISIBLE,
+    GlossyGaussians,
     Hits,
+    LightTables,
     Lobes,
     Rendering,
+    SurfaceSamples,
     _native,
     threads,
 )
@@ -36,7 +39,7 @@ from tumble.backends._cpu_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Shade, scratch, set_pointers
+from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
     "blockers",
@@ -49,6 +52,7 @@ __all__ = [
     "material_terms",
     "rasterize",
     "ready",
+    "relight",
     "sh_shade",
     "shade",
     "trace",
@@ -69,8 +73,10 @@ WIDE = 16
 """Children of a node, and Gaussians of a leaf, in `native/bvh.h`."""
 LEVELS = 8
 """Maximum number of levels of the tree in `native/bvh.h`."""
-LEAF = 14 * 16
+LEAF = 20 * 16
 """Numbers of a leaf in `native/bvh.h`."""
+LEAF_FIELDS = 15
+"""Numbers of a Gaussian that are computed for its leaf."""
 NODE = 10 * 16
 """Numbers of a node in `native/bvh.h`."""
 FEATURES_PER_PASS = 16
@@ -254,8 +260,8 @@ def build(
     set_pointers(t, dict(zip(_INPUTS[:4], inputs, strict=True)))
     memory = set_pointers(t, leaves=torch.empty(counts[0] * LEAF), nodes=torch.empty(sum(counts[1:]) * NODE))
     work = set_pointers(t, boxes=torch.empty(n * 6), normals=torch.empty(n * 3), order=_int32(n))
-    W = torch.empty(n * 9)
-    _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(W.data_ptr()))
+    fields = torch.empty(n * LEAF_FIELDS)
+    _native.library().bvh_build(ctypes.byref(t), ctypes.c_void_p(fields.data_ptr()))
     del work
     return CpuBvh(t, memory)
 
@@ -439,3 +445,45 @@ def _lookup_launch(tensors: Any, **more: Tensor) -> tuple[Lookup, list[Tensor]]:
     struct = Lookup(n=len(directions), levels=levels, height=height, width=width)
     named = {"stack": stack, "directions": directions, "roughness": roughness}
     return struct, set_pointers(struct, named | more)
+
+
+@torch.no_grad()
+def relight(
+    bvh: CpuBvh,
+    surface: SurfaceSamples,
+    light: LightTables,
+    gaussians: GlossyGaussians | None,
+    R_env_obj: Float[Tensor, "3 3"],
+    n_brdf: int,
+    f0: float,
+) -> Float[Tensor, "p 3"]:
+    """See `RelightKernel`."""
+    padded = torch.nn.functional.pad(surface.lattice.T, (0, _native.library().lanes()))
+    out = torch.empty_like(surface.albedo)
+    struct = Relight(
+        bvh=ctypes.addressof(bvh.bvh),
+        n_points=len(out),
+        n_brdf=n_brdf,
+        n_samples=len(surface.lattice),
+        stride=padded.shape[1],
+        threads=threads(),
+        height=light.radiance.shape[0],
+        width=light.radiance.shape[1],
+        rows=light.density.shape[0],
+        columns=light.density.shape[1],
+        row_buckets=len(light.row_guide) - 1,
+        column_buckets=light.column_guide.shape[1] - 1,
+        f0=f0,
+        roughness_min=ROUGHNESS_MIN,
+    )
+    named = {**surface._asdict(), **light._asdict(), "lattice": padded, "R": R_env_obj}
+    named["light"] = named.pop("radiance")
+    if gaussians is not None:
+        struct.levels, struct.stack_height, struct.stack_width, _ = gaussians.stack.shape
+        struct.table_size = len(gaussians.table)
+        named |= {"gaussian_normals": gaussians.normals, "gaussian_roughness": gaussians.roughness}
+        named |= {"radiance": gaussians.radiance, "stack": gaussians.stack, "table": gaussians.table}
+    kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, out=out)
+    _native.library().relight_points(ctypes.byref(struct))
+    del kept
+    return out

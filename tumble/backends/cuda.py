@@ -119,7 +119,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_pixels: Tensor, *_: Any) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        from tumble.backends import _warp, _warp_adjoint, _warp_composite, _warp_project
+        from tumble.backends import _warp, _warp_composite, _warp_project
 
         means, quats, scales, _, sh, corners, camera, record, n_tiles, starts, listed, pixels = ctx.saved_tensors
         n, channels = len(means), corners.shape[2]
@@ -133,7 +133,7 @@ class _Rasterize(torch.autograd.Function):
             gradients = v_means, v_quats, v_scales, v_sh, v_camera
             n_threads = -(-n // _warp.LANES) * _warp.LANES
             inputs = means, quats, scales, sh, camera, n_tiles
-            _warp.launch(_warp_adjoint.project_adjoint, n_threads, *inputs, sums, *gradients)
+            _warp.launch(_warp_project.project_adjoint, n_threads, *inputs, sums, *gradients)
         v_opacity = sums[:, _warp_project.OPACITY]
         v_corners = sums[:, _warp_project.CORNERS :].view(n, 4, channels)
         return v_means, v_quats, v_scales, v_opacity, v_sh, v_corners, v_camera[0], None, None, None

@@ -1,6 +1,7 @@
 """Prediction of a decomposed asset: a capture's evaluation views, rendered at the true poses (docs/prediction.md)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -13,7 +14,7 @@ from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
 from tumble.io import progress
 from tumble.maths import SO3, to_srgb8
-from tumble.rendering import antialiased_gbuffer, relight
+from tumble.rendering import Buffers, antialiased_gbuffer, relight
 from tumble.scene import Asset, Capture, Environment, Trajectory, Truth
 
 MIN_OBJECT_COVERAGE = 0.55
@@ -49,8 +50,7 @@ def predict_views(
     if alignment is None or truth.trajectory is None or not len(truth):
         return prediction
     views = alignment.to_prediction(truth.trajectory)
-    indices = progress.track(range(len(views)), "rendering maps of the evaluation views", len(views))
-    buffers = [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in indices]
+    buffers = _gbuffers(asset, views, capture, "rendering maps of the evaluation views")
     coverage = torch.stack([view.alpha for view in buffers])
     # Maps extend beyond the silhouette to all pixels with a usable value; `masks` holds the silhouette.
     known = coverage >= cfg.alpha_min
@@ -63,7 +63,7 @@ def predict_views(
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
         masks=coverage >= MIN_OBJECT_COVERAGE,
-        images=_rendered_views(cfg, asset, geometry, estimated_light, views, capture, "the estimated light"),
+        images=_rendered_views(cfg, asset, geometry, buffers, estimated_light, views, capture, "the estimated light"),
         relit=_relit_views(cfg, asset, geometry, albedo, alignment, capture, truth),
     )
 
@@ -131,22 +131,30 @@ def _relit_views(
         return {}
     scaled = relight.scale_albedo(asset, metrics.albedo_scale(albedo, truth.albedo, truth.foreground))
     views = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
+    buffers = _gbuffers(scaled, views, capture, "rendering maps with the scaled albedo")
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     return {
-        name: _rendered_views(cfg, scaled, geometry, light.rotated(R_pred_true), views, capture, name)
+        name: _rendered_views(cfg, scaled, geometry, buffers, light.rotated(R_pred_true), views, capture, name)
         for name, light in truth.lights.items()
     }
+
+
+def _gbuffers(asset: Asset, views: Trajectory, capture: Capture, task: str) -> list[Buffers]:
+    """Buffers of the views, which do not depend on the light."""
+    indices = progress.track(range(len(views)), task, len(views))
+    return [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in indices]
 
 
 def _rendered_views(
     cfg: relight.Config,
     asset: Asset,
     geometry: relight.TracedGeometry,
+    buffers: Sequence[Buffers],
     light: Environment,
     views: Trajectory,
     capture: Capture,
     name: str,
 ) -> UInt8[Tensor, "v h w 3"]:
     """The views under a light with this name."""
-    linear = relight.relight(cfg, asset, light, views, capture.camera, geometry=geometry)
+    linear = relight.relight(cfg, asset, light, views, capture.camera, geometry=geometry, buffers=buffers)
     return to_srgb8(torch.stack(list(progress.track(linear, f"rendering views under {name}", len(views)))))

@@ -44,7 +44,7 @@ PRESETS: dict[str, Preset | None] = {
 EXPORT_FILE = "export.json"
 """Unit and settings of an exported folder, by which it is recognised; written first."""
 CONFIDENCE_FILE = "confidence.png"
-"""Confidence of the material as a texture, beside the GLB."""
+"""Confidence of the material as a texture, beside the GLB and over the same UVs."""
 SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
 """Settings of the mesh that is extracted only to measure the object's size."""
 
@@ -73,7 +73,11 @@ def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, s
     }
     files.write_json(out / EXPORT_FILE, facts)
     if settings and shape:
-        write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
+        flat = write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
+        with progress.task("confidence of the material"):
+            score = confidence.confidence_of(asset, asset.camera).score
+            texture = bake.nearest_gaussian_texture(score, asset, flat, resolution=512)
+        files.write_png(out / CONFIDENCE_FILE, texture[..., None])
     ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
     ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
     _write_light(asset, out)
@@ -97,18 +101,15 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
         return mesh.simplify(mesh.smooth(whole), preset.triangles)
 
 
-def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
-    """Unwrap the mesh, bake its textures, write the GLB, and beside it the confidence texture over the same UVs."""
+def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> atlas.UnwrappedMesh:
+    """Unwrap the mesh, bake its textures, and write the GLB; returns the unwrapped mesh."""
     with progress.task("texture coordinates"):
         flat = atlas.unwrap(shape, preset.texture)
     with progress.task("baking textures"):
         textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
     assert asset.material is not None, "the asset has no material"
-    with progress.task("confidence of the material"):
-        score = confidence.confidence_of(asset, asset.camera).score
-        texture = bake.nearest_gaussian_texture(score, asset, flat, resolution=512)
-    files.write_png(path.parent / CONFIDENCE_FILE, texture[..., None])
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
+    return flat
 
 
 def _write_light(asset: Asset, out: Path) -> None:

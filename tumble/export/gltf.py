@@ -1,6 +1,5 @@
 """GLB writer for a textured mesh: glTF 2.0 binary with one JSON chunk and one binary chunk."""
 
-import io
 import json
 import math
 import struct
@@ -8,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
 from tumble import __version__
 from tumble.export.atlas import UnwrappedMesh
@@ -28,8 +27,9 @@ ARRAY_BUFFER = 34962
 """Target of buffer views with vertex attributes (glTF 2.0, section 5.11)."""
 ELEMENT_ARRAY_BUFFER = 34963
 """Target of buffer views with vertex indices."""
-PNG_LEVEL = 6
-"""Compression of textures; level 9 takes ten times as long for files that are 8 % smaller."""
+PNG_SETTINGS = (cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+"""Compression of textures: runs only. zlib's default strategy takes four times as long for files that are 8 % smaller;
+without a level, OpenCV would try one filter only, for files that are 35 % larger."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class _Buffer:
 
     def png(self, values: UInt8[np.ndarray, "h w *c"]) -> dict[str, Any]:
         """Append an image as PNG; returns its entry for `images`."""
-        file = io.BytesIO()
-        Image.fromarray(values).save(file, "PNG", optimize=False, compress_level=PNG_LEVEL)
-        return {"bufferView": self.view(file.getvalue()), "mimeType": "image/png"}
+        bgr = values[..., ::-1] if values.ndim == 3 else values
+        encoded = cv2.imencode(".png", bgr, PNG_SETTINGS)[1]
+        return {"bufferView": self.view(encoded.tobytes()), "mimeType": "image/png"}
 
 
 def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float, metres: float) -> None:

@@ -6,6 +6,7 @@ Pixel centres are at +0.5 in frames and windows, so the position `at` in a windo
 import hashlib
 import math
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -26,6 +27,10 @@ CONTRAST_SIGMA = 16.0
 CONTRAST_FLOOR = 3.0
 """Contrast added in the normalisation, so that noise is not amplified [code values]."""
 
+KEPT_WINDOWS = 64
+"""Number of windows that are kept, as a view has the same window for all pairs with smaller objects and in all
+matchers; limits memory to some 60 MB."""
+
 
 @dataclass(frozen=True)
 class Window:
@@ -42,7 +47,7 @@ class Window:
     scale: float
     """Pixels of the window per pixel of the frame."""
 
-    @property
+    @cached_property
     def grey(self) -> UInt8[np.ndarray, "h w"]:
         """Grey values with locally normalised contrast, which removes shading and changes of exposure.
 
@@ -51,7 +56,10 @@ class Window:
         grey = cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
         detail = grey - cv2.GaussianBlur(grey, (0, 0), CONTRAST_SIGMA)
         spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), CONTRAST_SIGMA))
-        return (128 + 45 * detail / (spread + CONTRAST_FLOOR)).clip(0, 255).astype(np.uint8)
+        detail *= 45
+        detail /= spread + CONTRAST_FLOOR
+        detail += 128
+        return detail.clip(0, 255, out=detail).astype(np.uint8)
 
     def in_frame(self, at: Float[np.ndarray, "m 2"]) -> Float[Tensor, "m 2"]:
         """Positions in the frame from positions in the window [pixels, centres at +0.5]."""
@@ -70,12 +78,14 @@ def interior_pixels(mask: UInt8[Tensor, "h w"]) -> Bool[np.ndarray, "h w"]:
     return cv2.erode((mask.cpu().numpy() == OBJECT).astype(np.uint8), disc) > 0
 
 
+@lru_cache(KEPT_WINDOWS)
 def extent(view: View) -> float:
     """Longer side of the bounding box of the interior pixels [pixels]; 0 if there are none."""
     rows, columns = np.nonzero(interior_pixels(view.mask))
     return 0.0 if len(rows) == 0 else float(max(np.ptp(rows), np.ptp(columns)) + 1)
 
 
+@lru_cache(KEPT_WINDOWS)
 def crop_window(view: View, width: float, size: int) -> Window:
     """Square window of `size` pixels around the centre of the object, `width` pixels of the frame wide.
 
@@ -93,9 +103,9 @@ def crop_window(view: View, width: float, size: int) -> Window:
         # Low-pass filter against aliasing: half a pixel of the coarser grid.
         rgb = cv2.GaussianBlur(rgb, (0, 0), 0.5 * math.sqrt(1 / scale**2 - 1) + 1e-3)
     image = cv2.warpAffine(rgb, warp, (size, size), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
-    at = np.stack([column, row], -1).reshape(-1, 2) / scale + corner
-    inside = _lookup(usable, torch.from_numpy(at.astype(np.float32))).reshape(size, size)
+    at = (np.arange(size)[:, None] + 0.5) / scale + corner
+    column, row = np.floor(at.astype(np.float32)).astype(int).T
+    inside = _values(usable, row[:, None], column)
     return Window(_fill_outside(image, inside), inside, usable, (float(corner[0]), float(corner[1])), scale)
 
 
@@ -108,14 +118,6 @@ def crop_windows(view_i: View, view_j: View, size: int) -> tuple[Window, Window]
     return crop_window(view_i, width, size), crop_window(view_j, width, size)
 
 
-def _lookup(mask: Bool[np.ndarray, "h w"], uv: Float[Tensor, "m 2"]) -> Bool[np.ndarray, " m"]:
-    """Values of a mask at positions; false outside the frame."""
-    height, width = mask.shape
-    column, row = uv.floor().long().numpy().T
-    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return within & mask[row.clip(0, height - 1), column.clip(0, width - 1)]
-
-
 def digest(view: View) -> str:
     """Hash of a view's image and mask, independent of its index."""
     digester = hashlib.blake2b(digest_size=16)
@@ -123,6 +125,19 @@ def digest(view: View) -> str:
         digester.update(repr(tuple(values.shape)).encode())
         digester.update(values.cpu().numpy().tobytes())
     return digester.hexdigest()
+
+
+def _lookup(mask: Bool[np.ndarray, "h w"], uv: Float[Tensor, "m 2"]) -> Bool[np.ndarray, " m"]:
+    """Values of a mask at positions; false outside the frame."""
+    column, row = uv.floor().long().numpy().T
+    return _values(mask, row, column)
+
+
+def _values(mask: Bool[np.ndarray, "h w"], row: np.ndarray, column: np.ndarray) -> Bool[np.ndarray, "..."]:
+    """Values of a mask at pixels, whose rows and columns broadcast; false outside the frame."""
+    height, width = mask.shape
+    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return within & mask[row.clip(0, height - 1), column.clip(0, width - 1)]
 
 
 def _fill_outside(rgb: UInt8[np.ndarray, "h w 3"], usable: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -139,7 +154,9 @@ def _fill_outside(rgb: UInt8[np.ndarray, "h w 3"], usable: Bool[np.ndarray, "h w
             filled = mean
             continue
         coarser = np.asarray(cv2.pyrUp(filled, dstsize=weight.shape[::-1]), np.float32)
-        filled = coarser + weight[..., None].clip(0, 1) * (mean - coarser)
+        mean -= coarser
+        mean *= weight[..., None].clip(0, 1)
+        filled = np.add(mean, coarser, out=mean)
     assert filled is not None, "there is at least one level"
     return filled.round().clip(0, 255).astype(np.uint8)
 

@@ -46,9 +46,9 @@ def load(device: torch.device | str):
         if min(len(uv_i), len(uv_j)) < 2:
             return empty_match(view_i.number, view_j.number)
         # Unit vectors with non-negative components: the cosine is in [0, 1].
-        distance = np.sqrt((2 - 2 * roots_i @ roots_j.T).clip(0))
-        best, ratio = _best_two(distance)
-        back, ratio_back = _best_two(distance.T)
+        squared = (2 - 2 * roots_i @ roots_j.T).clip(0)
+        back, ratio_back = _best_two(np.ascontiguousarray(squared.T))
+        best, ratio = _best_two(squared)
         i = np.arange(len(best))
         max_ratio = np.maximum(ratio, ratio_back[best])
         i = i[(back[best] == i) & (max_ratio < MAX_RATIO)]
@@ -76,9 +76,9 @@ def _extract(view: View) -> Features:
     return window.in_frame(at[kept]), roots[kept]
 
 
-def _best_two(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the smallest distance in every row, and its ratio to the second smallest."""
-    nearest = np.argpartition(distance, 1, axis=1)[:, :2]
-    pair = np.take_along_axis(distance, nearest, 1)
-    best = nearest[np.arange(len(distance)), pair.argmin(1)]
-    return best, pair.min(1) / pair.max(1).clip(1e-6)
+def _best_two(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index of the smallest distance in every row, and its ratio to the second smallest; overwrites the argument."""
+    rows, best = np.arange(len(squared)), squared.argmin(1)
+    smallest = squared[rows, best]
+    squared[rows, best] = np.inf
+    return best, np.sqrt(smallest) / np.sqrt(squared.min(1)).clip(1e-6)

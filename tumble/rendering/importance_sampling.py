@@ -5,17 +5,21 @@ uniform light and diffuse surfaces under a small light converge equally well. Ev
 Gaussians; occluded light is replaced by the radiance of the occluding Gaussians (`GlossyBounce`).
 """
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from tumble import backends
-from tumble.maths import equirect_from_direction, fibonacci_sphere, texel_directions, texel_solid_angles
+from tumble.backends import GlossyGaussians, LightTables, SurfaceSamples
+from tumble.maths import equirect_from_direction, fibonacci_sphere, texel_solid_angles
 from tumble.rendering import brdf
 from tumble.rendering.prefiltered_light import Prefiltered
-from tumble.rendering.shading import Bounce, Surface, specular
+from tumble.rendering.shading import Bounce, Surface, reflectance_table, specular
 from tumble.rendering.trace import Tracer, trace
 from tumble.scene import Environment
 
@@ -24,6 +28,8 @@ MAX_RAYS = 1 << 18
 CELL_ROWS = 512
 """Target number of rows of a light sampler's cells; maps with as many rows or more get twice as many, which is two
 million cells in all."""
+ROW_BUCKETS, COLUMN_BUCKETS = 1024, 256
+"""Numbers of intervals of the guides to the rows of cells and to the cells of a row (`LightTables`); powers of two."""
 BOUNCE_DIRECTIONS = 256
 """Directions in which the light is sampled for the diffuse indirect radiance."""
 GOLDEN_RATIO_3D = 1.2207440846057596
@@ -45,6 +51,21 @@ class LightSampler:
     cumulative: Float64[Tensor, " cells"]
     """Cumulative probability of the cells, row by row; in 64 bits, because of the dynamic range over a million
     cells."""
+
+    @cached_property
+    def tables(self) -> LightTables:
+        """Light and tables for the kernel."""
+        rows, columns = self.density.shape
+        like = {"dtype": torch.float64, "device": self.cumulative.device}
+        ends = self.cumulative[columns - 1 :: columns].contiguous()
+        starts = torch.cat([ends.new_zeros(1), ends[:-1]])
+        row_guide = torch.searchsorted(ends, torch.arange(ROW_BUCKETS + 1, **like) / ROW_BUCKETS, right=True)
+        along = torch.arange(COLUMN_BUCKETS + 1, **like) / COLUMN_BUCKETS
+        values = starts[:, None] + along * (ends - starts)[:, None]
+        column_guide = torch.searchsorted(self.cumulative, values, right=True)
+        cosines = (math.pi / rows * torch.arange(rows + 1, **like)).cos()
+        guides = row_guide.int(), column_guide.int()
+        return LightTables(self.environment.radiance, self.density, self.cumulative, cosines, *guides)
 
     def sample(self, u: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
         """Unit directions, env frame, from uniform numbers in [0, 1): `u[0]` chooses the row, `u[1]` the column."""
@@ -90,13 +111,21 @@ def light_sampler(environment: Environment) -> LightSampler:
     h, w, _ = environment.log_radiance.shape
     # Averages of a finer map are also nonzero wherever the map is nonzero.
     coarse = environment if h <= CELL_ROWS else environment.resampled(CELL_ROWS, w * CELL_ROWS // h)
-    h, w, _ = coarse.log_radiance.shape
-    h, w = (x * max(2, min(8, CELL_ROWS // h)) for x in (h, w))
-    like = {"dtype": environment.log_radiance.dtype, "device": environment.log_radiance.device}
-    brightness = coarse.lookup(texel_directions(h, w, **like)).mean(-1)
-    power = brightness.double() * texel_solid_angles(h, w, dtype=torch.float64, device=like["device"])
+    brightness = _enlarged(coarse.radiance.mean(-1), max(2, min(8, CELL_ROWS // coarse.radiance.shape[0])))
+    area = texel_solid_angles(*brightness.shape, dtype=torch.float64, device=brightness.device)
+    power = brightness.double() * area
     density = brightness / power.sum().to(brightness)
     return LightSampler(environment, density, power.flatten().cumsum(0) / power.sum())
+
+
+def _enlarged(texels: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "{factor}*h {factor}*w"]:
+    """Bilinear lookups in an equirectangular map (`scene.bilinear`) at the texel centres of a finer one."""
+    # The neighbour of a row across a pole is that row, half a revolution away.
+    above, below = (row.roll(texels.shape[1] // 2, 1) for row in (texels[:1], texels[-1:]))
+    padded = torch.cat([above, texels, below])
+    padded = torch.cat([padded[:, -1:], padded, padded[:, :1]], 1)
+    finer = interpolate(padded[None, None], scale_factor=factor, mode="bilinear", align_corners=False)[0, 0]
+    return finer[factor:-factor, factor:-factor]
 
 
 @dataclass(frozen=True)
@@ -141,29 +170,51 @@ def relight_surface(
         n_light: Samples per point by importance sampling of the light.
         bounce: Indirect light; occluded directions are black when None.
     """
-    shift = torch.rand(len(surface.points), 1, 3, generator=generator, dtype=albedo.dtype, device=generator.device)
-    diffuse, radiance = None if bounce is None else _diffuse(bounce, R_env_obj), light.environment.radiance
-    backend = backends.choose(albedo.device, albedo.dtype)
+    shift = torch.rand(len(surface.points), 3, generator=generator, dtype=albedo.dtype, device=generator.device)
+    lattice = _lattice(n_brdf + n_light).to(albedo)
+    origins = tracer.ray_origins(surface.points, surface.normals)
+    samples = SurfaceSamples(
+        origins, surface.normals, surface.views, albedo, roughness, shift.to(albedo.device), lattice
+    )
+    gaussians = None if bounce is None else _glossy_gaussians(bounce, tracer, R_env_obj)
+    kernel = backends.relight_kernel(tracer.backend)
+    if kernel is not None:
+        return kernel(tracer.bvh, samples, light.tables, gaussians, R_env_obj, n_brdf, f0)
+    return relight_by_operations(samples, light, R_env_obj, tracer, n_brdf, f0, bounce, gaussians)
+
+
+def relight_by_operations(
+    samples: SurfaceSamples,
+    light: LightSampler,
+    R_env_obj: Float[Tensor, "3 3"],
+    tracer: Tracer,
+    n_brdf: int,
+    f0: float,
+    bounce: GlossyBounce | None,
+    gaussians: GlossyGaussians | None,
+) -> Float[Tensor, "p 3"]:
+    """The definition of `RelightKernel` by operations of torch, for every device."""
+    n_light, radiance = len(samples.lattice) - n_brdf, light.environment.radiance
+    backend = backends.choose(radiance.device, radiance.dtype)
     chunk = max(1, MAX_RAYS // (n_brdf + n_light))
-    parts = [albedo.new_zeros(0, 3)]
-    for at in torch.arange(len(surface.points), device=albedo.device).split(chunk):
-        normals, views, rough = surface.normals[at, None], surface.views[at, None], roughness[at, None]
-        u = (_lattice(n_brdf + n_light).to(albedo) + shift[at.to(shift.device)].to(albedo)) % 1
+    parts = [samples.albedo.new_zeros(0, 3)]
+    for at in torch.arange(len(samples.origins), device=radiance.device).split(chunk):
+        normals, views, rough = samples.normals[at, None], samples.views[at, None], samples.roughness[at, None]
+        u = (samples.lattice + samples.shift[at, None]) % 1
         scattered = brdf.sample(u[:, :n_brdf], views, normals, roughness=rough)
         directions = torch.cat([scattered, light.sample(u[:, n_brdf:, 1:]) @ R_env_obj], 1)
         # All that follows is for the directions above the horizon, in one list for all points.
         above = torch.where((directions @ normals.mT).flatten() > 0)[0]
         index, wi = at[above // (n_brdf + n_light)], directions.flatten(0, 1).index_select(0, above)
-        normals, views, rough = (x.index_select(0, index) for x in (surface.normals, surface.views, roughness))
+        normals, views, rough = (x.index_select(0, index) for x in (samples.normals, samples.views, samples.roughness))
         wi_env = wi @ R_env_obj.mT
         density = n_brdf * brdf.pdf(wi, views, normals, roughness=rough) + n_light * light.pdf(wi_env)
-        value = brdf.evaluate(wi, views, normals, albedo=albedo.index_select(0, index), roughness=rough, f0=f0)
+        albedo = samples.albedo.index_select(0, index)
+        value = brdf.evaluate(wi, views, normals, albedo=albedo, roughness=rough, f0=f0)
         weight = torch.where(density > 0, value * brdf.cosine(wi, normals) / density, 0.0)
-        origins = tracer.ray_origins(surface.points, surface.normals).index_select(0, index)
+        origins = samples.origins.index_select(0, index)
         environment = backend.lookup(radiance[None], wi_env, torch.zeros_like(wi_env[:, 0]))
-        arriving = _arriving_radiance(
-            origins, wi, environment, R_env_obj, tracer, f0=f0, bounce=bounce, diffuse=diffuse
-        )
+        arriving = _arriving_radiance(origins, wi, environment, R_env_obj, tracer, f0, bounce, gaussians)
         reflected = torch.zeros_like(directions).flatten(0, 1).index_copy_(0, above, weight * arriving)
         parts.append(reflected.view_as(directions).sum(1))
     return torch.cat(parts)
@@ -175,27 +226,28 @@ def _arriving_radiance(
     environment: Float[Tensor, "r 3"],
     R_env_obj: Float[Tensor, "3 3"],
     tracer: Tracer,
-    *,
     f0: float,
     bounce: GlossyBounce | None,
-    diffuse: Float[Tensor, "n 3"] | None,
+    gaussians: GlossyGaussians | None,
 ) -> Float[Tensor, "r 3"]:
     """Incident radiance along rays: the environment's times the transmittance, plus that of occluding Gaussians."""
-    hits = trace(tracer, origins, wi, diffuse)
+    hits = trace(tracer, origins, wi, None if gaussians is None else gaussians.radiance)
     arriving = hits.transmittance[:, None] * environment + hits.radiance
-    if bounce is None:
+    if bounce is None or gaussians is None:
         return arriving
     occluded = torch.where(hits.hit >= 0)[0]
     index = hits.hit[occluded].long()
-    normals = tracer.gaussians.normals[index]
-    glossy = specular(normals, -wi[occluded], bounce.roughness[index], bounce.prefiltered, R_env_obj, f0)
+    normals, roughness = gaussians.normals[index], gaussians.roughness[index]
+    glossy = specular(normals, -wi[occluded], roughness, bounce.prefiltered, R_env_obj, f0)
     return arriving.index_add(0, occluded, (1 - hits.transmittance[occluded])[:, None] * glossy)
 
 
-def _diffuse(bounce: GlossyBounce, R_env_obj: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3"]:
-    """Diffuse radiance of every Gaussian under the light of one frame."""
+def _glossy_gaussians(bounce: GlossyBounce, tracer: Tracer, R_env_obj: Float[Tensor, "3 3"]) -> GlossyGaussians:
+    """Occluding Gaussians under the light of one frame."""
     directions = fibonacci_sphere(BOUNCE_DIRECTIONS).to(R_env_obj)
-    return bounce.diffuse.radiance(directions, bounce.prefiltered.cell_radiance(directions @ R_env_obj.mT))
+    radiance = bounce.diffuse.radiance(directions, bounce.prefiltered.cell_radiance(directions @ R_env_obj.mT))
+    table = reflectance_table(radiance.dtype, radiance.device)
+    return GlossyGaussians(radiance, tracer.gaussians.normals, bounce.roughness, bounce.prefiltered.stack, table)
 
 
 def _lattice(n: int) -> Float64[Tensor, "n 3"]:

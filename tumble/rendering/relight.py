@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -65,6 +65,7 @@ def relight(
     camera: Camera,
     *,
     geometry: TracedGeometry | None = None,
+    buffers: Sequence[Buffers] | None = None,
     seed: int = 0,
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """Images of the object along a trajectory, under a light: linear radiance over black, one view at a time.
@@ -76,6 +77,7 @@ def relight(
         trajectory: Poses; its field `light` defines whether the light is fixed to the camera or to the object.
         camera: Intrinsics and image size.
         geometry: That of the asset, if it is known from an earlier call.
+        buffers: Those of the frames by `antialiased_gbuffer`, if they are known.
         seed: Seed of the random samples.
     """
     material = asset.material
@@ -84,7 +86,7 @@ def relight(
     diffuse = Bounce(material.albedo.mean(1), geometry.transfer)
     bounce = GlossyBounce(diffuse, material.roughness.mean(1, keepdim=True), prefilter(environment))
     generator = torch.Generator().manual_seed(seed)
-    for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
+    for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera, buffers):
         shaded = relight_surface(
             points,
             points.sample(view.features["albedo"]),
@@ -179,10 +181,10 @@ def _transfer(asset: Asset, tracer: Tracer) -> Float[Tensor, "n 9"]:
 
 
 def _surfaces(
-    cfg: Config, asset: Asset, trajectory: Trajectory, camera: Camera
+    cfg: Config, asset: Asset, trajectory: Trajectory, camera: Camera, buffers: Sequence[Buffers] | None = None
 ) -> Iterator[tuple[Buffers, Surface, Float[Tensor, "3 3"]]]:
     """For each frame: buffers, surface points, and rotation from the object frame to the env frame."""
     for i, R_env_obj in enumerate(trajectory.R_env_obj):
         T_cam_obj = trajectory.T_cam_obj[i]
-        view = antialiased_gbuffer(asset, T_cam_obj, camera)
+        view = antialiased_gbuffer(asset, T_cam_obj, camera) if buffers is None else buffers[i]
         yield view, surface(view, T_cam_obj, camera, alpha_min=cfg.alpha_min), R_env_obj

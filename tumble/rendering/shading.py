@@ -216,11 +216,11 @@ def _reflectance(
 ) -> Float[Tensor, "p 1"]:
     """Directional albedo of the specular lobe divided by f0."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
-    return brdf.split_sum(_table(nov.dtype, nov.device), nov, roughness)
+    return brdf.split_sum(reflectance_table(nov.dtype, nov.device), nov, roughness)
 
 
 @cache
-def _table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size"]:
+def reflectance_table(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size"]:
     """The split-sum table, cached per device."""
     return brdf.split_sum_table().to(device, dtype)
 

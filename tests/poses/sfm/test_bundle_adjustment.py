@@ -74,15 +74,19 @@ def relative_errors(found: BundleState, truth: BundleState) -> Tensor:
     return SO3.from_matrix(a @ b.mT).angle()
 
 
+def linearised(problem: Problem, at: BundleState, scale: float) -> bundle_adjustment._System:
+    return bundle_adjustment._linearise(problem, at, scale, bundle_adjustment._layout(problem))
+
+
 def test_the_gradient_equals_finite_differences_of_the_cost() -> None:
     """For cameras and points, with the Cauchy loss and priors."""
     truth = scene(2, 3, 5)
     problem, at = observed(truth, noise=1.0), perturbed(truth, 0.05)
-    system = bundle_adjustment._linearise(problem, at, 1.5)
+    system = linearised(problem, at, 1.5)
     h = 1e-6
 
     def cost(d_cam: Tensor, d_point: Tensor) -> Tensor:
-        return bundle_adjustment._linearise(problem, bundle_adjustment._apply_step(at, d_cam, d_point), 1.5).cost.sum()
+        return linearised(problem, bundle_adjustment._apply_step(at, d_cam, d_point), 1.5).cost.sum()
 
     cameras, points = torch.zeros(6, 6).double(), torch.zeros(10, 3).double()
     for index in range(36):
@@ -109,7 +113,7 @@ def test_derivatives_by_the_focal_length_equal_finite_differences() -> None:
     def at_focal(
         d: Tensor, problem: Problem = problem, at: BundleState = at, scale: float = 1.5
     ) -> bundle_adjustment._System:
-        return bundle_adjustment._linearise(problem, replace(at, log_focal=d), scale)
+        return linearised(problem, replace(at, log_focal=d), scale)
 
     system = at_focal(torch.full((2,), 0.02).double(), replace(problem, log_focal_prior=-0.1))
     for group in range(2):
@@ -137,11 +141,12 @@ def test_elimination_solves_the_dense_system(short: int, factor: float | None, m
     Both ways to eliminate points are tested, each with a known and with an estimated focal length.
     """
     monkeypatch.setattr(bundle_adjustment, "SHORT_TRACK", short)
+    monkeypatch.setattr(bundle_adjustment, "PAIRS_AT_ONCE", 4)
     truth = scene(1, 3, 6)
     problem, at = observed(truth, noise=0.5), perturbed(truth, 0.02)
     if factor is not None:
         problem, at = with_wrong_focal(at, problem, factor)
-    system = bundle_adjustment._linearise(problem, at, 2.0)
+    system = linearised(problem, at, 2.0)
     damping = torch.tensor([0.01]).double()
     d_cam, d_point, d_focal = bundle_adjustment._solve(problem, at, system, damping, bundle_adjustment._layout(problem))
     H = torch.zeros(36, 36).double()

@@ -7,10 +7,10 @@
 #pragma once
 #include "project.h"
 
-enum { WIDE = 16, LEVELS = 8, BUFFER = 128 };
+enum { WIDE = 16, LEVELS = 8, BUFFER = 128, MAX_NEAR = 256, FIELDS = 15 };
 
 struct Leaf {
-    float W[9][WIDE], mean[3][WIDE], opacity[WIDE];
+    float W[9][WIDE], extent[6][WIDE], mean[3][WIDE], opacity[WIDE];   // extent: matrix whose form is the squared reach
     int id[WIDE];
 };
 struct Node {
@@ -36,7 +36,7 @@ struct Rays {
     int *hit, *bits;
 };
 
-static void leaf_fields(Bvh& t, float* W) {
+static void leaf_fields(Bvh& t, float* fields) {
     for (int first = 0; first < t.n; first += LANES) {
         int count = imin2(LANES, t.n - first);
         vf q[4];
@@ -48,12 +48,13 @@ static void leaf_fields(Bvh& t, float* W) {
         vf inv[3] = {1.0f / s.x, 1.0f / s.y, 1.0f / s.z}, m[3] = {mu.x, mu.y, mu.z};
         vf cut = 2.0f * vlog(vmax(gather(t.opacity, 1, 0, first, count) * (1.0f / t.alpha_min), splat(1.0f)));
         cut = vmin(cut + 1e-4f, splat(t.sigmas * t.sigmas * 1.0001f));
-        for (int i = 0; i < 3; i++) {
+        for (int i = 0, k = 0; i < 3; i++) {
             V3 side = row(R, i) * s;
             vf half = vsqrt(cut * dot(side, side)) + 1e-6f;
+            for (int j = i; j < 3; j++, k++) scatter(fields, FIELDS, 9 + k, first, count, cut * dot(side, row(R, j) * s));
             scatter(t.boxes, 6, i, first, count, m[i] - half), scatter(t.boxes, 6, 3 + i, first, count, m[i] + half);
             scatter(t.normals, 3, i, first, count, R(i, 2));
-            for (int j = 0; j < 3; j++) scatter(W, 9, 3 * i + j, first, count, R(j, i) * inv[i]);
+            for (int j = 0; j < 3; j++) scatter(fields, FIELDS, 3 * i + j, first, count, R(j, i) * inv[i]);
         }
     }
 }
@@ -133,13 +134,14 @@ static void enclose(const Bvh& t, Node& node, int c, int from, int to) {
     if (from >= to) node.sine[c] = -2;
 }
 
-static void fill_tree(Bvh& t, const float* W) {
+static void fill_tree(Bvh& t, const float* fields) {
     for (int l = 0; l < t.n_leaves; l++) {
         Leaf& leaf = t.leaves[l];
         clear(&leaf, sizeof leaf);
         for (int c = 0; c < WIDE && l * WIDE + c < t.n; c++) {
             int g = t.order[l * WIDE + c];
-            for (int j = 0; j < 9; j++) leaf.W[j][c] = W[9 * (i64)g + j];
+            for (int j = 0; j < 9; j++) leaf.W[j][c] = fields[FIELDS * (i64)g + j];
+            for (int j = 0; j < 6; j++) leaf.extent[j][c] = fields[FIELDS * (i64)g + 9 + j];
             for (int j = 0; j < 3; j++) leaf.mean[j][c] = t.means[3 * (i64)g + j];
             leaf.opacity[c] = t.opacity[g], leaf.id[c] = g;
         }
@@ -169,21 +171,6 @@ INLINE Ray ray_at(const float* o, const float* d) {
     return r;
 }
 
-// Children of a node that the ray may hit, one bit each.
-INLINE u32 met_children(const Node& n, const Ray& r) {
-    u32 met = 0;
-    for (int c = 0; c < WIDE; c += LANES) {
-        vf near = splat(0.0f), far = splat(1e30f);
-        for (int a = 0; a < 3; a++) {
-            vf t0 = load(n.low[a] + c) * r.inv[a] - r.o_inv[a], t1 = load(n.high[a] + c) * r.inv[a] - r.o_inv[a];
-            near = vmax(near, vmin(t0, t1)), far = vmin(far, vmax(t0, t1));
-        }
-        vf along = load(n.axis[0] + c) * r.d[0] + load(n.axis[1] + c) * r.d[1] + load(n.axis[2] + c) * r.d[2];
-        met |= bits((near <= far) & (along <= load(n.sine + c))) << c;
-    }
-    return met;
-}
-
 // Alphas of the Gaussians of a leaf on the ray (0 where not hit) and distances of their peaks.
 INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, vf& alpha, vf& z) {
     vf p[3], Wd[3], Wp[3];
@@ -205,9 +192,113 @@ INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, vf&
     return on;
 }
 
-// Calls visit(alpha, z, ids, on) for every group of Gaussians with hits, in any order, until it returns false.
+// Leaves that rays from one point into the half space above it may meet, in ascending order, in whole vectors.
+struct Near {
+    float low[3][MAX_NEAR], high[3][MAX_NEAR], axis[3][MAX_NEAR], sine[MAX_NEAR];
+    int leaf[MAX_NEAR], count;
+};
+
+// Children of a node whose boxes reach into the half space above a point, one bit each.
+INLINE u32 children_above(const Node& n, const float* o, const float* normal) {
+    u32 met = 0;
+    for (int c = 0; c < WIDE; c += LANES) {
+        vf height = splat(1e-5f);   // rounding must not lose a child
+        for (int a = 0; a < 3; a++)
+            height += vmax((load(n.low[a] + c) - o[a]) * normal[a], (load(n.high[a] + c) - o[a]) * normal[a]);
+        met |= bits((height > 0.0f) & (load(n.sine + c) > -2.0f)) << c;
+    }
+    return met;
+}
+
+// Whether a Gaussian of a leaf reaches into the half space above a point.
+INLINE bool is_above(const Leaf& leaf, const float* o, const float* n) {
+    for (int c = 0; c < WIDE; c += LANES) {
+        vf height = splat(1e-5f), form = {};
+        for (int a = 0, k = 0; a < 3; a++) {
+            height += (load(leaf.mean[a] + c) - o[a]) * n[a];
+            for (int b = a; b < 3; b++, k++) form += load(leaf.extent[k] + c) * (n[a] * n[b] * (a == b ? 1 : 2));
+        }
+        if (any((height + vsqrt(vmax(form, vf{})) > 0.0f) & (load(leaf.opacity + c) > 0.0f))) return true;
+    }
+    return false;
+}
+
+// Collects the leaves above a point; false if there are so many that the tree is faster.
+static bool collect_near(const Bvh& t, const float* o, const float* normal, Near& near) {
+    struct Task {
+        int level, node;
+        u32 met;
+    } stack[LEVELS];
+    int top = 0, root = t.n_levels - 1;
+    stack[0] = {root, 0, children_above(t.nodes[t.first_node[root]], o, normal)};
+    near.count = 0;
+    while (top >= 0) {
+        Task& task = stack[top];
+        if (!task.met) {
+            top--;
+            continue;
+        }
+        int c = __builtin_ctz(task.met), child = task.node * WIDE + c, level = task.level;
+        task.met &= task.met - 1;
+        if (level) {
+            stack[++top] = {level - 1, child, children_above(t.nodes[t.first_node[level - 1] + child], o, normal)};
+            continue;
+        }
+        if (!is_above(t.leaves[child], o, normal)) continue;
+        if (near.count == MAX_NEAR) return false;
+        const Node& n = t.nodes[t.first_node[0] + task.node];
+        int to = near.count++;
+        for (int a = 0; a < 3; a++)
+            near.low[a][to] = n.low[a][c], near.high[a][to] = n.high[a][c], near.axis[a][to] = n.axis[a][c];
+        near.sine[to] = n.sine[c], near.leaf[to] = child;
+    }
+    for (int i = near.count; i < (near.count + LANES - 1) / LANES * LANES; i++) {   // never met
+        for (int a = 0; a < 3; a++) near.low[a][i] = near.high[a][i] = near.axis[a][i] = 0;
+        near.sine[i] = -2;
+    }
+    return true;
+}
+
+// Whether the ray may hit the boxes from c on.
+template <class Boxes>
+INLINE u32 met_boxes(const Boxes& n, int c, const Ray& r) {
+    vf near = splat(0.0f), far = splat(1e30f);
+    for (int a = 0; a < 3; a++) {
+        vf t0 = load(n.low[a] + c) * r.inv[a] - r.o_inv[a], t1 = load(n.high[a] + c) * r.inv[a] - r.o_inv[a];
+        near = vmax(near, vmin(t0, t1)), far = vmin(far, vmax(t0, t1));
+    }
+    vf along = load(n.axis[0] + c) * r.d[0] + load(n.axis[1] + c) * r.d[1] + load(n.axis[2] + c) * r.d[2];
+    return bits((near <= far) & (along <= load(n.sine + c)));
+}
+
+// Children of a node that the ray may hit, one bit each.
+INLINE u32 met_children(const Node& n, const Ray& r) {
+    u32 met = 0;
+    for (int c = 0; c < WIDE; c += LANES) met |= met_boxes(n, c, r) << c;
+    return met;
+}
+
+// Calls visit(alpha, z, ids, on) for every group of Gaussians of a leaf with hits, until it returns false.
 template <class F>
-INLINE void search(const Bvh& t, const Ray& ray, F visit) {
+INLINE bool visit_leaf(const Bvh& t, int l, const Ray& ray, F visit) {
+    const Leaf& leaf = t.leaves[l];
+    for (int c = 0; c < WIDE; c += LANES) {
+        vf alpha, z;
+        vi on = met_gaussians(t, leaf, c, ray, alpha, z);
+        if (any(on) && !visit(alpha, z, leaf.id + c, on)) return false;
+    }
+    return true;
+}
+
+// The same for all leaves, in ascending order; those of `near` if it is given.
+template <class F>
+INLINE void search(const Bvh& t, const Near* near, const Ray& ray, F visit) {
+    if (near) {
+        for (int c = 0; c < near->count; c += LANES)
+            for (u32 met = met_boxes(*near, c, ray); met; met &= met - 1)
+                if (!visit_leaf(t, near->leaf[c + __builtin_ctz(met)], ray, visit)) return;
+        return;
+    }
     struct Task {
         int level, node;
         u32 met;
@@ -227,12 +318,7 @@ INLINE void search(const Bvh& t, const Ray& ray, F visit) {
             if (met) stack[++top] = {level - 1, child, met};
             continue;
         }
-        const Leaf& leaf = t.leaves[child];
-        for (int c = 0; c < WIDE; c += LANES) {
-            vf alpha, z;
-            vi on = met_gaussians(t, leaf, c, ray, alpha, z);
-            if (any(on) && !visit(alpha, z, leaf.id + c, on)) return;
-        }
+        if (!visit_leaf(t, child, ray, visit)) return;
     }
 }
 
@@ -244,9 +330,9 @@ INLINE float product(vf x) {
     return p[0];
 }
 
-INLINE bool is_visible(const Bvh& t, const Ray& ray) {
+INLINE bool is_visible(const Bvh& t, const Near* near, const Ray& ray) {
     float T = 1;
-    search(t, ray, [&](vf alpha, vf, const int*, vi) { return (T *= product(1.0f - alpha)) >= t.visible; });
+    search(t, near, ray, [&](vf alpha, vf, const int*, vi) { return (T *= product(1.0f - alpha)) >= t.visible; });
     return T >= t.visible;
 }
 
@@ -290,11 +376,11 @@ struct Hits {
 };
 
 // Collects the hits behind (after_z, after_id). If the buffer is too small, only the nearest ones, and `all` is false.
-static void collect(const Bvh& t, const Ray& ray, float after_z, int after_id, Hits& hits, bool& all) {
+static void collect(const Bvh& t, const Near* near, const Ray& ray, float after_z, int after_id, Hits& hits, bool& all) {
     float limit_z = 1e30f;
     int limit_id = 0;
     hits.count = 0, all = true;
-    search(t, ray, [&](vf alpha, vf z, const int* id, vi on) {
+    search(t, near, ray, [&](vf alpha, vf z, const int* id, vi on) {
         float alphas[LANES], depths[LANES];
         store(alphas, alpha), store(depths, z);
         on &= (z >= after_z) & (z <= limit_z);
@@ -313,13 +399,13 @@ static void collect(const Bvh& t, const Ray& ray, float after_z, int after_id, H
 }
 
 // Blends the hits of a ray front to back; returns the dominant Gaussian.
-static int trace_ray(const Bvh& t, const Ray& ray, const float* radiance, float* transmittance, float* out) {
+static int trace_ray(const Bvh& t, const Near* near, const Ray& ray, const float* radiance, float* transmittance, float* out) {
     float T = 1, best = 0, sum[3] = {}, z = -1;
     int dominant = -1, id = 0;
     bool all = false;
     Hits hits;
     while (!all && T >= t.T_min) {
-        collect(t, ray, z, id, hits, all);
+        collect(t, near, ray, z, id, hits, all);
         for (int place = 0; place < hits.count && T >= t.T_min; place++) {
             int i = hits.order[place];
             float w = T * hits.alpha[i];
@@ -342,19 +428,21 @@ enum { RAYS_AT_ONCE = 64 };
 static void trace_share(const Rays& r, int share) {
     for (i64 start = (i64)share * RAYS_AT_ONCE; start < r.n_rays; start += (i64)r.threads * RAYS_AT_ONCE)
         for (i64 i = start; i < start + RAYS_AT_ONCE && i < r.n_rays; i++)
-            r.hit[i] = trace_ray(*r.bvh, ray_at(r.origins + 3 * i, r.directions + 3 * i),
+            r.hit[i] = trace_ray(*r.bvh, nullptr, ray_at(r.origins + 3 * i, r.directions + 3 * i),
                                  r.has_radiance ? r.radiance : nullptr, r.transmittance + i, r.out + 3 * i);
 }
 
 INLINE bool above(const float* n, const float* d) { return n[0] * d[0] + n[1] * d[1] + n[2] * d[2] > 0; }
 
 static void visible_share(const Rays& r, int share) {
+    Near buffer;
     for (i64 p = share; p < r.n_rays; p += r.threads) {
         int* words = r.bits + p * r.words;
+        const Near* near = collect_near(*r.bvh, r.origins + 3 * p, r.normals + 3 * p, buffer) ? &buffer : nullptr;
         clear(words, (i64)4 * r.words);
         for (int j = 0; j < r.n_directions; j++) {
             const float* d = r.directions + 3 * j;
-            if (above(r.normals + 3 * p, d) && is_visible(*r.bvh, ray_at(r.origins + 3 * p, d)))
+            if (above(r.normals + 3 * p, d) && is_visible(*r.bvh, near, ray_at(r.origins + 3 * p, d)))
                 words[j / 32] |= (int)(1u << j % 32);
         }
     }
@@ -366,6 +454,6 @@ static void blockers_share(const Rays& r, int share) {
             const float* d = r.directions + 3 * j;
             bool blocked = above(r.normals + 3 * p, d) && !((u32)r.bits[p * r.words + j / 32] >> j % 32 & 1);
             int* hit = r.hit + p * r.n_directions + j;
-            *hit = blocked ? trace_ray(*r.bvh, ray_at(r.origins + 3 * p, d), nullptr, nullptr, nullptr) : -1;
+            *hit = blocked ? trace_ray(*r.bvh, nullptr, ray_at(r.origins + 3 * p, d), nullptr, nullptr, nullptr) : -1;
         }
 }

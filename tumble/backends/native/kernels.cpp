@@ -8,6 +8,7 @@
 #include "material.h"
 #include "parallel.h"
 #include "project.h"
+#include "relight.h"
 #include "sh_shade.h"
 #include "shade.h"
 
@@ -19,7 +20,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -77,10 +78,10 @@ API void raster_adjoint(Raster* r) {
     }
 }
 
-API void bvh_build(Bvh* t, float* W) {
-    leaf_fields(*t, W);
+API void bvh_build(Bvh* t, float* fields) {
+    leaf_fields(*t, fields);
     sort_by_halving(*t);
-    fill_tree(*t, W);
+    fill_tree(*t, fields);
 }
 
 API void rays_trace(const Rays* r) {
@@ -128,3 +129,7 @@ API void material_adjoint(const Activation* m) {
 API void bounce_forward(const Indirect* s) { bounce_values(*s, false); }
 API void bounce_adjoint(const Indirect* s) { bounce_values(*s, true); }
 API void material_loss(const MaterialImage* m) { material_terms(*m); }
+
+API void relight_points(const Relight* s) {
+    parallel(s->threads, [=](int share) { relight_share(*s, share); });
+}

@@ -24,20 +24,69 @@ INLINE vf vatan2(vf y, vf x) {
     return pick(y < 0.0f, -angle, angle);
 }
 
+// Sine and cosine of an angle in turns, |turns| <= 1000; error below 2e-7 for one turn.
+INLINE void vsincos(vf turns, vf& sine, vf& cosine) {
+    vf quarters = 4.0f * turns, whole = (quarters + 12582912.f) - 12582912.f;
+    vf y = 1.570796327f * (quarters - whole), yy = y * y;
+    vi quadrant = __builtin_convertvector(whole, vi);
+    // The series of Cephes for |y| <= pi / 4.
+    vf s = y + y * yy * (-1.6666654611e-1f + yy * (8.3321608736e-3f - 1.9515295891e-4f * yy));
+    vf c = 1.0f - 0.5f * yy + yy * yy * (4.166664568298827e-2f + yy * (-1.388731625493765e-3f + 2.443315711809948e-5f * yy));
+    vi odd = (quadrant & 1) != 0;
+    vf a = pick(odd, c, s), b = pick(odd, s, c);
+    sine = pick((quadrant & 2) != 0, -a, a), cosine = pick(((quadrant + 1) & 2) != 0, -b, b);
+}
+
+// Coordinates of LANES directions on an equirectangular map.
+struct OnMap {
+    vf rho2, u, v;   // rho2 = x^2 + z^2
+};
+INLINE OnMap on_map(const vf* d) {
+    vf rho2 = d[0] * d[0] + d[2] * d[2];
+    return {rho2, 0.159154943f * vatan2(d[0], -d[2]) + 0.5f, 0.318309886f * vatan2(vsqrt(rho2), d[1])};
+}
+
+// The four texels around LANES directions, and the position between them.
+struct Square {
+    vf fx, fy;
+    vi at[4];   // number of a texel; bits: column, row
+};
+INLINE Square square_at(const OnMap& o, int height, int width) {
+    Square q;
+    vf x = o.u * (float)width + 0.5f, y = o.v * (float)height + 0.5f;   // one texel further, so that they are positive
+    vi column = __builtin_convertvector(x, vi), row = __builtin_convertvector(y, vi);
+    q.fx = x - __builtin_convertvector(column, vf), q.fy = y - __builtin_convertvector(row, vf);
+    for (int k = 0; k < 4; k++) {
+        vi r = row + ((k >> 1) - 1), c = column + ((k & 1) - 1);
+        // Across a pole lies the same row, half a revolution away.
+        vi across = (r < 0) | (r >= height);
+        r = r < 0 ? vi{} : r, r = r >= height ? splat(height - 1) : r;
+        c += across & (width / 2);
+        c = c < 0 ? c + width : c, c = c >= width ? c - width : c;
+        q.at[k] = r * width + (((c >= 0) & (c < width)) & c);   // within the map even if the direction is not a number
+    }
+    return q;
+}
+
 // The eight texels around LANES directions, and the position between them.
 struct Texels {
-    vf d[3], rho2, fx, fy, fz;     // rho2 = x^2 + z^2
-    int at[8][LANES];              // first number of a texel; bits: column, row, level
+    vf d[3], rho2, fx, fy, fz;
+    vi at[8];   // first number of a texel; bits: column, row, level
     vi level_moves;
 };
 
-INLINE int texel(const Lookup& s, int level, int row, int column) {
-    // Across a pole lies the same row, half a revolution away.
-    if (row < 0 || row >= s.height) row = row < 0 ? 0 : s.height - 1, column += s.width / 2;
-    column %= s.width;
-    return 3 * ((level * s.height + row) * s.width + (column < 0 ? column + s.width : column));
+INLINE void texels_around(const Lookup& s, const vf* d, vf roughness, Texels& o) {
+    OnMap at = on_map(d);
+    Square q = square_at(at, s.height, s.width);
+    vf z = vmin(vmax(roughness, vf{}), splat(1.0f)) * (float)(s.levels - 1);
+    o.level_moves = (roughness >= 0.0f) & (roughness <= 1.0f);
+    vi low = __builtin_convertvector(z, vi), top = splat(imax2(0, s.levels - 2)), size = splat(s.height * s.width);
+    low = low > top ? top : low;
+    vi high = low + 1 < s.levels ? low + 1 : low;
+    for (int i = 0; i < 3; i++) o.d[i] = d[i];
+    o.rho2 = at.rho2, o.fx = q.fx, o.fy = q.fy, o.fz = z - __builtin_convertvector(low, vf);
+    for (int k = 0; k < 4; k++) o.at[k] = 3 * (low * size + q.at[k]), o.at[k + 4] = 3 * (high * size + q.at[k]);
 }
-
 INLINE void texels_at(const Lookup& s, int first, int count, Texels& o) {
     float lanes[4][LANES];
     for (int l = 0; l < LANES; l++) {
@@ -45,30 +94,25 @@ INLINE void texels_at(const Lookup& s, int first, int count, Texels& o) {
         for (int j = 0; j < 3; j++) lanes[j][l] = s.directions[3 * i + j];
         lanes[3][l] = s.roughness[i];
     }
-    for (int j = 0; j < 3; j++) o.d[j] = load(lanes[j]);
-    o.rho2 = o.d[0] * o.d[0] + o.d[2] * o.d[2];
-    vf u = 0.159154943f * vatan2(o.d[0], -o.d[2]) + 0.5f, v = 0.318309886f * vatan2(vsqrt(o.rho2), o.d[1]);
-    vf x = u * (float)s.width + 0.5f, y = v * (float)s.height + 0.5f;   // one texel further, so that they are positive
-    vf roughness = load(lanes[3]), z = vmin(vmax(roughness, vf{}), splat(1.0f)) * (float)(s.levels - 1);
-    o.level_moves = (roughness >= 0.0f) & (roughness <= 1.0f);
-    vi column = __builtin_convertvector(x, vi), row = __builtin_convertvector(y, vi), low = __builtin_convertvector(z, vi);
-    o.fx = x - __builtin_convertvector(column, vf), o.fy = y - __builtin_convertvector(row, vf);
-    for (int l = 0; l < LANES; l++) {
-        low[l] = imax2(0, imin2(low[l], s.levels - 2));
-        for (int k = 0; k < 8; k++) {
-            int above = imin2(low[l] + (k >> 2), s.levels - 1);
-            o.at[k][l] = texel(s, above, row[l] - 1 + (k >> 1 & 1), column[l] - 1 + (k & 1));
-        }
-    }
-    o.fz = z - __builtin_convertvector(low, vf);
+    vf d[3] = {load(lanes[0]), load(lanes[1]), load(lanes[2])};
+    texels_around(s, d, load(lanes[3]), o);
 }
 
-INLINE vf texel_values(const Lookup& s, const Texels& o, int k, int ch) {
+INLINE vf gathered(const float* from, vi at) {
     vf x;
-    for (int l = 0; l < LANES; l++) x[l] = s.stack[o.at[k][l] + ch];
+    for (int l = 0; l < LANES; l++) x[l] = from[at[l]];
     return x;
 }
+INLINE vf texel_values(const Lookup& s, const Texels& o, int k, int ch) {
+    return gathered(s.stack + ch, o.at[k]);
+}
 INLINE vf blend(vf a, vf b, vf f) { return a + f * (b - a); }
+
+INLINE vf value_at(const Lookup& s, const Texels& o, int ch) {
+    vf x[4];
+    for (int k = 0; k < 4; k++) x[k] = blend(texel_values(s, o, 2 * k, ch), texel_values(s, o, 2 * k + 1, ch), o.fx);
+    return blend(blend(x[0], x[1], o.fy), blend(x[2], x[3], o.fy), o.fz);
+}
 
 static void lookup_values(const Lookup& s) {
     for (int first = 0; first < s.n; first += LANES) {
@@ -76,10 +120,7 @@ static void lookup_values(const Lookup& s) {
         Texels o;
         texels_at(s, first, count, o);
         for (int ch = 0; ch < 3; ch++) {
-            vf x[4];
-            for (int k = 0; k < 4; k++)
-                x[k] = blend(texel_values(s, o, 2 * k, ch), texel_values(s, o, 2 * k + 1, ch), o.fx);
-            vf value = blend(blend(x[0], x[1], o.fy), blend(x[2], x[3], o.fy), o.fz);
+            vf value = value_at(s, o, ch);
             for (int l = 0; l < count; l++) s.out[3 * (i64)(first + l) + ch] = value[l];
         }
     }

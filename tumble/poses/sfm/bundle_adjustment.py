@@ -40,8 +40,13 @@ FOCAL_NOISE = 0.02
 
 Small, because the errors of observations are not independent: the focal length then hardly changes where observations
 do not constrain it, and the prior hardly biases it elsewhere."""
-SHORT_TRACK = 3
-"""Number of observations up to which a point is eliminated by a sum over their pairs; above, by a matrix product."""
+SHORT_TRACK, LONG_TRACK = 3, 12
+"""Limits of the number of observations up to which a point is eliminated by a sum over their pairs; points with more
+are eliminated by a matrix product."""
+CAMERAS_PER_OBSERVATION = 3
+"""Cameras of a group per observation of that number, at which both ways take the same time."""
+PAIRS_AT_ONCE = 1 << 16
+"""Maximum number of pairs that are summed at once; limits memory."""
 
 
 @dataclass(frozen=True)
@@ -133,11 +138,39 @@ class _System:
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Observations that the elimination of points couples: pairs for short tracks, a matrix column for long ones."""
+class _Slots:
+    """Places of some observations in a table with a row for every camera."""
 
+    camera: Int64[Tensor, " k"]
+    """Camera of every observation."""
+    index: Int64[Tensor, " k"]
+    """Index of every observation within its camera."""
+    size: tuple[int, int]
+    """Numbers of cameras, and of observations of the camera with most."""
+
+    def gram(self, rows: Float[Tensor, "k r w"]) -> Float[Tensor, "c w w"]:
+        """Sum of `rows.mT @ rows` over the observations of every camera, as one matrix product per camera."""
+        table = rows.new_zeros(*self.size, *rows.shape[1:])
+        table[self.camera, self.index] = rows
+        table = table.flatten(1, 2)
+        return table.mT @ table
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Observations by camera, and those that the elimination of points couples.
+
+    Points with short tracks couple pairs of observations, each of the others is a column of a matrix.
+    """
+
+    slot: "_Slots"
+    """Of all observations."""
+    short: Int64[Tensor, " k"]
+    """Observations of points with short tracks."""
+    short_slot: "_Slots"
+    """Of the observations of points with short tracks."""
     a: Int64[Tensor, " l"]
-    """First observation of every ordered pair of observations of one point, for points with short tracks."""
+    """First observation of every pair of observations of one such point, the earlier one in `Tracks`."""
     b: Int64[Tensor, " l"]
     """Second observation of every pair."""
     long: Int64[Tensor, " m"]
@@ -163,7 +196,7 @@ def adjust(
     layout = _layout(problem)
 
     def linearised(scene: BundleState) -> Linearised:
-        system = _linearise(problem, scene, scale)
+        system = _linearise(problem, scene, scale, layout)
         return Linearised(system.cost, system)
 
     def moved(scene: BundleState, system: _System, damping: Tensor) -> BundleState:
@@ -179,13 +212,15 @@ def _layout(problem: Problem) -> _Layout:
     """Couplings between observations, the same in all iterations."""
     point = problem.tracks.point
     count = torch.bincount(point, minlength=len(problem.group))
-    short, many = count[point] <= SHORT_TRACK, count > SHORT_TRACK
+    limit = max(SHORT_TRACK, min(LONG_TRACK, problem.centre.shape[1] // CAMERAS_PER_OBSERVATION))
+    short, many = count[point] <= limit, count > limit
     order = torch.nonzero(short)[:, 0][torch.argsort(point[short], stable=True)]
     size = count[point[order]]
     begin = torch.nonzero(torch.cat([size.new_ones(1), point[order].diff()]))[:, 0] if len(order) else size
     begin = torch.repeat_interleave(begin, count[point[order][begin]])
     first = torch.repeat_interleave(torch.arange(len(order)), size)
-    offset = torch.arange(len(first)) - (torch.cumsum(size, 0) - size)[first]
+    second = begin[first] + torch.arange(len(first)) - (torch.cumsum(size, 0) - size)[first]
+    first, second = first[first < second], second[first < second]
     # Points with many observations are numbered within their group.
     column = torch.zeros_like(count)
     n = 0
@@ -193,7 +228,18 @@ def _layout(problem: Problem) -> _Layout:
         mine = many & (problem.group == group)
         column[mine] = torch.arange(int(mine.sum()))
         n = max(n, int(mine.sum()))
-    return _Layout(order[first], order[begin[first] + offset], torch.nonzero(~short)[:, 0], column, n)
+    frame, n_cameras = problem.tracks.frame, problem.centre[..., 0].numel()
+    slots = _slots(frame, n_cameras), _slots(frame[order], n_cameras)
+    return _Layout(slots[0], order, slots[1], order[first], order[second], torch.nonzero(~short)[:, 0], column, n)
+
+
+def _slots(camera: Int64[Tensor, " k"], n_cameras: int) -> _Slots:
+    """Places of observations, given their cameras."""
+    count = torch.bincount(camera, minlength=n_cameras)
+    by_camera = torch.argsort(camera, stable=True)
+    index = torch.empty_like(camera)
+    index[by_camera] = torch.arange(len(camera)) - (torch.cumsum(count, 0) - count)[camera[by_camera]]
+    return _Slots(camera, index, (n_cameras, int(count.max())))
 
 
 def _jacobians(
@@ -216,25 +262,22 @@ def _jacobians(
     return torch.cat([J_rotation, J_x], -1), J_x @ R
 
 
-def _linearise(problem: Problem, scene: BundleState, scale: float) -> _System:
+def _linearise(problem: Problem, scene: BundleState, scale: float, layout: _Layout) -> _System:
     """Costs and normal equations at the current poses and points."""
-    g, f = scene.t.shape[:2]
+    g = len(scene.t)
     residual, x = residuals(problem, scene)
-    squared = residual.square().sum(-1) / scale**2
+    squared = (residual[:, 0].square() + residual[:, 1].square()) / scale**2
     w = problem.weight / (1 + squared)
     J_cam, J_point = _jacobians(problem, scene, x)
     wJ_cam, wJ_point = w[:, None, None] * J_cam, w[:, None, None] * J_point
-    n, c = len(scene.X), g * f
-    U = torch.zeros(c, 6, 6, dtype=torch.float64).index_add_(0, problem.tracks.frame, wJ_cam.mT @ J_cam)
-    V = torch.zeros(n, 3, 3, dtype=torch.float64).index_add_(0, problem.tracks.point, wJ_point.mT @ J_point)
-    g_cam = torch.zeros(c, 6, dtype=torch.float64).index_add_(
-        0, problem.tracks.frame, (wJ_cam * residual[..., None]).sum(1)
-    )
-    g_point = torch.zeros(n, 3, dtype=torch.float64).index_add_(
-        0, problem.tracks.point, (wJ_point * residual[..., None]).sum(1)
-    )
+    n, track = len(scene.X), problem.tracks
+    rows = w.sqrt()[:, None, None] * torch.cat([J_cam, residual[..., None]], -1)
+    U, g_cam = layout.slot.gram(rows)[:, :6].split([6, 1], -1)
+    g_cam = g_cam[..., 0].clone()
+    V = torch.zeros(n, 3, 3, dtype=torch.float64).index_add_(0, track.point, wJ_point.mT @ J_point)
+    g_point = torch.zeros(n, 3, dtype=torch.float64).index_add_(0, track.point, _gradient(wJ_point, residual))
     loss = problem.weight * scale**2 * torch.log1p(squared)
-    cost = torch.zeros(g, dtype=torch.float64).index_add_(0, problem.group[problem.tracks.point], loss)
+    cost = torch.zeros(g, dtype=torch.float64).index_add_(0, problem.group[track.point], loss)
     cost = cost + _camera_priors(problem, scene, U, g_cam)
     # A prior keeps weakly constrained points within the object.
     prior = _point_prior_weight(problem, scene)
@@ -244,6 +287,11 @@ def _linearise(problem: Problem, scene: BundleState, scale: float) -> _System:
     known = scene.log_focal is None
     penalty, border = (0, None) if known else _focal_border(problem, scene, x, residual, wJ_cam, wJ_point, w)
     return _System(cost + penalty, U, V, wJ_cam.mT @ J_point, g_cam, g_point, border)
+
+
+def _gradient(wJ: Float[Tensor, "o 2 d"], residual: Float[Tensor, "o 2"]) -> Float[Tensor, "o d"]:
+    """Gradient of every observation."""
+    return wJ[:, 0] * residual[:, :1] + wJ[:, 1] * residual[:, 1:]
 
 
 def _point_prior_weight(problem: Problem, scene: BundleState) -> Float[Tensor, "#n 1"]:
@@ -261,9 +309,9 @@ def _focal_border(
     track, focal = problem.tracks, _focals(problem, scene)
     group = problem.group[track.point]
     J = x[:, :2] / x[:, 2:].clamp_min(MIN_DEPTH) * focal[track.frame]
-    cam = torch.zeros(g * f, 6, dtype=torch.float64).index_add_(0, track.frame, (wJ_cam * J[..., None]).sum(1))
+    cam = torch.zeros(g * f, 6, dtype=torch.float64).index_add_(0, track.frame, _gradient(wJ_cam, J))
     prior = _point_prior_weight(problem, scene) * scene.X
-    point = prior.index_add(0, track.point, (wJ_point * J[..., None]).sum(1))
+    point = prior.index_add(0, track.point, _gradient(wJ_point, J))
     zero, offset = torch.zeros(g, dtype=torch.float64), scene.log_focal - problem.log_focal_prior
     weight = (FOCAL_NOISE / FOCAL_SIGMA) ** 2 * zero.index_add(0, group, problem.weight)
     shrinkage = zero.index_add(0, problem.group, (prior * scene.X).sum(-1))
@@ -309,26 +357,29 @@ def _solve(
         for H, lam in ((system.U, lam_cam), (system.V, lam_point))
     )
     V_inv = torch.linalg.inv(V)
-    Y = system.W @ V_inv[problem.tracks.point]
-    a, b, frame = layout.a, layout.b, problem.tracks.frame
-    S = torch.zeros(g * f * f, 6, 6, dtype=torch.float64)
-    S.index_add_(0, frame[a] * f + frame[b] % f, -(Y[a] @ system.W[b].mT))
-    S = S.reshape(g, f, f, 6, 6)
-    S.diagonal(dim1=1, dim2=2).add_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
-    S = S.permute(0, 1, 3, 2, 4).reshape(g, 6 * f, 6 * f)
+    frame, point = problem.tracks.frame, problem.tracks.point
+    # With V_inv = L L^T, points add -(W L)(W L)^T, which is symmetric.
+    WL = system.W @ torch.linalg.cholesky(V_inv)[point]
+    pairs = torch.zeros(g * f * f, 6, 6, dtype=torch.float64)
+    for a, b in zip(layout.a.split(PAIRS_AT_ONCE), layout.b.split(PAIRS_AT_ONCE), strict=True):
+        pairs.index_add_(0, frame[a] * f + frame[b] % f, WL[a] @ WL[b].mT)
+    pairs = pairs.reshape(g, f, f, 6, 6).permute(0, 1, 3, 2, 4).reshape(g, 6 * f, 6 * f)
+    U = U - layout.short_slot.gram(WL[layout.short].mT)
     # One matrix product instead of a sum over pairs, whose number is the square of a track's length.
-    half = torch.zeros(g * f, layout.columns, 6, 3, dtype=torch.float64)
-    point = problem.tracks.point[layout.long]
-    half[frame[layout.long], layout.column[point]] = system.W[layout.long] @ torch.linalg.cholesky(V_inv)[point]
-    half = half.transpose(1, 2).reshape(g, 6 * f, 3 * layout.columns)
-    S = S - half @ half.mT
-    right = -system.g_cam
-    right = right.index_add(0, problem.tracks.frame, (Y @ system.g_point[problem.tracks.point][..., None])[..., 0])
+    camera, column = frame[layout.long], layout.column[point[layout.long]]
+    half = torch.zeros(g, f, 6, layout.columns, 3, dtype=torch.float64)
+    half[camera // f, camera % f, :, column] = WL[layout.long]
+    half = half.reshape(g, 6 * f, 3 * layout.columns)
+    S = torch.zeros(g, f, 6, f, 6, dtype=torch.float64)
+    S.diagonal(dim1=1, dim2=3).copy_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
+    S = S.reshape(g, 6 * f, 6 * f) - pairs - pairs.mT - half @ half.mT
+    eliminated = (V_inv @ system.g_point[..., None])[point]
+    right = (-system.g_cam).index_add(0, frame, (system.W @ eliminated)[..., 0])
     d_cam = torch.linalg.solve(S, right.reshape(g, 6 * f, 1)).reshape(g * f, 6)
     g_point, d_focal = system.g_point, None
     if (border := system.border) is not None:
         V_point = (V_inv @ border.point[..., None])[..., 0]
-        side = border.cam.index_add(0, frame, -(Y @ border.point[problem.tracks.point][..., None])[..., 0])
+        side = border.cam.index_add(0, frame, -(system.W @ V_point[point][..., None])[..., 0])
         slope = torch.linalg.solve(S, side.reshape(g, 6 * f, 1)).reshape(g * f, 6)
 
         def total(cameras: Tensor, points: Tensor) -> Float[Tensor, " g"]:
@@ -338,7 +389,7 @@ def _solve(
         d_focal = (-border.g - total(side * d_cam, -V_point * g_point)) / H
         d_cam = d_cam - d_focal.repeat_interleave(f)[:, None] * slope
         g_point = g_point + d_focal[problem.group][:, None] * border.point
-    back = g_point.index_add(0, problem.tracks.point, (system.W.mT @ d_cam[problem.tracks.frame][..., None])[..., 0])
+    back = g_point.index_add(0, point, (system.W.mT @ d_cam[frame][..., None])[..., 0])
     return d_cam, -(V_inv @ back[..., None])[..., 0], d_focal
 
 
