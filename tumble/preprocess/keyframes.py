@@ -37,7 +37,7 @@ def cumulative_rotation(
 ) -> Float64[np.ndarray, " t"]:
     """Angle by which the object has rotated since the first frame, summed along the path [radians]; never decreases.
 
-    Where too little texture shows to measure it, the object is assumed to rotate as fast as in the median of the frames.
+    Where too little texture shows to measure it, the object is assumed to rotate as fast as in the median frame.
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     increase, anchor, since = np.zeros(len(images)), 0, 0.0
