@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from tumble.engine import State, optim
-from tumble.inverse_rendering import losses, sh_lighting, specular_fit
+from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
 from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb, random_rotation
@@ -53,7 +53,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 15
+VERSION = 16
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -95,7 +95,7 @@ class Rates:
     normal: float = 1e-3
     """Learning rate of the normal offsets."""
     specular_scale: float = 0.0
-    """Learning rate of the logarithmic specular scale, which the paper fixes."""
+    """Learning rate of the logarithmic specular scale. If it is 0, F0 is 0.04, as in the paper."""
     light: float = 0.01
     """Learning rate of the logarithmic radiance of the environment map."""
     means: float = 1.6e-5
@@ -107,7 +107,10 @@ class Rates:
     sdf: float = 5e-3
     """Learning rate of the signed distances after the warm-up [object radius]."""
     poses: float = 0.0
-    """Learning rate of the tangents of all poses after the warm-up; 0 keeps the poses of stage 2."""
+    """Learning rate of the tangents of all poses after the warm-up, or of the network that predicts them; 0 keeps the
+    poses of stage 2."""
+    decay: float = 0.1
+    """Factor by which all learning rates decay over the run."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,8 @@ class Config:
     the light of the frame."""
     corners: bool = True
     """Whether the material varies between the corners of a Gaussian."""
+    pose_model: Literal["tangents", "network"] = "tangents"
+    """Corrections of the poses, as in stage 2. network: a new one, which starts at the poses of stage 2."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
 
@@ -161,6 +166,8 @@ class Params:
     """Natural logarithm of the specular lobe's scale per channel. The diffuse lobe determines only the product of
     albedo and light; the specular lobe depends on the light alone and so resolves the ambiguity. As one parameter per
     channel it converges faster than the texels of the light would."""
+    pose_network: dict[str, Tensor] = field(default_factory=dict)
+    """Network that predicts the tangents of the poses (`pose_network`); empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -185,13 +192,15 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     albedo = (refined.albedo * factor).clamp(*ALBEDO_RANGE)
     light = sh_lighting.environment(refined.light, cfg.rows)
     material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
+    scale = refined.light.log_specular_scale + factor.log()
     params = Params(
         gaussians=refined.gaussians,
         gamma=refined.gamma,
         material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
         environment=Environment.from_radiance(light.radiance / factor),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
-        log_specular_scale=(refined.light.log_specular_scale + factor.log()).repeat(3),
+        log_specular_scale=(scale if cfg.rates.specular_scale else torch.zeros_like(scale)).repeat(3),
+        pose_network=pose_network.initial(len(refined.trajectory), albedo, rng) if _learns_network(cfg) else {},
     )
     params = optim.leaves(params)
     sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
@@ -243,9 +252,14 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
     state.memory["specular_penalty"] = torch.zeros_like(params.gamma)
 
 
+def _learns_network(cfg: Config) -> bool:
+    """Whether a network corrects the poses."""
+    return cfg.pose_model == "network" and cfg.rates.poses != 0
+
+
 def _rates(cfg: Config) -> dict[str, float]:
     """Learning rates by name prefix of the parameters."""
-    rates = cfg.rates
+    rates, learned = cfg.rates, _learns_network(cfg)
     return {
         "material.albedo_logits": rates.albedo,
         "material.roughness_logits": rates.roughness,
@@ -258,9 +272,9 @@ def _rates(cfg: Config) -> dict[str, float]:
         "gaussians.sdf": rates.sdf,
         "gaussians.sh": 0.0,
         "gamma": 0.0,
-        "poses": rates.poses,
+        "poses": 0.0 if learned else rates.poses,
         "log_specular_scale": rates.specular_scale,
-    }
+    } | ({"pose_network": rates.poses} if learned else {})
 
 
 @torch.no_grad()
@@ -295,7 +309,9 @@ def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
 def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
     """`T_cam_obj` of one frame."""
     base = inputs.refined.trajectory.T_cam_obj[frame]
-    return SE3.exp(params.poses[frame]) @ base if params.poses.requires_grad else base
+    if not params.poses.requires_grad and not params.pose_network:
+        return base
+    return pose_network.correction(params.poses, params.pose_network, frame) @ base
 
 
 def without_corners(params: Params) -> Params:
@@ -318,7 +334,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     params, capture = state.params, inputs.capture
     if state.step < cfg.warmup:
         # Geometry and poses are fixed; this saves half of the rasterizer's backward pass.
-        params = replace(params, gaussians=tree.detach(params.gaussians), poses=params.poses.detach())
+        fixed = {"gaussians": tree.detach(params.gaussians), "poses": params.poses.detach()}
+        params = replace(params, **fixed, pose_network={})
     frame = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, frame)
     corners, mean_albedo = corner_features((params if cfg.corners else without_corners(params)).material)
@@ -346,9 +363,9 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         "specular": state.memory["specular_penalty"]
         * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
     }
-    decayed = 0.1 ** (state.step / cfg.steps)
-    after_warmup = decayed * (state.step >= cfg.warmup)
-    optim.anneal(state.optimizer, {"": decayed, "gaussians": after_warmup, "poses": after_warmup})
+    decayed = cfg.rates.decay ** (state.step / cfg.steps)
+    later = decayed * (state.step >= cfg.warmup)
+    optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
 
@@ -435,7 +452,8 @@ def absorb_specular_scale(params: Params) -> Params:
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable asset."""
     params = absorb_specular_scale(state.params if cfg.corners else without_corners(state.params))
-    T_cam_obj = SE3.exp(params.poses) @ inputs.refined.trajectory.T_cam_obj
+    correction = pose_network.correction(params.poses, params.pose_network, slice(None))
+    T_cam_obj = correction @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,
         gamma=params.gamma,
