@@ -68,6 +68,8 @@ PRINTED = [
     ("stage 3: grid search of the specular lobe", False, "section 4.3", "decompose.fit_specular"),
     ("stage 3: material at the corners of a Gaussian", True, "section 4.3", "decompose.corners"),
     ("stage 3: self-occlusion", True, "section 4.3", "decompose.visibility"),
+    ("stage 3: shadows at the shaded points", "traced", "section 4.3", "decompose.shadows"),
+    ("stage 3: both lobes summed over the directions", "sum", "section 4.3", "decompose.lobes"),
     ("stage 3: indirect light from the colours of stage 2", "average", "section 4.3", "decompose.bounce"),
     ("relighting: samples of the BRDF", 512, "appendix A, stage 3", "relight.brdf_samples"),
     ("relighting: samples of the light", 512, "appendix A, stage 3", "relight.light_samples"),

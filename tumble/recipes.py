@@ -84,6 +84,8 @@ PAPER = Recipe(
         roughness=0.54,
         initial_albedo=0.415,
         bounce="average",
+        shadows="traced",
+        lobes="sum",
         pose_model="network",
         weights=inverse_rendering.decompose.Weights(specular=0.0),
         rates=inverse_rendering.decompose.Rates(poses=5e-4, decay=1.0),

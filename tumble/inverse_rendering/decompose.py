@@ -2,7 +2,8 @@
 
 Every step shades some pixels of one frame. Direct and indirect light are those of the frame's pose, since the light is
 fixed in the env frame; the paper averages indirect light over all frames. Visibility is cached per Gaussian, for
-several rotated sets of directions that all Gaussians share.
+several rotated sets of directions that all Gaussians share, or traced from the shaded points as in the paper
+(`Config.shadows`).
 """
 
 import math
@@ -31,6 +32,7 @@ from tumble.rendering import (
     prefilter,
     rasterize_material,
     render_gbuffer,
+    shade,
     shade_split,
     surface,
     surface_points,
@@ -140,6 +142,12 @@ class Config:
     albedo and light."""
     visibility: bool = True
     """Whether the object casts shadows on itself."""
+    shadows: Literal["cached", "traced"] = "cached"
+    """cached: visibility of the Gaussian that a pixel shows, traced when geometry has moved. traced: from the shaded
+    points themselves, in every step, as in the paper."""
+    lobes: Literal["split", "sum"] = "split"
+    """split: narrow specular lobes from a prefiltered map (`shading.shade_split`). sum: both lobes summed over the
+    directions (`shading.shade`), as in the paper."""
     bounce: Literal["none", "average", "frame"] = "frame"
     """Indirect light. average: from the mean radiance over all frames, as in the paper. frame: from the radiance under
     the light of the frame."""
@@ -277,10 +285,15 @@ def _rates(cfg: Config) -> dict[str, float]:
     } | ({"pose_network": rates.poses} if learned else {})
 
 
+def _caches_visibility(cfg: Config) -> bool:
+    """Whether shadows or indirect light need the visibility of every Gaussian."""
+    return cfg.visibility and (cfg.shadows == "cached" or cfg.bounce == "frame")
+
+
 @torch.no_grad()
 def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace the visibility of all Gaussians from their surface points and store it, with the geometry, in the state."""
-    if not cfg.visibility:
+    if not _caches_visibility(cfg):
         return
     params, gaussians = state.params, state.params.gaussians
     poses = [pose(params, inputs, frame) for frame in range(len(inputs.capture))]
@@ -299,7 +312,7 @@ def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
 
 def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace visibility again when geometry has moved by about the width of a shadow's edge since the last time."""
-    if not cfg.visibility or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
+    if not _caches_visibility(cfg) or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
         return
     traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
     if displacement(traced, state.params.gaussians) > MAX_DISPLACEMENT:
@@ -390,8 +403,10 @@ def _shade(
     f0: float | Tensor,
     bounce: Bounce | AveragedBounce | None,
 ) -> Float[Tensor, "p 3"]:
-    """Reflected radiance of surface points under the current light, with the cached visibility of their Gaussians."""
-    visible = _pixel_visibility(cfg, state, gaussian)
+    """Reflected radiance of surface points under the current light; `gaussian` are the Gaussians that they show."""
+    visible = _pixel_visibility(cfg, state, params, points, gaussian)
+    if cfg.lobes == "sum":
+        return shade(points, albedo, roughness, params.environment, R_env_obj, visible, f0=f0, bounce=bounce)
     light = prefilter(params.environment)
     return shade_split(points, albedo, roughness, light, R_env_obj, visible, f0=f0, bounce=bounce)
 
@@ -410,13 +425,16 @@ def _bounce(cfg: Config, state: State, params: Params, albedo: Float[Tensor, "n 
     return Bounce(albedo, state.memory["transfer"])
 
 
-def _pixel_visibility(cfg: Config, state: State, index: Tensor) -> Visibility:
-    """Visibility of pixels for this step's set of directions: that of the Gaussians `index` that they show."""
-    memory, current = state.memory, state.step % cfg.sets
+def _pixel_visibility(cfg: Config, state: State, params: Params, points: Surface, index: Tensor) -> Visibility:
+    """Visibility of pixels for this step's set of directions: of their points, or of the Gaussians `index`."""
+    memory, current, blockers = state.memory, state.step % cfg.sets, cfg.bounce != "none"
     directions = memory["directions"][current]
     if not cfg.visibility:
         return unoccluded(directions, len(index))
-    blocker = memory["blocker"][current] if cfg.bounce != "none" else None
+    if cfg.shadows == "traced":
+        tracer = build_tracer(params.gaussians, params.gamma)
+        return visibility(tracer, points.points.detach(), points.normals.detach(), directions, blockers=blockers)
+    blocker = memory["blocker"][current] if blockers else None
     return Visibility(directions, memory["bits"][current], blocker).gather(index)
 
 
