@@ -1,8 +1,11 @@
 """Recipes: PAPER has the paper's numbers, and a scaled recipe still learns."""
 
 import math
+import signal
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,7 +13,10 @@ import torch
 
 from tests.poses.progressive.test_tracker import INPUTS, TRUTH
 from tumble import recipes
+from tumble.engine.loop import drive
 from tumble.inverse_rendering import decompose, refine
+from tumble.io import tree
+from tumble.maths.se3 import SE3
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
 from tumble.scene import DIELECTRIC, TEMPERATURE, Trajectory
@@ -86,6 +92,10 @@ def test_constants_of_the_paper_that_no_recipe_changes() -> None:
     assert DIELECTRIC == 0.04  # section 4.3: F0
 
 
+CLOSE = Trajectory(SE3.exp(torch.full((6,), 0.01)) @ TRUTH, "camera")
+"""Poses with errors, for the networks to correct."""
+
+
 def losses_of(stage: Any, cfg: Any, inputs: Any) -> tuple[list[float], Any]:
     """The photometric term of every step that has one, and the output of the stage."""
     state, seen = stage.init(cfg, inputs, torch.Generator().manual_seed(0)), []
@@ -124,6 +134,32 @@ def test_the_paper_recipe_keeps_given_poses() -> None:
     _, refined = losses_of(refine, recipe.refine, refine.Inputs(INPUTS.capture, given))
     _, asset = losses_of(decompose, recipe.decompose, decompose.Inputs(INPUTS.capture, refined))
     assert torch.allclose(asset.trajectory.T_cam_obj.matrix(), given.T_cam_obj.matrix(), atol=1e-6)
+
+
+@pytest.mark.parametrize("stage", [refine, decompose])
+def test_an_interrupted_stage_of_the_paper_recipe_ends_the_same(
+    stage: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With pose networks, which are part of the checkpoint."""
+    recipe = recipes.scaled(recipes.PAPER, 1 / 10_000)
+    cfg, second = getattr(recipe, stage.__name__.split(".")[-1]), refine.Inputs(INPUTS.capture, CLOSE)
+    inputs: Any = second
+    if stage is decompose:
+        inputs = decompose.Inputs(INPUTS.capture, drive(refine, replace(recipe.refine, steps=2), second, seed=1))
+    whole, step = tree.named_tensors(drive(stage, cfg, inputs, seed=1)), stage.step
+
+    def interrupted(cfg: Any, inputs: Any, state: Any) -> Any:
+        result = step(cfg, inputs, state)
+        if state.step == 9:
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(stage, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        drive(stage, cfg, inputs, seed=1, checkpoint=tmp_path / "state.safetensors", key="k")
+    monkeypatch.setattr(stage, "step", step)
+    resumed = drive(stage, cfg, inputs, seed=1, checkpoint=tmp_path / "state.safetensors", key="k")
+    assert all(torch.equal(x, whole[name]) for name, x in tree.named_tensors(resumed).items())
 
 
 def leaves_of(cfg: Any, path: str = "") -> dict[str, Any]:

@@ -145,11 +145,12 @@ def run(
         options: How a video or images are converted to a capture. Ignored if the input is a capture.
         out: Run directory. Repeating the command resumes an interrupted run.
         quality: How much is computed, and from how many frames of which size if the input is footage.
-            draft: 3,000 and 1,000 steps. 2 minutes on two CPU cores for 64 frames of 128 x 128 pixels with known poses;
-            there 26 to 35 dB of albedo. All measured figures of this package are of this quality.
-            standard: 20,000 and 10,000 steps, for a GPU. Not measured yet.
+            draft: 3,000 and 1,000 steps. 1 to 2 minutes on two CPU cores for 64 frames of 128 x 128 pixels with known
+            poses, where it reaches 26 to 35 dB of albedo. All measured runs are of this quality.
+            standard: 20,000 and 10,000 steps, for a GPU. No measured run yet.
             full: 150,000 steps each, for a GPU. Never run.
-            paper: the paper's stages and numbers instead of ours (docs/method.md), for a GPU. Never run at this size.
+            paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
+            (docs/method.md), where it is far behind draft.
         poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
         up: Direction of the object that points up in the results; a finished run is only turned, in seconds.
             auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -107,3 +108,13 @@ def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_prun
     n_left = len(state.params.points.albedo_logits)
     assert n_left == (visible[3] & (torch.arange(600) % 3 > 0)).sum()
     assert torch.equal(state.memory["max_weight"], torch.zeros(n_left))
+
+
+def test_the_weight_of_the_gamma_term_is_the_stated_one() -> None:
+    """All signed distances are 0, so that the median is the floor: 2 acosh(sqrt 2) / 0.02 - 30, times the weight."""
+    points, true, capture = textured_sphere()
+    params = Params(points, GAMMA, SHLight.constant(0.4, true.xyz), torch.zeros(4, 6))
+    view = refine.render(points, GAMMA, params.light, true[0], Trajectory(true, "camera"), capture.camera)
+    cfg = replace(SMOKE.refine, weights=replace(SMOKE.refine.weights, gamma=5.0))
+    terms = refine._terms(cfg, params, view, capture, 0, true[0], 1.0)
+    assert float(terms["gamma"]) == pytest.approx(5 * (2 * math.acosh(math.sqrt(2)) / 0.02 - 30), rel=1e-5)
