@@ -136,6 +136,19 @@ def test_the_paper_recipe_keeps_given_poses() -> None:
     assert torch.allclose(asset.trajectory.T_cam_obj.matrix(), given.T_cam_obj.matrix(), atol=1e-6)
 
 
+def test_the_pose_network_of_stage_2_goes_on_in_stage_3_from_the_same_poses(tmp_path: Path) -> None:
+    recipe = recipes.scaled(recipes.PAPER, 1 / 10_000)
+    _, refined = losses_of(refine, recipe.refine, refine.Inputs(INPUTS.capture, CLOSE))
+    tree.save(refined, tmp_path / "refined.safetensors")
+    inputs = decompose.Inputs(INPUTS.capture, tree.load(refine.Refined, tmp_path / "refined.safetensors"))
+    state = decompose.init(recipe.decompose, inputs, torch.Generator().manual_seed(0))
+    assert state.params.pose_network.keys() == refined.pose_network.keys()
+    assert all(torch.equal(x, refined.pose_network[name]) for name, x in state.params.pose_network.items())
+    assert refined.pose_network["weight2"].abs().max() > 1e-4  # it has learnt corrections
+    start = decompose.finish(recipe.decompose, inputs, state).trajectory.T_cam_obj.matrix()
+    torch.testing.assert_close(start, refined.trajectory.T_cam_obj.matrix(), atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("stage", [refine, decompose])
 def test_an_interrupted_stage_of_the_paper_recipe_ends_the_same(
     stage: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -154,7 +154,7 @@ class Config:
     corners: bool = True
     """Whether the material varies between the corners of a Gaussian."""
     pose_model: Literal["tangents", "network"] = "tangents"
-    """Corrections of the poses, as in stage 2. network: a new one, which starts at the poses of stage 2."""
+    """Corrections of the poses, as in stage 2. network: that of stage 2 goes on, or a new one if it had none."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
 
@@ -208,7 +208,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         environment=Environment.from_radiance(light.radiance / factor),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
         log_specular_scale=(scale if cfg.rates.specular_scale else torch.zeros_like(scale)).repeat(3),
-        pose_network=pose_network.initial(len(refined.trajectory), albedo, rng) if _learns_network(cfg) else {},
+        pose_network=_first_network(cfg, refined, rng),
     )
     params = optim.leaves(params)
     sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
@@ -263,6 +263,20 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
 def _learns_network(cfg: Config) -> bool:
     """Whether a network corrects the poses."""
     return cfg.pose_model == "network" and cfg.rates.poses != 0
+
+
+def _first_network(cfg: Config, refined: Refined, rng: torch.Generator) -> dict[str, Tensor]:
+    """The network of stage 2, or a new one if it had none; empty if no network corrects the poses."""
+    if not _learns_network(cfg):
+        return {}
+    return refined.pose_network or pose_network.initial(len(refined.trajectory), refined.albedo, rng)
+
+
+def _correction(params: Params, inputs: Inputs, frame: int | slice) -> SE3:
+    """Correction of the poses of stage 2. A network also predicts those of stage 2, which are taken out."""
+    now, before = params.pose_network, inputs.refined.pose_network
+    correction = pose_network.correction(params.poses, now, frame)
+    return correction @ pose_network.correction(params.poses, before, frame).inverse() if now and before else correction
 
 
 def _rates(cfg: Config) -> dict[str, float]:
@@ -324,7 +338,7 @@ def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
     base = inputs.refined.trajectory.T_cam_obj[frame]
     if not params.poses.requires_grad and not params.pose_network:
         return base
-    return pose_network.correction(params.poses, params.pose_network, frame) @ base
+    return _correction(params, inputs, frame) @ base
 
 
 def without_corners(params: Params) -> Params:
@@ -470,8 +484,7 @@ def absorb_specular_scale(params: Params) -> Params:
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable asset."""
     params = absorb_specular_scale(state.params if cfg.corners else without_corners(state.params))
-    correction = pose_network.correction(params.poses, params.pose_network, slice(None))
-    T_cam_obj = correction @ inputs.refined.trajectory.T_cam_obj
+    T_cam_obj = _correction(params, inputs, slice(None)) @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,
         gamma=params.gamma,

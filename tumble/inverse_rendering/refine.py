@@ -19,6 +19,7 @@ from tumble.inverse_rendering import densify, losses, pose_network, sh_lighting
 from tumble.inverse_rendering.photometric_alignment import align_pose
 from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
 from tumble.inverse_rendering.sh_lighting import SHLight
+from tumble.io import tree
 from tumble.maths import SE3, fibonacci_sphere
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
@@ -178,6 +179,8 @@ class Refined:
     light: SHLight
     trajectory: Trajectory
     """Refined poses."""
+    pose_network: dict[str, Tensor] = field(default_factory=dict)
+    """Network that predicted the corrections of the poses; empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -448,4 +451,4 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
         for R_env_obj in trajectory.R_env_obj:
             mean += albedo * params.light.diffuse(gaussians.normals @ R_env_obj.T) / len(trajectory)
         gaussians = replace(gaussians, sh=constant_sh(mean))
-    return Refined(gaussians, params.gamma, albedo, params.light, trajectory)
+    return Refined(gaussians, params.gamma, albedo, params.light, trajectory, tree.detach(params.pose_network))
