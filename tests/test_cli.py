@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.films import scene, written
 from tests.test_interrupt import capture, whole  # noqa: F401 (fixtures)
-from tumble import cli
+from tumble import cli, pipeline
+from tumble.preprocess.options import FRAMES_AND_SIZE, FootageOptions
 from tumble.scene.environment import Environment
 
 
@@ -32,6 +34,44 @@ def test_every_command_explains_itself(
 ) -> None:
     assert run(monkeypatch, command, "--help") == 0
     assert f"tumble {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_the_help_names_frames_and_size_of_every_quality(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, command, "--help") == 0
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    frames, size = ({quality: pair[k] for quality, pair in FRAMES_AND_SIZE.items()} for k in (0, 1))
+    for usual in (frames, size):
+        assert usual["full"] == usual["paper"]
+        assert f"draft {usual['draft']}, standard {usual['standard']}, full and paper {usual['paper']}." in said
+
+
+def test_a_film_is_converted_as_the_quality_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder with a capture of another quality is refused, before any work; explicit numbers take precedence."""
+    film, out = written(scene().pictures, tmp_path / "x.mp4"), tmp_path / "run"
+    pipeline.capture_of(film, out, FootageOptions(box=scene().box(), focal=300.0))
+    words = ["run", str(film), "-o", str(out), "--box", *map(str, scene().box()), "--focal", "300"]
+    assert run(monkeypatch, *words, "--quality", "standard") == 1
+    refused = capsys.readouterr().err
+    assert "options.frames is 144 in the folder, 200 was requested" in refused
+    assert "options.size is 256 in the folder, 512 was requested" in refused
+    assert run(monkeypatch, *words, "--quality", "paper", "--frames", "144") == 1
+    refused = capsys.readouterr().err
+    assert "options.frames" not in refused
+    assert "options.size is 256 in the folder, 800 was requested" in refused
+
+
+def test_a_check_selects_as_many_frames_as_the_run_that_it_is_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    film = written(scene().pictures, tmp_path / "x.mp4")
+    words = ["check", str(film), "-o", str(tmp_path / "c"), "--box", *map(str, scene().box()), "--focal", "300"]
+    run(monkeypatch, *words, "--quality", "full", "--frames", "7")
+    assert "7 selected" in capsys.readouterr().out
 
 
 def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(

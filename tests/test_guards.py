@@ -65,8 +65,6 @@ MANY_PARAMETERS = {"rasterize", "gaussian_terms"}
 """Functions over 12 parameters: the backends' contract hands tensors over one by one."""
 STAGE_WORDS = {"Config", "Inputs", "Params", "Weights", "Rates"}
 """Classes that every stage names alike."""
-OF_THE_PAPER = {"by_pnp", "surface_points", "global_mlp", "delta", "GlobalMlp"}
-"""Parts of the paper that no recipe uses yet."""
 
 of_every_file = pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
 
@@ -238,7 +236,7 @@ def test_every_public_function_has_a_caller() -> None:
         for node in parsed(path).body
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
     }
-    idle = {name for name in functions if name[1] not in used | offered | OF_THE_PAPER and not is_plugin(name[0])}
+    idle = {name for name in functions if name[1] not in used | offered and not is_plugin(name[0])}
     assert not idle
 
 

@@ -487,3 +487,14 @@ def test_every_ablation_runs_and_changes_the_asset(finished: tuple[Path, Asset],
     # The object is convex: no part of it lights another.
     if "indirect" not in name:
         assert any(not torch.equal(x, method[key]) for key, x in changed.items())
+
+
+@pytest.mark.parametrize("name", recipes.QUALITIES)
+def test_every_quality_runs_scaled_down(capture: Path, tmp_path: Path, name: str) -> None:
+    """Into a run directory, with given poses, which stay."""
+    recipe = recipes.scaled(recipes.QUALITIES[name], 1 / 10_000)
+    asset = pipeline.reconstruct(capture, tmp_path / "run", recipe)
+    assert all(torch.isfinite(x).all() for x in tree.named_tensors(asset).values())
+    given = folder.load(capture).trajectory
+    assert given is not None
+    torch.testing.assert_close(asset.trajectory.T_cam_obj.matrix(), given.T_cam_obj.matrix(), atol=1e-6, rtol=0)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from tumble.pipeline import estimate_poses, read_capture, reconstruct, video_to_capture
     from tumble.poses import PoseResult
     from tumble.preprocess import FootageOptions
-    from tumble.recipes import DRAFT, PAPER, STANDARD, Recipe
+    from tumble.recipes import DRAFT, FULL, PAPER, STANDARD, Recipe
     from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 __version__ = "0.1.0"
@@ -57,6 +57,7 @@ __all__ = [
     "DRAFT",
     "Environment",
     "FootageOptions",
+    "FULL",
     "PAPER",
     "PoseResult",
     "Progress",
@@ -87,7 +88,7 @@ __getattr__ = lazy_getattr(
         "pipeline": ("estimate_poses", "video_to_capture", "read_capture", "reconstruct"),
         "poses": ("PoseResult",),
         "preprocess": ("FootageOptions",),
-        "recipes": ("DRAFT", "PAPER", "STANDARD", "Recipe"),
+        "recipes": ("DRAFT", "FULL", "PAPER", "STANDARD", "Recipe"),
         "scene": ("Asset", "Camera", "Capture", "Environment", "Trajectory"),
     },
 )

@@ -1,11 +1,14 @@
-"""Recipes: the settings of all stages. PAPER has the defaults of the stages; the others change some of them.
+"""Recipes: the settings of all stages.
 
-DRAFT: minutes on two CPU cores. STANDARD: meant for one GPU. SMOKE: seconds, for tests. The ablations and baselines of
-the paper are functions from a recipe to a recipe. What experiments said about the values stands in docs/method.md.
+DRAFT, STANDARD and FULL are our method at three sizes; PAPER is the paper's, and `scaled` makes a recipe smaller.
+SMOKE: seconds, for tests. docs/method.md says what each was run on and what it reached, and how PAPER and ours differ.
+The ablations and baselines of the paper are functions from a recipe to a recipe.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from tumble import inverse_rendering, rendering
@@ -40,18 +43,73 @@ PROJ = 0.1
 MASK = 3.0
 """Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
-PAPER = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
-"""The default configuration of every stage, except that estimated poses are realigned instead of moved by the paper's
-pose network (docs/method.md)."""
+OURS = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
+"""What our recipes share: the default configuration of every stage, and realigned poses."""
+
+PAPER = Recipe(
+    track=progressive.Config(lift="pnp"),
+    refine=inverse_rendering.refine.Config(
+        colour="sh",
+        start="sphere",
+        points=100_000,
+        opacity=0.99,
+        gamma=1.0,
+        gamma_floor=0.1,
+        mask_loss="entropy",
+        weights=inverse_rendering.refine.Weights(gamma=5.0),
+        rates=inverse_rendering.refine.Rates(
+            means=5 * 1.6e-4,
+            quats=1e-3,
+            log_scales=5e-3,
+            sdf=0.05,
+            gamma=0.005,
+            sh=2.5e-3,
+            sh_rest=2.5e-3 / 20,
+            poses=5e-4,
+            decay=0.01,
+            others_decay=1.0,
+        ),
+        densification=densify.Config(
+            refine_stop=0.1,
+            max_gaussians=1_000_000,
+            bad_min_error=0.0,
+            grow_score=5.0,
+            grow_fraction=1.0,
+            prune_opacity=0.005,
+        ),
+        pose_model="network",
+    ),
+    decompose=inverse_rendering.decompose.Config(
+        sets=1,
+        pixels=512,
+        roughness=0.54,
+        initial_albedo=0.415,
+        bounce="average",
+        shadows="traced",
+        lobes="sum",
+        pose_model="network",
+        weights=inverse_rendering.decompose.Weights(specular=0.0),
+        rates=inverse_rendering.decompose.Rates(poses=5e-4, decay=1.0),
+    ),
+)
+"""The paper's method with the numbers that it prints, as far as it is implemented; docs/method.md lists what is not.
+
+Where the paper prints no number, the work that it follows decides. 3DGS: rates of the Gaussians' centres, rotations,
+scales and harmonics; only that of the centres decays. DiscretizedSDF: number and opacity of the first Gaussians, start
+and rate of gamma, rate of the signed distances, the factor 5 on the centres' rate. FastGS: end of densification (15,000
+steps), thresholds on error, score and opacity. R3DG: cross entropy, rates of geometry in stage 3. SVG-IR: first albedo
+and roughness. IRGS: rays per step of stage 3 (2^18). The poses' rate in stages 2 and 3 is that of stage 1. Never run to
+the end: only `scaled` versions were.
+"""
 
 STANDARD = replace(
-    PAPER,
+    OURS,
     refine=replace(
-        PAPER.refine,
+        OURS.refine,
         steps=20_000,
-        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
+        weights=replace(OURS.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
         crease=CREASE,
-        rates=replace(PAPER.refine.rates, specular_scale=0.005),
+        rates=replace(OURS.refine.rates, specular_scale=0.005),
         points=20_000,
         densification=densify.Config(max_gaussians=60_000),
     ),
@@ -65,18 +123,25 @@ STANDARD = replace(
     ),
 )
 
+FULL = replace(
+    STANDARD,
+    refine=replace(STANDARD.refine, steps=150_000, points=50_000, densification=densify.Config(max_gaussians=200_000)),
+    decompose=replace(STANDARD.decompose, steps=150_000, warmup=15_000, doublings=6),
+)
+"""STANDARD with the paper's numbers of steps, more Gaussians and the paper's resolution of the light. Never run."""
+
 DRAFT = replace(
-    PAPER,
+    OURS,
     # A normal weight above the paper's 0.05 gives smoother normals; `crease` keeps it from filling grooves.
     refine=replace(
-        PAPER.refine,
+        OURS.refine,
         steps=3_000,
         points=9_000,
         densification=densify.Config(refine_every=300, max_gaussians=16_000),
         hull=96,
-        weights=replace(PAPER.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
+        weights=replace(OURS.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
         crease=CREASE,
-        rates=replace(PAPER.refine.rates, specular_scale=0.02),
+        rates=replace(OURS.refine.rates, specular_scale=0.02),
         ramp=0.5,
     ),
     decompose=inverse_rendering.decompose.Config(
@@ -88,7 +153,7 @@ DRAFT = replace(
         weights=inverse_rendering.decompose.Weights(light=0.002, material=0.01, mask=MASK),
         rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.05, light=0.05, specular_scale=0.1),
     ),
-    relight=replace(PAPER.relight, brdf_samples=128, light_samples=128),
+    relight=replace(OURS.relight, brdf_samples=128, light_samples=128),
 )
 
 SMOKE = replace(
@@ -127,7 +192,7 @@ QUICK_TRACK = progressive.Config(
 """The progressive stage for two CPU cores: network, rays and steps take a hundredth of the paper's computation. So few
 rays need a larger weight of the match term than the paper's."""
 
-QUALITIES = {"draft": DRAFT, "standard": STANDARD, "paper": PAPER}
+QUALITIES = {"draft": DRAFT, "standard": STANDARD, "full": FULL, "paper": PAPER}
 """Recipes by the value of `--quality`."""
 
 
@@ -195,10 +260,63 @@ def no_specular_fit(recipe: Recipe) -> Recipe:
 def progressive_poses(recipe: Recipe) -> Recipe:
     """Stage 1 as in the paper: a neural SDF that grows frame by frame.
 
-    PAPER uses the paper's numbers, which take days on a CPU; other recipes use a small network with few rays and steps,
-    which take minutes.
+    PAPER has it, with the paper's numbers, which take days on a CPU; other recipes get a small network with few rays
+    and steps, which take minutes.
     """
-    return replace(recipe, track=progressive.Config() if recipe == PAPER else QUICK_TRACK)
+    return recipe if isinstance(recipe.track, progressive.Config) else replace(recipe, track=QUICK_TRACK)
+
+
+def scaled(recipe: Recipe, factor: float) -> Recipe:
+    """The recipe at a fraction of its computation, with the same learning rates, loss weights and switches.
+
+    Numbers of steps are multiplied by the factor. Rays, pixels, directions, Gaussians and the widths of networks are
+    multiplied by its square root, as is the final resolution of the environment map, but none falls below a minimum
+    with which a stage still trains. Stage 1 is scaled if it is the progressive one. With unchanged learning rates a
+    tenth of the steps moves Gaussians a tenth as far: PAPER's sphere reaches the object at 1/20, not at 1/50.
+
+    Args:
+        factor: In (0, 1].
+
+    Raises:
+        ValueError: The factor is not in this range.
+    """
+    if not 0 < factor <= 1:
+        raise ValueError(f"a recipe is scaled by a factor in (0, 1], not by {factor}")
+    fewer, smaller = partial(_times, factor), partial(_times, math.sqrt(factor))
+    track, second, third, relight = recipe.track, recipe.refine, recipe.decompose, recipe.relight
+    if isinstance(track, progressive.Config):
+        steps = {name: fewer(getattr(track, name), 1) for name in ("warmup", "pose_steps", "joint_steps")}
+        rays = {name: smaller(getattr(track, name), 16) for name in ("rays", "old_rays", "match_rays")}
+        # The skip connection of the distance network needs a width above that of the encoded point, 39.
+        widths = {name: smaller(getattr(track.sizes, name), 64) for name in ("width", "features", "colour_width")}
+        rates = replace(track.rates, ramp=fewer(track.rates.ramp, 1))
+        sizes = replace(track.sizes, **widths)
+        track = replace(track, **steps, **rays, sizes=sizes, rates=rates, samples=smaller(track.samples, 12))
+    if isinstance(second, inverse_rendering.refine.Config):
+        growth = second.densification
+        every, most = fewer(growth.refine_every, 10), smaller(growth.max_gaussians, 500)
+        second = replace(
+            second,
+            steps=fewer(second.steps, 1),
+            points=smaller(second.points, 500),
+            densification=replace(growth, refine_every=every, max_gaussians=most),
+        )
+    if isinstance(third, inverse_rendering.decompose.Config):
+        third = replace(
+            third,
+            steps=fewer(third.steps, 1),
+            warmup=fewer(third.warmup, 1),
+            directions=smaller(third.directions, 64),
+            pixels=smaller(third.pixels, 64),
+            doublings=max(0, third.doublings + round(math.log2(factor) / 2)),
+        )
+    samples = {name: smaller(getattr(relight, name), 16) for name in ("brdf_samples", "light_samples")}
+    return replace(recipe, track=track, refine=second, decompose=third, relight=replace(relight, **samples))
+
+
+def _times(factor: float, number: int, least: int) -> int:
+    """A number of things times a factor, but at least `least`, and not more than before."""
+    return min(number, max(least, round(factor * number)))
 
 
 def _replace_decompose(recipe: Recipe, **changes: Any) -> Recipe:

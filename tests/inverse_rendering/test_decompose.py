@@ -1,13 +1,16 @@
 """Stage 3: division of the product of albedo and light. Whole runs are tested in `test_pipeline`."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.surfaces import sphere
+from tests.surfaces import GAMMA, MAJOR, MINOR, sphere, torus
+from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose
+from tumble.rendering.shading import Surface
 from tumble.scene.environment import Environment
 from tumble.scene.material import DIELECTRIC, Material
 
@@ -42,3 +45,20 @@ def test_an_object_without_a_specular_lobe_keeps_an_albedo_below_one() -> None:
     # The lobe is too faint for its colour to be used: still 0.6, 0.3, 0.05, scaled to the largest allowed albedo.
     torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.9, 0.45, 0.075]), rtol=1e-5, atol=0)
     assert after.material.f0.item() < 0.1 * DIELECTRIC
+
+
+def test_traced_shadows_are_those_of_the_shaded_points() -> None:
+    """Across the hole of a torus is its other side; from the inner rim obliquely upwards there is nothing."""
+    gaussians, inner, outer = torus(4000), torch.tensor([MAJOR - MINOR, 0.0, 0.0]), torch.tensor([0.0, 0.0, 2.0])
+    across, up = torch.tensor([-1.0, 0.0, 0.0]), torch.nn.functional.normalize(torch.tensor([-0.2, 0.0, 1.0]), dim=0)
+    points = Surface(torch.arange(2), torch.stack([inner, outer]), torch.stack([across, up]), torch.zeros(2, 3))
+    trained = replace(params(torch.zeros(3)), gaussians=gaussians, gamma=GAMMA)
+    state = State(0, trained, None, torch.Generator(), {"directions": torch.stack([across, up])[None]})
+    cfg = decompose.Config(shadows="traced", bounce="average", sets=1)
+    # The Gaussian that a pixel shows does not count: both pixels show the same one, on the other side of the torus.
+    index = (gaussians.means[:, 0] + 1).argmin().repeat(2)
+    seen = decompose._pixel_visibility(cfg, state, trained, points, index)
+    assert seen.unpacked().tolist() == [[False, True], [True, True]]
+    blocker = seen.blocker
+    assert blocker is not None
+    assert gaussians.means[int(blocker[0, 0])][0] < -0.3

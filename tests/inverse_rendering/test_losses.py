@@ -11,7 +11,7 @@ from tumble.maths.images import linear_from_srgb
 from tumble.maths.se3 import SE3, SO3
 from tumble.rendering.rasterizer import Buffers
 from tumble.scene.camera import Camera
-from tumble.scene.capture import OBJECT, UNKNOWN
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.scene.gaussians import Gaussians
 
 CAMERA = Camera.from_fov(math.radians(40), 32, 40)
@@ -217,3 +217,14 @@ def test_depth_without_variance_has_no_loss() -> None:
     assert terms_of(view_of(), photo, mask)["variance"] == pytest.approx(0, abs=1e-7)
     view = view_of(depth_var=torch.full((32, 40), 0.01))
     assert terms_of(view, photo, mask)["variance"] == pytest.approx(0.1, abs=2e-3)
+
+
+def test_mask_entropy_is_the_binary_cross_entropy_of_known_pixels() -> None:
+    mask = torch.tensor([[OBJECT, OBJECT, BACKGROUND, UNKNOWN]], dtype=torch.uint8)
+    alpha = torch.tensor([[0.25, 1.0, 0.5, 0.1]], requires_grad=True)
+    loss = losses.mask_entropy(alpha, mask)
+    assert loss.item() == pytest.approx((math.log(4) + math.log(2)) / 4, rel=1e-4)
+    loss.backward()
+    assert alpha.grad is not None
+    # d/da of -log a and -log(1 - a), over four pixels; none where coverage is clamped or the mask unknown.
+    torch.testing.assert_close(alpha.grad, torch.tensor([[-1.0, 0.0, 0.5, 0.0]]))

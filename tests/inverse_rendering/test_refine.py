@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -30,7 +31,8 @@ def textured_sphere() -> tuple[Points, SE3, Capture]:
     means = torch.nn.functional.normalize(torch.randn(600, 3, generator=rng), dim=-1)
     flat = torch.tensor([-2.4, -2.4, -4.6]).expand(600, 3)
     gaussians = Gaussians(means, quats_from_normals(means), flat, torch.zeros(600), constant_sh(means * 0))
-    points = Points(gaussians, 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]])))
+    logits = 4 * torch.sin(4 * means @ torch.tensor([[1.0, 2, -1], [2, -1, 1], [-1, 1, 2]]))
+    points = Points(gaussians, logits, torch.zeros(600, 0, 3))
     axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])
     true = SE3.from_rotation(SO3.exp(axes), torch.tensor([0.02, 0.05, 4.0]).expand(4, 3).contiguous())
     light, camera = SHLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
@@ -106,3 +108,13 @@ def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_prun
     n_left = len(state.params.points.albedo_logits)
     assert n_left == (visible[3] & (torch.arange(600) % 3 > 0)).sum()
     assert torch.equal(state.memory["max_weight"], torch.zeros(n_left))
+
+
+def test_the_weight_of_the_gamma_term_is_the_stated_one() -> None:
+    """All signed distances are 0, so that the median is the floor: 2 acosh(sqrt 2) / 0.02 - 30, times the weight."""
+    points, true, capture = textured_sphere()
+    params = Params(points, GAMMA, SHLight.constant(0.4, true.xyz), torch.zeros(4, 6))
+    view = refine.render(points, GAMMA, params.light, true[0], Trajectory(true, "camera"), capture.camera)
+    cfg = replace(SMOKE.refine, weights=replace(SMOKE.refine.weights, gamma=5.0))
+    terms = refine._terms(cfg, params, view, capture, 0, true[0], 1.0)
+    assert float(terms["gamma"]) == pytest.approx(5 * (2 * math.acosh(math.sqrt(2)) / 0.02 - 30), rel=1e-5)

@@ -2,7 +2,8 @@
 
 Every step shades some pixels of one frame. Direct and indirect light are those of the frame's pose, since the light is
 fixed in the env frame; the paper averages indirect light over all frames. Visibility is cached per Gaussian, for
-several rotated sets of directions that all Gaussians share.
+several rotated sets of directions that all Gaussians share, or traced from the shaded points as in the paper
+(`Config.shadows`).
 """
 
 import math
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from tumble.engine import State, optim
-from tumble.inverse_rendering import losses, sh_lighting, specular_fit
+from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
 from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb, random_rotation
@@ -31,6 +32,7 @@ from tumble.rendering import (
     prefilter,
     rasterize_material,
     render_gbuffer,
+    shade,
     shade_split,
     surface,
     surface_points,
@@ -53,7 +55,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 15
+VERSION = 16
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -95,7 +97,7 @@ class Rates:
     normal: float = 1e-3
     """Learning rate of the normal offsets."""
     specular_scale: float = 0.0
-    """Learning rate of the logarithmic specular scale, which the paper fixes."""
+    """Learning rate of the logarithmic specular scale. If it is 0, F0 is 0.04, as in the paper."""
     light: float = 0.01
     """Learning rate of the logarithmic radiance of the environment map."""
     means: float = 1.6e-5
@@ -107,7 +109,10 @@ class Rates:
     sdf: float = 5e-3
     """Learning rate of the signed distances after the warm-up [object radius]."""
     poses: float = 0.0
-    """Learning rate of the tangents of all poses after the warm-up; 0 keeps the poses of stage 2."""
+    """Learning rate of the tangents of all poses after the warm-up, or of the network that predicts them; 0 keeps the
+    poses of stage 2."""
+    decay: float = 0.1
+    """Factor by which all learning rates decay over the run."""
 
 
 @dataclass(frozen=True)
@@ -137,11 +142,19 @@ class Config:
     albedo and light."""
     visibility: bool = True
     """Whether the object casts shadows on itself."""
+    shadows: Literal["cached", "traced"] = "cached"
+    """cached: visibility of the Gaussian that a pixel shows, traced when geometry has moved. traced: from the shaded
+    points themselves, in every step, as in the paper."""
+    lobes: Literal["split", "sum"] = "split"
+    """split: narrow specular lobes from a prefiltered map (`shading.shade_split`). sum: both lobes summed over the
+    directions (`shading.shade`), as in the paper."""
     bounce: Literal["none", "average", "frame"] = "frame"
     """Indirect light. average: from the mean radiance over all frames, as in the paper. frame: from the radiance under
     the light of the frame."""
     corners: bool = True
     """Whether the material varies between the corners of a Gaussian."""
+    pose_model: Literal["tangents", "network"] = "tangents"
+    """Corrections of the poses, as in stage 2. network: that of stage 2 goes on, or a new one if it had none."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
 
@@ -161,6 +174,8 @@ class Params:
     """Natural logarithm of the specular lobe's scale per channel. The diffuse lobe determines only the product of
     albedo and light; the specular lobe depends on the light alone and so resolves the ambiguity. As one parameter per
     channel it converges faster than the texels of the light would."""
+    pose_network: dict[str, Tensor] = field(default_factory=dict)
+    """Network that predicts the tangents of the poses (`pose_network`); empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -185,13 +200,15 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     albedo = (refined.albedo * factor).clamp(*ALBEDO_RANGE)
     light = sh_lighting.environment(refined.light, cfg.rows)
     material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
+    scale = refined.light.log_specular_scale + factor.log()
     params = Params(
         gaussians=refined.gaussians,
         gamma=refined.gamma,
         material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
         environment=Environment.from_radiance(light.radiance / factor),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
-        log_specular_scale=(refined.light.log_specular_scale + factor.log()).repeat(3),
+        log_specular_scale=(scale if cfg.rates.specular_scale else torch.zeros_like(scale)).repeat(3),
+        pose_network=_first_network(cfg, refined, rng),
     )
     params = optim.leaves(params)
     sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
@@ -243,9 +260,28 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
     state.memory["specular_penalty"] = torch.zeros_like(params.gamma)
 
 
+def _learns_network(cfg: Config) -> bool:
+    """Whether a network corrects the poses."""
+    return cfg.pose_model == "network" and cfg.rates.poses != 0
+
+
+def _first_network(cfg: Config, refined: Refined, rng: torch.Generator) -> dict[str, Tensor]:
+    """The network of stage 2, or a new one if it had none; empty if no network corrects the poses."""
+    if not _learns_network(cfg):
+        return {}
+    return refined.pose_network or pose_network.initial(len(refined.trajectory), refined.albedo, rng)
+
+
+def _correction(params: Params, inputs: Inputs, frame: int | slice) -> SE3:
+    """Correction of the poses of stage 2. A network also predicts those of stage 2, which are taken out."""
+    now, before = params.pose_network, inputs.refined.pose_network
+    correction = pose_network.correction(params.poses, now, frame)
+    return correction @ pose_network.correction(params.poses, before, frame).inverse() if now and before else correction
+
+
 def _rates(cfg: Config) -> dict[str, float]:
     """Learning rates by name prefix of the parameters."""
-    rates = cfg.rates
+    rates, learned = cfg.rates, _learns_network(cfg)
     return {
         "material.albedo_logits": rates.albedo,
         "material.roughness_logits": rates.roughness,
@@ -258,15 +294,20 @@ def _rates(cfg: Config) -> dict[str, float]:
         "gaussians.sdf": rates.sdf,
         "gaussians.sh": 0.0,
         "gamma": 0.0,
-        "poses": rates.poses,
+        "poses": 0.0 if learned else rates.poses,
         "log_specular_scale": rates.specular_scale,
-    }
+    } | ({"pose_network": rates.poses} if learned else {})
+
+
+def _caches_visibility(cfg: Config) -> bool:
+    """Whether shadows or indirect light need the visibility of every Gaussian."""
+    return cfg.visibility and (cfg.shadows == "cached" or cfg.bounce == "frame")
 
 
 @torch.no_grad()
 def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace the visibility of all Gaussians from their surface points and store it, with the geometry, in the state."""
-    if not cfg.visibility:
+    if not _caches_visibility(cfg):
         return
     params, gaussians = state.params, state.params.gaussians
     poses = [pose(params, inputs, frame) for frame in range(len(inputs.capture))]
@@ -285,7 +326,7 @@ def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
 
 def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace visibility again when geometry has moved by about the width of a shadow's edge since the last time."""
-    if not cfg.visibility or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
+    if not _caches_visibility(cfg) or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
         return
     traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
     if displacement(traced, state.params.gaussians) > MAX_DISPLACEMENT:
@@ -295,7 +336,9 @@ def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
 def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
     """`T_cam_obj` of one frame."""
     base = inputs.refined.trajectory.T_cam_obj[frame]
-    return SE3.exp(params.poses[frame]) @ base if params.poses.requires_grad else base
+    if not params.poses.requires_grad and not params.pose_network:
+        return base
+    return _correction(params, inputs, frame) @ base
 
 
 def without_corners(params: Params) -> Params:
@@ -318,7 +361,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     params, capture = state.params, inputs.capture
     if state.step < cfg.warmup:
         # Geometry and poses are fixed; this saves half of the rasterizer's backward pass.
-        params = replace(params, gaussians=tree.detach(params.gaussians), poses=params.poses.detach())
+        fixed = {"gaussians": tree.detach(params.gaussians), "poses": params.poses.detach()}
+        params = replace(params, **fixed, pose_network={})
     frame = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, frame)
     corners, mean_albedo = corner_features((params if cfg.corners else without_corners(params)).material)
@@ -346,9 +390,9 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         "specular": state.memory["specular_penalty"]
         * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
     }
-    decayed = 0.1 ** (state.step / cfg.steps)
-    after_warmup = decayed * (state.step >= cfg.warmup)
-    optim.anneal(state.optimizer, {"": decayed, "gaussians": after_warmup, "poses": after_warmup})
+    decayed = cfg.rates.decay ** (state.step / cfg.steps)
+    later = decayed * (state.step >= cfg.warmup)
+    optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
 
@@ -373,8 +417,10 @@ def _shade(
     f0: float | Tensor,
     bounce: Bounce | AveragedBounce | None,
 ) -> Float[Tensor, "p 3"]:
-    """Reflected radiance of surface points under the current light, with the cached visibility of their Gaussians."""
-    visible = _pixel_visibility(cfg, state, gaussian)
+    """Reflected radiance of surface points under the current light; `gaussian` are the Gaussians that they show."""
+    visible = _pixel_visibility(cfg, state, params, points, gaussian)
+    if cfg.lobes == "sum":
+        return shade(points, albedo, roughness, params.environment, R_env_obj, visible, f0=f0, bounce=bounce)
     light = prefilter(params.environment)
     return shade_split(points, albedo, roughness, light, R_env_obj, visible, f0=f0, bounce=bounce)
 
@@ -393,13 +439,16 @@ def _bounce(cfg: Config, state: State, params: Params, albedo: Float[Tensor, "n 
     return Bounce(albedo, state.memory["transfer"])
 
 
-def _pixel_visibility(cfg: Config, state: State, index: Tensor) -> Visibility:
-    """Visibility of pixels for this step's set of directions: that of the Gaussians `index` that they show."""
-    memory, current = state.memory, state.step % cfg.sets
+def _pixel_visibility(cfg: Config, state: State, params: Params, points: Surface, index: Tensor) -> Visibility:
+    """Visibility of pixels for this step's set of directions: of their points, or of the Gaussians `index`."""
+    memory, current, blockers = state.memory, state.step % cfg.sets, cfg.bounce != "none"
     directions = memory["directions"][current]
     if not cfg.visibility:
         return unoccluded(directions, len(index))
-    blocker = memory["blocker"][current] if cfg.bounce != "none" else None
+    if cfg.shadows == "traced":
+        tracer = build_tracer(params.gaussians, params.gamma)
+        return visibility(tracer, points.points.detach(), points.normals.detach(), directions, blockers=blockers)
+    blocker = memory["blocker"][current] if blockers else None
     return Visibility(directions, memory["bits"][current], blocker).gather(index)
 
 
@@ -435,7 +484,7 @@ def absorb_specular_scale(params: Params) -> Params:
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable asset."""
     params = absorb_specular_scale(state.params if cfg.corners else without_corners(state.params))
-    T_cam_obj = SE3.exp(params.poses) @ inputs.refined.trajectory.T_cam_obj
+    T_cam_obj = _correction(params, inputs, slice(None)) @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,
         gamma=params.gamma,

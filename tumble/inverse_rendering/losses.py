@@ -7,11 +7,12 @@ are computed together are kernels of the backends.
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy
 
 from tumble import backends
 from tumble.maths import SE3, srgb_from_linear
 from tumble.rendering import Buffers
-from tumble.scene import Camera, Gaussians
+from tumble.scene import OBJECT, UNKNOWN, Camera, Gaussians
 
 
 def srgb_as_captured(linear: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -36,8 +37,8 @@ def image_terms(
     """Terms of a view of stage 2 by name, averaged over the image (eq. 11; exact in `Backend.image_terms`).
 
     render: `(1 - ssim_weight) L1 + ssim_weight (1 - SSIM)` between rendering and input image (L_render).
-    mask: mean squared difference between coverage and mask. Related methods use binary cross entropy, which is
-    unbounded: it would penalise the correct coverage of half-covered pixels, whose mask is 0 or 1, without limit.
+    mask: mean squared difference between coverage and mask. Related methods use binary cross entropy (`mask_entropy`),
+    which is unbounded: it penalises the correct coverage of half-covered pixels, whose mask is 0 or 1, without limit.
     normal: 1 - cosine between rendered normals and normals of the depth map (L_normal).
     variance: mean standard deviation of the depth along each ray (L_variance).
 
@@ -61,6 +62,15 @@ def image_terms(
     pose = (T_cam_obj.rotation.matrix(), camera.fx_fy_cx_cy.to(view.alpha))
     terms = backends.choose(view.alpha.device, view.alpha.dtype).image_terms(*images, *pose, ssim_weight, crease)
     return dict(zip(("render", "mask", "normal", "variance"), terms.unbind(), strict=True))
+
+
+def mask_entropy(alpha: Float[Tensor, "h w"], mask: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean binary cross entropy between coverage and mask, the silhouette term of related methods (R3DG).
+
+    Coverage is clamped to [1e-6, 1 - 1e-6], as published. Pixels with an unknown mask count as 0.
+    """
+    clamped = alpha.clamp(1e-6, 1 - 1e-6)
+    return (binary_cross_entropy(clamped, (mask == OBJECT).to(alpha), reduction="none") * (mask != UNKNOWN)).mean()
 
 
 def gaussian_terms(

@@ -1,9 +1,11 @@
 """Stage 2: joint optimisation of Gaussians and poses, with initial albedo and light (paper section 4.2).
 
-The Gaussians are initialised on the visual hull of the masks. Their colour is shaded by one spherical-harmonic light
-(`sh_lighting`); the paper's static radiance per Gaussian is an ablation (`Config.colour`).
+The Gaussians are initialised on the visual hull of the masks, or on a sphere as in the paper (`Config.start`). Their
+colour is shaded by one spherical-harmonic light (`sh_lighting`), or static per Gaussian as in the paper
+(`Config.colour`). Poses are aligned photometrically, or corrected by the paper's network (`Config.pose_model`).
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
@@ -13,11 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.engine import State, optim
-from tumble.inverse_rendering import densify, losses, sh_lighting
+from tumble.inverse_rendering import densify, losses, pose_network, sh_lighting
 from tumble.inverse_rendering.photometric_alignment import align_pose
 from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
 from tumble.inverse_rendering.sh_lighting import SHLight
-from tumble.maths import SE3
+from tumble.io import tree
+from tumble.maths import SE3, fibonacci_sphere
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
     Camera,
@@ -43,7 +46,7 @@ COVERAGE_WEIGHT = 0.3
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the loss terms (eq. 11); values from appendix A, stage 2."""
+    """Weights of the loss terms (eq. 11); values from appendix A, stage 2, but for `gamma`."""
 
     mask: float = 1.0
     """Weight of the silhouette term."""
@@ -53,9 +56,9 @@ class Weights:
     """Weight of the standard deviation of depth along the rays."""
     rank: float = 0.1
     """Weight of the penalty on needle-shaped Gaussians."""
-    gamma: float = 5.0
-    """Weight of the sharpness term, divided by 100 in the sum. Its value hardly matters: no other term has a strong
-    gradient to gamma, and Adam is invariant to the scale of the gradient."""
+    gamma: float = 0.05
+    """Weight of the sharpness term; 5 in the paper. Its value hardly matters: no other term has a strong gradient to
+    gamma, and Adam is invariant to the scale of the gradient."""
     proj: float = 1.0
     """Weight of the projection term."""
     specular: float = 0.0
@@ -84,11 +87,15 @@ class Rates:
     specular_scale: float = 0.0
     """Learning rate of the logarithmic specular scale; 0 fixes the scale at 1."""
     sh: float = 1e-2
-    """Learning rate of the static radiance, if `Config.colour` is "sh"."""
+    """Learning rate of the static radiance, if `Config.colour` is "sh": of its mean over all directions."""
+    sh_rest: float = 1e-2
+    """Learning rate of the static radiance's harmonics of degree 1 to 3."""
     poses: float = 0.0
-    """Learning rate of the tangents of all poses."""
+    """Learning rate of the tangents of all poses, or of the network that predicts them."""
     decay: float = 0.05
     """Factor by which the learning rate of the centres decays over the run."""
+    others_decay: float = 0.2
+    """Factor by which all other learning rates decay over the run, except that of `gamma`."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +106,8 @@ class Config:
     """Number of optimisation steps (appendix A)."""
     colour: Literal["light", "sh"] = "light"
     """light: shading by one light for all Gaussians. sh: the paper's static radiance per Gaussian, degree 3."""
+    start: Literal["hull", "sphere"] = "hull"
+    """Initial surface. hull: the visual hull of the masks. sphere: the unit sphere, as in the paper."""
     points: int = 20_000
     """Initial number of Gaussians; not stated in the paper."""
     hull: int = 128
@@ -111,6 +120,8 @@ class Config:
     """Lower limit of the median distance in the gamma term (L_gamma), which limits gamma [object radius]."""
     ssim: float = 0.2
     """Weight of 1 - SSIM in the photometric term."""
+    mask_loss: Literal["squared", "entropy"] = "squared"
+    """Silhouette term. squared: see `losses.image_terms`. entropy: see `losses.mask_entropy`, as in related methods."""
     weights: Weights = field(default_factory=Weights)
     rates: Rates = field(default_factory=Rates)
     crease: float = 0.0
@@ -120,8 +131,15 @@ class Config:
     densification: densify.Config = field(default_factory=densify.Config)
     shadow_start: float = 0.2
     """Fraction of the run after which self-shadowing is applied; before, the geometry is too coarse."""
+    pose_model: Literal["tangents", "network"] = "tangents"
+    """Corrections of the poses, if their learning rate is not 0. tangents: one per frame. network: the paper's network
+    over embeddings of the frames (`pose_network`)."""
     realignments: int = 0
     """Number of photometric alignments of every pose (`photometric_alignment`), at even intervals."""
+
+    def __post_init__(self) -> None:
+        if self.pose_model == "network" and self.realignments:
+            raise ValueError("a pose network replaces the photometric alignments of poses: set realignments to 0")
 
 
 @dataclass(frozen=True)
@@ -131,6 +149,8 @@ class Points:
     gaussians: Gaussians
     albedo_logits: Float[Tensor, "n 3"]
     """Linear albedo before the sigmoid."""
+    sh_rest: Float[Tensor, "n k 3"]
+    """Static radiance's harmonics of degree 1 to 3, which continue `gaussians.sh`; none (k = 0) under a light."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +162,9 @@ class Params:
     """Sharpness of the opacity [1 / object radius]."""
     light: SHLight
     poses: Float[Tensor, "t 6"]
-    """Tangents of the pose corrections: `T_cam_obj = exp(poses) @ base`."""
+    """Tangents of the pose corrections: `T_cam_obj = exp(poses) @ base`; unused if there is a network."""
+    pose_network: dict[str, Tensor] = field(default_factory=dict)
+    """Network that predicts these tangents (`pose_network`); empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +179,8 @@ class Refined:
     light: SHLight
     trajectory: Trajectory
     """Refined poses."""
+    pose_network: dict[str, Tensor] = field(default_factory=dict)
+    """Network that predicted the corrections of the poses; empty if there is none."""
 
 
 @dataclass(frozen=True)
@@ -174,48 +198,61 @@ def length(cfg: Config, inputs: Inputs) -> int:
 
 @threads_for_kernels()
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
-    """The initial state: grey Gaussians on the visual hull, under a uniform light."""
+    """The initial state: grey Gaussians on the initial surface, under a uniform light."""
     like = inputs.trajectory.T_cam_obj.xyz
-    cells = visual_hull.carve(inputs.capture, inputs.trajectory, resolution=cfg.hull)
-    start = visual_hull.sample_surface(cells, cfg.points, rng)
+    start = _start(cfg, inputs, rng)
     n = len(start.positions)
     scale = (0.7 * start.spacing).clamp(1e-3, 0.2)
     gamma = torch.tensor(cfg.gamma).to(like)
     sdf = sdf_from_opacity(torch.full_like(scale, cfg.opacity), gamma)
-    k = 1 if cfg.colour == "light" else 16
+    k = 0 if cfg.colour == "light" else 15
     gaussians = Gaussians(
         means=start.positions,
         quats=quats_from_normals(start.normals),
         log_scales=torch.stack([scale, scale, 0.1 * scale], -1).log(),
         sdf=sdf,
-        sh=torch.cat([constant_sh(torch.full_like(start.positions, 0.2)), start.positions.new_zeros(n, k - 1, 3)], 1),
+        sh=constant_sh(torch.full_like(start.positions, 0.2)),
     )
+    learned = cfg.pose_model == "network" and cfg.rates.poses != 0
     params = Params(
-        points=Points(gaussians, torch.full_like(start.positions, -0.4)),
+        points=Points(gaussians, torch.full_like(start.positions, -0.4), start.positions.new_zeros(n, k, 3)),
         gamma=gamma,
         light=SHLight.constant(0.4, like),
         poses=like.new_zeros(len(inputs.trajectory), 6),
+        pose_network=pose_network.initial(len(inputs.trajectory), like, rng) if learned else {},
     )
     params = optim.leaves(params)
     memory = {"order": torch.zeros(0, dtype=torch.long), "max_weight": torch.zeros_like(scale)}
     return State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
 
 
+def _start(cfg: Config, inputs: Inputs, rng: torch.Generator) -> visual_hull.OrientedPoints:
+    """Points on the initial surface."""
+    if cfg.start == "sphere":
+        x_obj = fibonacci_sphere(cfg.points).to(inputs.trajectory.T_cam_obj.xyz)
+        spacing = math.sqrt(4 * math.pi / cfg.points)
+        return visual_hull.OrientedPoints(x_obj, x_obj, torch.full_like(x_obj[:, 0], spacing))
+    cells = visual_hull.carve(inputs.capture, inputs.trajectory, resolution=cfg.hull)
+    return visual_hull.sample_surface(cells, cfg.points, rng)
+
+
 def _rates(cfg: Config) -> dict[str, float]:
     """Learning rates by name of the parameters; 0 for those that the colour model does not use."""
     rates, light = cfg.rates, cfg.colour == "light"
+    learned = cfg.pose_model == "network" and rates.poses != 0
     return {
         "points.gaussians.means": rates.means,
         "points.gaussians.quats": rates.quats,
         "points.gaussians.log_scales": rates.log_scales,
         "points.gaussians.sdf": rates.sdf,
         "points.gaussians.sh": 0.0 if light else rates.sh,
+        "points.sh_rest": 0.0 if light else rates.sh_rest,
         "points.albedo_logits": rates.albedo if light else 0.0,
         "light.coefficients": rates.light if light else 0.0,
         "light.log_specular_scale": rates.specular_scale if light else 0.0,
         "gamma": rates.gamma,
-        "poses": rates.poses,
-    }
+        "poses": 0.0 if learned else rates.poses,
+    } | ({"pose_network": rates.poses} if learned else {})
 
 
 def pose(params: Params, inputs: Inputs, frame: int, *, corrected: bool = True) -> SE3:
@@ -226,7 +263,7 @@ def pose(params: Params, inputs: Inputs, frame: int, *, corrected: bool = True) 
             is skipped; the result is the same.
     """
     base = inputs.trajectory.T_cam_obj[frame]
-    return SE3.exp(params.poses[frame]) @ base if corrected else base
+    return pose_network.correction(params.poses, params.pose_network, frame) @ base if corrected else base
 
 
 def _corrects_poses(cfg: Config, step: int) -> bool:
@@ -257,13 +294,19 @@ def render(
         mask: Pixels that count in `Buffers.touched`; all when None.
         visibility: For self-shadowing; no self-shadowing when None.
     """
-    gaussians = points.gaussians
+    gaussians = _with_radiance(points)
     if gaussians.sh.shape[1] == 1:
         R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
         lit = (visibility, R_env_obj, -(T_cam_obj.translation @ T_cam_obj.rotation.matrix()))
         colour = sh_lighting.radiance(light, gaussians, points.albedo_logits, *lit)
         gaussians = replace(gaussians, sh=constant_sh(colour))
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
+
+
+def _with_radiance(points: Points) -> Gaussians:
+    """The Gaussians with all harmonics of their static radiance."""
+    gaussians = points.gaussians
+    return replace(gaussians, sh=torch.cat([gaussians.sh, points.sh_rest], 1)) if points.sh_rest.shape[1] else gaussians
 
 
 @threads_for_kernels()
@@ -317,8 +360,7 @@ def _next_frame(state: State, n: int) -> int:
 
 def _rate_factors(cfg: Config, progress: float) -> dict[str, float]:
     """Factors of the learning rates by name prefix, at a progress of 0 to 1."""
-    decayed = 0.2**progress
-    return {"": decayed, "points.gaussians.means": cfg.rates.decay**progress, "gamma": 1.0}
+    return {"": cfg.rates.others_decay**progress, "points.gaussians.means": cfg.rates.decay**progress, "gamma": 1.0}
 
 
 def _terms(
@@ -329,6 +371,8 @@ def _terms(
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
     photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
     terms = losses.image_terms(view, photo, mask, camera, T_cam_obj, ssim_weight=cfg.ssim, crease=cfg.crease)
+    if cfg.mask_loss == "entropy":
+        terms |= {"mask": losses.mask_entropy(view.alpha, mask)}
     own = (params.points.gaussians, params.gamma, view, camera, T_cam_obj)
     terms |= losses.gaussian_terms(*own, floor=cfg.gamma_floor, reach=0.1)
     factors = {
@@ -336,7 +380,7 @@ def _terms(
         "normal": ramp * weights.normal,
         "variance": ramp * weights.variance,
         "rank": weights.rank,
-        "gamma": weights.gamma * 1e-2,
+        "gamma": weights.gamma,
         "proj": weights.proj,
     }
     weighted = {name: factors.get(name, 1.0) * term for name, term in terms.items()}
@@ -398,12 +442,13 @@ def _residuals(
 def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
     """Geometry, albedo and light; the static radiance is the unshadowed diffuse one, averaged over all frames."""
     params = state.params
-    T_cam_obj = SE3.exp(params.poses) @ inputs.trajectory.T_cam_obj
+    every = slice(None)
+    T_cam_obj = pose_network.correction(params.poses, params.pose_network, every) @ inputs.trajectory.T_cam_obj
     trajectory = Trajectory(T_cam_obj, inputs.trajectory.light)
-    gaussians, albedo = params.points.gaussians, torch.sigmoid(params.points.albedo_logits)
+    gaussians, albedo = _with_radiance(params.points), torch.sigmoid(params.points.albedo_logits)
     if cfg.colour == "light":
         mean = torch.zeros_like(albedo)
         for R_env_obj in trajectory.R_env_obj:
             mean += albedo * params.light.diffuse(gaussians.normals @ R_env_obj.T) / len(trajectory)
         gaussians = replace(gaussians, sh=constant_sh(mean))
-    return Refined(gaussians, params.gamma, albedo, params.light, trajectory)
+    return Refined(gaussians, params.gamma, albedo, params.light, trajectory, tree.detach(params.pose_network))

@@ -10,7 +10,7 @@ from tumble._lazy import lazy_getattr
 if TYPE_CHECKING:
     from tumble.preprocess.check import check_footage, passes
     from tumble.preprocess.footage import PROVENANCE, read_provenance
-    from tumble.preprocess.options import FootageOptions
+    from tumble.preprocess.options import FootageOptions, Quality, at_quality
     from tumble.preprocess.picker import pick_box
     from tumble.preprocess.source import FOOTAGE, input_kind, to_capture
     from tumble.preprocess.survey import Survey, survey_footage
@@ -21,7 +21,9 @@ __all__ = [
     "FootageOptions",
     "PREVIEW",
     "PROVENANCE",
+    "Quality",
     "Survey",
+    "at_quality",
     "check_footage",
     "passes",
     "input_kind",
@@ -37,7 +39,7 @@ __getattr__ = lazy_getattr(
     {
         "picker": ("pick_box",),
         "check": ("check_footage", "passes"),
-        "options": ("FootageOptions",),
+        "options": ("FootageOptions", "Quality", "at_quality"),
         "source": ("FOOTAGE", "input_kind", "to_capture"),
         "survey": ("Survey", "survey_footage"),
         "footage": ("PROVENANCE", "read_provenance"),

@@ -4,11 +4,11 @@ The docstrings of the fields are the help texts of the command line; each line o
 module imports nothing heavy, so that `--help` is fast.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Suppress, UseAppendAction, arg
 
 MAX_SURVEY_FRAMES = 400
 """Maximum number of frames that the survey keeps; of a longer video every second, every fourth, ... frame is kept."""
@@ -16,6 +16,17 @@ MIN_SIDE = 64
 """Minimum of width and height of footage, and minimum of `--size` [pixels]."""
 MIN_FRAMES = 3
 """Minimum number of frames of a capture."""
+
+Quality = Literal["draft", "standard", "full", "paper"]
+"""Values of `--quality`, which `recipes.QUALITIES` maps to recipes."""
+FRAMES_AND_SIZE: dict[Quality, tuple[int, int]] = {
+    "draft": (144, 256),
+    "standard": (200, 512),
+    "full": (400, 800),
+    "paper": (400, 800),
+}
+"""Per quality, the maximum number of frames of a capture made from footage, and the longer side of its images [pixels].
+The paper's captures have 400 frames (its appendix B); it prints no size, and 800 pixels are TensoIR's."""
 
 Clicks = Annotated[
     UseAppendAction[tuple[tuple[int, int, int], ...]], arg(metavar="X Y FRAME", help_behavior_hint="(repeatable)")
@@ -59,10 +70,10 @@ class FootageOptions:
     """Only for images with a COLMAP model: what the light was fixed to.
     object: the camera moved around the object.
     camera: the object was turned in front of the camera, and the background was masked. (Videos: always the camera.)"""
-    frames: int = 144
-    """Maximum number of frames in the capture."""
-    size: int = 256
-    """Longer side of the capture's images [pixels]; they are never larger than in the video."""
+    frames: Suppress[int] = 144
+    """Maximum number of frames in the capture. The default is that of the quality "draft", see `at_quality`."""
+    size: Suppress[int] = 256
+    """Longer side of the capture's images [pixels]; they are never larger than in the video. Default: as for frames."""
 
     def __post_init__(self) -> None:
         if self.box is not None and self.click is not None:
@@ -77,3 +88,19 @@ class FootageOptions:
             raise ValueError(f"--segmenter {self.segmenter} needs --weights, the path of its checkpoint file")
         if not MIN_FRAMES <= self.frames <= MAX_SURVEY_FRAMES or not MIN_SIDE <= self.size <= 4096:
             raise ValueError(f"--frames must be {MIN_FRAMES} to {MAX_SURVEY_FRAMES}, and --size {MIN_SIDE} to 4096")
+
+
+def at_quality(options: FootageOptions, quality: Quality, *, frames: int | None, size: int | None) -> FootageOptions:
+    """The options with the number of frames and the size of images that a quality asks for.
+
+    Args:
+        frames: Maximum number of frames instead of the quality's; None for the quality's.
+        size: Longer side of the images instead of the quality's [pixels]; None for the quality's.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    usual_frames, usual_size = FRAMES_AND_SIZE[quality]
+    return replace(
+        options, frames=usual_frames if frames is None else frames, size=usual_size if size is None else size
+    )

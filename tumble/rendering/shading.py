@@ -122,7 +122,7 @@ def shade(
     R_env_obj: Float[Tensor, "3 3"],
     visibility: Visibility,
     *,
-    f0: float,
+    f0: float | Float[Tensor, "*c"],
     bounce: Bounce | AveragedBounce | None = None,
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance (eq. 3), both lobes summed over the visibility's directions.

@@ -1,4 +1,4 @@
-"""Pose parametrisations: three pose sources, and the motions that their outputs stand for."""
+"""Pose parametrisations: two pose sources, and the motion that their outputs stand for."""
 
 import math
 
@@ -17,10 +17,10 @@ def source(kind: str, n: int = 5, out: int = 6) -> PoseSource:
     rng = torch.Generator().manual_seed(0)
     if kind == "vectors":
         return pose_networks.vectors(n, out)
-    return (pose_networks.frame_mlps if kind == "frame_mlps" else pose_networks.global_mlp)(n, out, rng)
+    return pose_networks.frame_mlps(n, out, rng)
 
 
-KINDS = ["vectors", "frame_mlps", "global_mlp"]
+KINDS = ["vectors", "frame_mlps"]
 
 
 def rates(kind: str) -> dict[str, float]:
@@ -41,7 +41,7 @@ def test_all_sources_start_near_zero_and_fit_any_target(kind: str) -> None:
     assert (pose_networks.raw_outputs(net, frames) - target).abs().max() < 0.02
 
 
-@pytest.mark.parametrize("kind", ["vectors", "frame_mlps"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_frames_without_gradient_do_not_move(kind: str) -> None:
     """Also once they have momentum, with which Adam would otherwise move them."""
     net = optim.leaves(source(kind))
@@ -104,11 +104,3 @@ def test_an_orbit_equals_the_camera_motion_of_fmov() -> None:
     )
     T_cam_obj = pose_networks.orbit(base.inverse(), raw)
     assert torch.allclose(T_cam_obj.inverse().matrix(), left @ scaled, atol=1e-5)
-
-
-def test_a_delta_is_bounded_and_zero_for_zero_outputs() -> None:
-    assert torch.equal(pose_networks.delta(torch.zeros(6), rotation=0.3, translation=0.2).matrix(), torch.eye(4))
-    huge = pose_networks.delta(torch.full((6,), 1e4), rotation=0.3, translation=0.2)
-    assert huge.rotation.angle() == pytest.approx(0.3 * math.sqrt(3), rel=1e-4)
-    # A screw motion moves the origin by at most |v|.
-    assert huge.xyz.norm() <= 0.2 * math.sqrt(3) + 1e-5

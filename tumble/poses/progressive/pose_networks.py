@@ -1,8 +1,8 @@
-"""Pose parametrisations: per-frame vectors or networks, and the motions that their outputs stand for.
+"""Pose parametrisations: per-frame vectors or networks, and the motion that their outputs stand for.
 
 A *pose source* is a tree of weights from which `raw_outputs(source, frames)` computes `k` numbers per frame, about zero
-at the start. Two functions convert these to motions: `orbit` rotates the object about its centre, scales its distance
-and shifts it across the view (stage 1); `delta` is a small bounded motion in the camera frame.
+at the start. `orbit` converts these to a motion: it rotates the object about its centre, scales its distance and shifts
+it across the view.
 """
 
 import math
@@ -44,21 +44,7 @@ class FrameMlps:
     """Number of outputs."""
 
 
-@dataclass(frozen=True)
-class GlobalMlp:
-    """The paper's network over learned embeddings of the frames (section 4.2); not used by the default recipe."""
-
-    embeddings: Float[Tensor, "t e"]
-    """Embeddings of the frames, trained."""
-    layers: dict[str, Tensor]
-    """All weights of the network in one vector, under the name "mlp"."""
-    width: int
-    """Units of the hidden layers."""
-    out: int
-    """Number of outputs."""
-
-
-PoseSource = Vectors | FrameMlps | GlobalMlp
+PoseSource = Vectors | FrameMlps
 
 
 def vectors(n_frames: int, out: int) -> Vectors:
@@ -77,25 +63,12 @@ def frame_mlps(n_frames: int, out: int, rng: torch.Generator, *, width: int = 64
     return FrameMlps(codes, {str(i): _initial_weights(code, width, out, rng) for i in range(n_frames)}, width, out)
 
 
-def global_mlp(n_frames: int, out: int, rng: torch.Generator, *, width: int = 64, embedding: int = 32) -> GlobalMlp:
-    """The paper's global pose network with per-frame embeddings (section 4.2); not used by the default recipe.
-
-    A pose source for refining poses in stage 2, together with `delta`. The paper does not state its sizes.
-    """
-    embeddings = HEAD_STD * torch.randn(n_frames, embedding, generator=rng)
-    return GlobalMlp(embeddings, {"mlp": _initial_weights(embedding, width, out, rng)}, width, out)
-
-
 def raw_outputs(source: PoseSource, frames: Sequence[int]) -> Float[Tensor, "f k"]:
     """Outputs of a pose source for some frames, about 0 at the start."""
     if isinstance(source, Vectors):
         return torch.stack([source.values[str(i)] for i in frames])
-    if isinstance(source, FrameMlps):
-        weights = torch.stack([source.values[str(i)] for i in frames])
-        return _apply_mlps(weights, source.codes[list(frames)], source.width, source.out)
-    inputs = source.embeddings[list(frames)]
-    weights = source.layers["mlp"].expand(len(inputs), -1)
-    return _apply_mlps(weights, inputs, source.width, source.out)
+    weights = torch.stack([source.values[str(i)] for i in frames])
+    return _apply_mlps(weights, source.codes[list(frames)], source.width, source.out)
 
 
 def orbit(base: SE3, raw: Float[Tensor, "*b 6"]) -> SE3:
@@ -111,20 +84,6 @@ def orbit(base: SE3, raw: Float[Tensor, "*b 6"]) -> SE3:
     """
     rotated = base.rotation @ SO3.exp(-math.pi * raw[..., :3])
     return SE3.from_rotation(rotated, base.xyz * (1 + raw[..., 3:4]) + pad(raw[..., 4:], (0, 1)))
-
-
-def delta(raw: Float[Tensor, "*b 6"], *, rotation: float, translation: float) -> SE3:
-    """The paper's deviation from an initial pose, as a bounded motion (section 4.2); not used by the default recipe.
-
-    For refining poses in stages 2 and 3: `delta(raw, ...) @ base` is the refined pose.
-
-    Args:
-        raw: Translation and rotation vector before the limits are applied; 0 is no motion, 0.01 a hundredth of them.
-        rotation: Limit of the rotation about each axis of the camera frame [radians].
-        translation: Limit of the translation along each axis of the camera frame [object radius].
-    """
-    v, omega = raw.tanh().split(3, -1)
-    return SE3.exp(torch.cat([translation * v, rotation * omega], -1))
 
 
 def _initial_weights(n_in: int, width: int, out: int, rng: torch.Generator) -> Float[Tensor, " w"]:

@@ -1,11 +1,12 @@
 """Stage 1 by the paper's progressive route (section 4.1): tracking frame by frame against a shape learned meanwhile.
 
-The tracker estimates poses in the frame of the virtual camera, which are converted to the true camera in closed form.
+The tracker estimates poses in the frame of the virtual camera, which are converted to the true camera (`Config.lift`).
 Their quality is computed by a function that the caller passes in, so that both routes of stage 1 are assessed alike.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
@@ -14,14 +15,19 @@ from tumble.poses.progressive import tracker, virtual_camera
 from tumble.poses.result import PoseResult
 from tumble.scene import Capture, Match, Trajectory
 
-VERSION = 5
+VERSION = 6
 VIRTUAL_SIZE = 128
 """Height and width of the virtual frames [pixels]."""
+PNP_POINTS = 1000
+"""Approximate number of surface points whose projections determine a pose, if it is lifted by RANSAC-EPnP."""
 
 
 @dataclass(frozen=True)
 class Config(tracker.Config):
-    """Settings of the progressive route, which are those of the tracker."""
+    """Settings of the progressive route: those of the tracker, and how poses are lifted to the true camera."""
+
+    lift: Literal["exact", "pnp"] = "exact"
+    """exact: in closed form. pnp: by RANSAC-EPnP from points of the shape, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -64,4 +70,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, torch.Tensor | 
 def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     """Poses in the true camera, with their quality."""
     result = tracker.finish(cfg, inputs.track, state)
-    return inputs.assess(virtual_camera.lift(result.aim, result.T_aim_obj, inputs.track.capture.light))
+    capture = inputs.track.capture
+    if cfg.lift == "exact":
+        return inputs.assess(virtual_camera.lift(result.aim, result.T_aim_obj, capture.light))
+    points = virtual_camera.surface_points(result.sdf, PNP_POINTS, state.rng)
+    return inputs.assess(virtual_camera.by_pnp(points, result.aim, result.T_aim_obj, capture.camera, capture.light))

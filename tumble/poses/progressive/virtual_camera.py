@@ -103,9 +103,7 @@ def lift(aim: Aim, T_aim_obj: SE3, light: Light) -> Trajectory:
 
 @torch.no_grad()
 def surface_points(sdf: Sdf, n: int, rng: torch.Generator, *, resolution: int = 64) -> Float[Tensor, "n 3"]:
-    """The paper's surface points for 2D-3D correspondences (section 4.2); not used by the default recipe.
-
-    Input of `by_pnp`.
+    """The paper's surface points for 2D-3D correspondences (section 4.2), input of `by_pnp`.
 
     Args:
         sdf: Shape.
@@ -130,9 +128,9 @@ def surface_points(sdf: Sdf, n: int, rng: torch.Generator, *, resolution: int = 
 
 
 def by_pnp(points: Float[Tensor, "n 3"], aim: Aim, T_aim_obj: SE3, camera: Camera, light: Light) -> Trajectory:
-    """The paper's lifting of poses to the true camera by RANSAC-EPnP (section 4.2); not used by the default recipe.
+    """The paper's lifting of poses to the true camera by RANSAC-EPnP (section 4.2).
 
-    For comparison with `lift`, which does the same in closed form. Points are projected into the virtual frame and
+    `lift` does the same in closed form. Points are projected into the virtual frame and
     mapped to the true frame; the pose is then estimated from these 2D-3D correspondences. Points on the back of the
     object are used as well, as correspondences are projections rather than observations.
 
