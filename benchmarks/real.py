@@ -1,0 +1,316 @@
+"""Films and photographs of real objects from file to asset, compared with scans of the objects where there are any.
+
+`python -m benchmarks.real NAME=PATH... -o FOLDER [--scan NAME=GLB...]` runs `tumble run` on the inputs named in
+`INPUTS` and writes `benchmarks/real.json` and `benchmarks/real.md`. Nothing of the inputs is copied into them.
+
+With a scan, true poses are found without anything of ours: the scan's albedo and depth are rendered from 42 directions
+by `tumble synth`; SIFT features of a film's frame are matched to those views, and the pose is that of RANSAC PnP on
+the points of the scan behind them. The rotation from the asset to the scan is the mean over frames.
+Surfaces are compared after ICP with a similarity: from the vertices of the asset to the scan, and back.
+"""
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from benchmarks.kernels import machine
+from benchmarks.poses import line
+from tumble.datasets import reader_for, save_capture
+from tumble.io import files, video
+from tumble.scene import BACKGROUND, OBJECT, Camera, Capture, Trajectory, Truth
+from tumble.synthetic import SynthOptions, render_capture
+
+COMMAND = "python -m benchmarks.real NAME=PATH... -o FOLDER"
+Row = dict[str, Any]
+Features = tuple[np.ndarray, np.ndarray]
+"""SIFT descriptors of a view, and the points of the object behind them [object radius]."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """A film or a set of photographs."""
+
+    source: str
+    """Where it comes from."""
+    options: str
+    """Options of `tumble run`."""
+    focal: float = 0.0
+    """Focal length, for poses by the scan; the principal point is the centre [pixels]."""
+
+
+INPUTS = {
+    "MC1": Input("HO-3D, cracker box, 141 frames", "--box 315 35 210 275 --focal 617", 617),
+    "SMu1": Input("HO-3D, red mug, 130 frames", "--box 230 220 220 200 --focal 617", 617),
+    "ABF14": Input("HO-3D, bleach bottle, 131 frames", "--box 340 160 240 180 --focal 617", 617),
+    "cube": Input("ViSP, cube_video.mp4, first 600 frames", "--box 390 155 222 222 --at 300 --focal 605", 605),
+    "box": Input("OpenCV, box.mp4, 455 frames", "--box 292 16 308 225"),
+    "dtu": Input("DTU scan 65 in the layout of NeuS: a skull, 49 photographs from a dome, their masks and poses", ""),
+    "dinosaur": Input("Oxford dinosaur, turntable, 36 photographs as a film", "--box 80 8 372 468 --focal 3217"),
+}
+TITLES = {
+    "name": "input",
+    "result": "rating of the report",
+    "frames": "frames with a pose",
+    "degrees": "named error [deg]",
+    "rotation_median": "rotation, median [deg]",
+    "rotation_p90": "90 % below [deg]",
+    "with_truth": "frames with truth",
+    "asset_to_scan": "asset to scan, median [% of diameter]",
+    "scan_to_asset": "scan to asset, median",
+    "seconds": "time of the stages [s]",
+}
+"""Column titles by the key of a row."""
+CAMERAS = "cameras_sphere.npz"
+"""File of the cameras in the layout of NeuS."""
+VIEWS = 42
+"""Rendered views of a scan, from all directions."""
+WIDTH = 400
+"""Width of the photographs of a still object [pixels]."""
+VIEW = 512
+"""Height and width of the rendered views of a scan [pixels]."""
+CONTRAST = 0.02
+"""Contrast threshold of SIFT: half of OpenCV's, because films are dark."""
+MIN_INLIERS = 25
+"""Matches that agree with a pose, for it to count as true."""
+MIN_FRAMES = 8
+"""Frames with a true pose below which nothing is compared."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("inputs", nargs="+", metavar="NAME=PATH")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="folder of the runs")
+    parser.add_argument("--scan", nargs="*", default=[], metavar="NAME=GLB")
+    arguments = parser.parse_args()
+    scans = dict(each.split("=", 1) for each in arguments.scan)
+    target = Path(__file__).with_suffix(".json")
+    rows: list[Row] = json.loads(target.read_text())["rows"] if target.exists() else []
+    for name, path in (each.split("=", 1) for each in arguments.inputs):
+        row = measure(name, Path(path), arguments.out / name)
+        if name in scans and "frames" in row:
+            row |= compare(name, Path(path), arguments.out / name, Path(scans[name]))
+        rows = [each for each in rows if each["name"] != name] + [row]
+        print(line([*TITLES], row), flush=True)
+        files.write_json(target, {"command": COMMAND, "machine": machine(), "rows": rows})
+        target.with_suffix(".md").write_text(report(rows))
+
+
+def report(rows: list[Row]) -> str:
+    """The table in Markdown."""
+    about = "\n".join(f"- {name}: {each.source}. `tumble run FILE {each.options}`" for name, each in INPUTS.items())
+    lines = [line([*TITLES], TITLES), "|" + " --- |" * len(TITLES), *(line([*TITLES], row) for row in rows)]
+    sentences = "\n".join(f"- {row['name']}: {row['sentence']}" for row in rows)
+    return (
+        f"# Films of real objects\n\n`{COMMAND} [--scan NAME=GLB...]`. Rotation errors and distances are against scans "
+        "of the objects (see the docstring of the script).\n\n"
+        + "\n".join(lines)
+        + f"\n\nWhat the program said:\n\n{sentences}\n\nInputs:\n\n{about}\n"
+    )
+
+
+def measure(name: str, path: Path, run: Path) -> Row:
+    """Run the pipeline; the rating of its report, how many frames have a pose, how long the stages took."""
+    source = static_capture(path, run.parent / f"{name}-capture") if (path / CAMERAS).exists() else path
+    command = [sys.executable, "-m", "tumble", "run", str(source), *INPUTS[name].options.split(), "-o", str(run)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode:
+        return {"name": name, "result": "NO-GO", "sentence": done.stderr.strip().splitlines()[-1]}
+    capture = run / "capture" / "transforms.json"
+    poses = files.read_json(run / "poses.json")
+    page = (run / "report.html").read_text()
+    rating = re.search(r'<p class="rating \w+"><span>(.*?)</span>\s*(.*?)</p>', page)
+    named = re.search(r"accurate to about ([\d.]+) degrees", page)
+    assert rating is not None, "every report has one"
+    records = [json.loads(text) for text in (run / "log.jsonl").read_text().splitlines()]
+    return {
+        "name": name,
+        "result": rating[1],
+        "sentence": rating[2],
+        "frames": f"{len(poses)} of {len(files.read_json(capture)['frames']) if capture.exists() else len(poses)}",
+        "degrees": float(named[1]) if named else None,
+        "seconds": round(sum(record.get("seconds", 0) for record in records if record.get("event") == "done")),
+    }
+
+
+def static_capture(path: Path, out: Path) -> Path:
+    """A capture folder of `WIDTH` pixels from photographs, masks and cameras in the layout of NeuS, for a still object.
+
+    The cameras may be those of larger photographs: the factor is the whole number that brings the principal point
+    nearest to the centre.
+    """
+    cameras = np.load(path / CAMERAS)
+    images, masks = (sorted((path / name).iterdir()) for name in ("image", "mask"))
+    pixels = np.stack([shrunk(files.read_image(each)) for each in images])
+    inside = np.stack([shrunk(files.read_image(each)[..., 0]) for each in masks]) > 127
+    _, height, width, _ = pixels.shape
+    lenses, T_obj_gl = [], []
+    for i in range(len(images)):
+        K, R, x, *_ = cv2.decomposeProjectionMatrix((cameras[f"world_mat_{i}"] @ cameras[f"scale_mat_{i}"])[:3])
+        original = files.image_size(images[i])[1]
+        scale = WIDTH / (original * round(float(K[0, 2] / K[2, 2] / (original / 2))))
+        lenses.append((np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) / K[2, 2] + [0, 0, 0.5, 0.5]) * scale)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = R.T @ np.diag([1, -1, -1]), x[:3, 0] / x[3, 0]
+        T_obj_gl.append(matrix)
+    trajectory = Trajectory.from_camera_to_object(torch.tensor(np.stack(T_obj_gl)).float(), "object")
+    capture = Capture(
+        torch.from_numpy(pixels * inside[..., None]),
+        torch.from_numpy(np.where(inside, OBJECT, BACKGROUND).astype(np.uint8)),
+        Camera(torch.tensor(np.median(lenses, 0)).float(), height, width),
+        tuple(f"{each.stem}.png" for each in images),
+        "object",
+        trajectory,
+    )
+    if not out.exists():
+        save_capture(out, capture)
+    return out
+
+
+def shrunk(pixels: np.ndarray) -> np.ndarray:
+    """An image of `WIDTH` pixels; every pixel is the mean of those that it covers."""
+    size = WIDTH, round(pixels.shape[0] * WIDTH / pixels.shape[1])
+    return cv2.resize(np.ascontiguousarray(pixels), size, interpolation=cv2.INTER_AREA)
+
+
+# Comparison with a scan -----------------------------------------------------------------------------------------------
+
+
+def compare(name: str, film: Path, run: Path, scan: Path) -> Row:
+    """Errors of the poses and of the surface against a scan of the object."""
+    rendered = run.parent / f"{name}-scan"
+    options = SynthOptions(env="white", views=2, eval_shared=0, eval_sphere=VIEWS, resolution=VIEW, samples=1)
+    reader = reader_for(render_capture(scan, rendered, options))
+    views = rendered_features(reader.load_truth(rendered), reader.load(rendered).camera)
+    numbers = {
+        each["name"]: each["source_frame"] for each in files.read_json(run / "capture" / "ingest.json")["frames"]
+    }
+    glb = exported(run)
+    poses = files.read_json(glb.with_name("poses.json"))
+    estimated = Trajectory.from_camera_to_object(torch.tensor(list(poses.values())), "camera").T_cam_obj
+    wanted = {numbers[key]: i for i, key in enumerate(poses)}
+    pairs = []
+    for number, frame in enumerate(video.read_clip(film)):
+        if number in wanted and (pose := true_pose(frame, INPUTS[name].focal, views)) is not None:
+            pairs.append((wanted[number], *pose))
+    R_est, x_est = estimated.rotation.matrix().numpy(), estimated.xyz.numpy()
+    if len(pairs) < MIN_FRAMES:
+        return {"with_truth": len(pairs)}
+    index = [pair[0] for pair in pairs]
+    R, t = np.stack([pair[1] for pair in pairs]), np.stack([pair[2] for pair in pairs])
+    relative = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ R_est[index])
+    # The frame of which most others are within 15 degrees starts the mean, so that wrong poses do not turn it.
+    apart = np.degrees([(relative.inv() * each).magnitude() for each in relative])
+    near = apart[np.argmax((apart < 15).sum(1))] < 15
+    R_scan_asset = relative[near].mean()
+    errors = np.degrees((relative.inv() * R_scan_asset).magnitude())
+    matrix = similarity(R[near], t[near], x_est[index][near], R_scan_asset.as_matrix())
+    asset = trimesh.load_mesh(glb, force="mesh")
+    return {
+        "with_truth": len(pairs),
+        "rotation_median": round(float(np.median(errors)), 2),
+        "rotation_p90": round(float(np.quantile(errors, 0.9)), 2),
+        **surface_distances(asset, trimesh.load_mesh(rendered / "truth" / "mesh.glb", force="mesh"), matrix),
+    }
+
+
+def rendered_features(truth: Truth, camera: Camera) -> list[Features]:
+    """SIFT features of the views of a scan."""
+    assert truth.trajectory is not None, "synth writes it"
+    assert truth.albedo is not None, "synth writes it"
+    assert truth.depth is not None, "synth writes it"
+    views = []
+    for i, (albedo, depth) in enumerate(zip(truth.albedo.numpy(), truth.depth.numpy(), strict=True)):
+        grey = cv2.cvtColor((255 * albedo.clip(0, 1) ** (1 / 2.2)).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+        inside = cv2.erode((depth > 0).astype(np.uint8), np.ones((3, 3)))
+        points, descriptors = cv2.SIFT.create(contrastThreshold=CONTRAST).detectAndCompute(grey, inside)
+        if len(points) < MIN_INLIERS:
+            continue
+        uv = np.array([point.pt for point in points])
+        column, row = uv.round().astype(int).T
+        K = camera.opencv_matrix
+        rays = np.concatenate([(uv - K[:2, 2]) / [K[0, 0], K[1, 1]], np.ones((len(uv), 1))], 1)
+        x_cam = torch.from_numpy(rays * depth[row, column, None]).float()
+        views.append((descriptors, (truth.trajectory.T_cam_obj.inverse()[i] @ x_cam).numpy()))
+    return views
+
+
+def true_pose(frame: np.ndarray, focal: float, views: list[Features]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotation and translation of the scan in the camera frame (OpenCV axes) in a frame of a film; None if unsure."""
+    points, descriptors = cv2.SIFT.create(contrastThreshold=CONTRAST).detectAndCompute(
+        cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2GRAY), None
+    )
+    if descriptors is None:
+        return None
+    uv = np.array([point.pt for point in points]) + 0.5
+    found = []
+    for of_view, x_obj in views:
+        matches = cv2.BFMatcher().knnMatch(descriptors, of_view, k=2)
+        good = [(a.queryIdx, a.trainIdx) for a, b in matches if a.distance < 0.8 * b.distance]
+        found.append([(uv[i], x_obj[j]) for i, j in good])
+    chosen = [pair for view in sorted(found, key=len)[-4:] for pair in view]
+    if len(chosen) < MIN_INLIERS:
+        return None
+    image, world = (np.array(values) for values in zip(*chosen, strict=True))
+    K = np.array([[focal, 0, frame.shape[1] / 2], [0, focal, frame.shape[0] / 2], [0, 0, 1]])
+    good, rvec, t, inliers = cv2.solvePnPRansac(
+        world, image, K, None, iterationsCount=5000, reprojectionError=3.0, flags=cv2.SOLVEPNP_AP3P
+    )
+    if not good or inliers is None or len(inliers) < MIN_INLIERS:
+        return None
+    agreeing = np.asarray(inliers, int).ravel()
+    rvec, t = cv2.solvePnPRefineLM(world[agreeing], image[agreeing], K, None, rvec, t)
+    return cv2.Rodrigues(rvec)[0], t[:, 0]
+
+
+def similarity(R: np.ndarray, t: np.ndarray, x_est: np.ndarray, R_scan_asset: np.ndarray) -> np.ndarray:
+    """Asset frame to scan frame, from the poses of both: R c + t = s x_est in every frame, by least squares."""
+    A = np.concatenate([np.concatenate([R[i], -x_est[i][:, None]], 1) for i in range(len(R))])
+    *c, s = np.linalg.lstsq(A, -t.ravel(), rcond=None)[0]
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = s * R_scan_asset, c
+    return matrix
+
+
+def surface_distances(asset: trimesh.Trimesh, scan: trimesh.Trimesh, matrix: np.ndarray) -> Row:
+    """Median distances between two surfaces after ICP [% of the scan's diameter]."""
+    points, on_scan = (trimesh.sample.sample_surface(mesh, 60000, seed=0)[0] for mesh in (asset, scan))
+    tree = KDTree(on_scan)
+    kept: np.ndarray = points[::10]
+    for share in (1.0, 0.85):
+        distance = tree.query(trimesh.transform_points(kept, matrix))[0]
+        kept = kept[distance <= np.quantile(distance, share)]
+        matrix, *_ = trimesh.registration.icp(kept, on_scan, matrix, max_iterations=60, reflection=False)
+    moved = trimesh.transform_points(points, matrix)
+    diameter = pdist(scan.convex_hull.vertices).max()
+    back = KDTree(moved).query(on_scan)[0]
+    forward = tree.query(moved)[0]
+    return {
+        "asset_to_scan": round(float(100 * np.median(forward) / diameter), 2),
+        "scan_to_asset": round(float(100 * np.median(back) / diameter), 2),
+    }
+
+
+def exported(run: Path) -> Path:
+    """The GLB of a run, with the object frame of its poses."""
+    out = run / "export"
+    if not list(out.glob("*.glb")):
+        command = [sys.executable, "-m", "tumble", "export", str(run), "--preset", "web", "-o", str(out)]
+        subprocess.run(command, check=True, capture_output=True)
+    return next(out.glob("*.glb"))
+
+
+if __name__ == "__main__":
+    main()
