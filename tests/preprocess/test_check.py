@@ -70,6 +70,17 @@ def test_drift_and_blur_are_reported(tmp_path: Path) -> None:
     assert "colours by" in results["exposure"].state
 
 
+def test_a_drift_of_more_than_a_stop_is_a_warning_because_it_is_corrected(tmp_path: Path) -> None:
+    """A film of a real hand whose exposure drifted by 1.25 stops ended in poses that were right to 1.5 degrees."""
+    pictures = scene().pictures
+    dimmed = (pictures * np.geomspace(1, 0.65, len(pictures))[:, None, None, None]).astype(np.uint8)
+    for i, mask in enumerate(scene().object):
+        files.write_png(tmp_path / "m" / f"{i}.png", (mask * np.uint8(255))[..., None])
+    results = findings(dimmed, tmp_path, FootageOptions(masks=tmp_path / "m", focal=300.0))
+    assert "drifts by 1." in results["exposure"].state
+    assert results["exposure"].rating == "warn"
+
+
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Survey:
     """Survey of a film with a hand; its masks are replaced by the true ones."""

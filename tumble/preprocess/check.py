@@ -23,8 +23,9 @@ CAMERA_MOTION = (0.004, camera_motion.MAX_CAMERA_MOTION)
 """Limits of the motion of the background [longer side of the image]; 8 and 38 of 1920 pixels."""
 EDGE_BLUR = (1.2, 2.5)
 """Limits of the blur of the object's edges in the selected frames [pixels of the capture's images]."""
-EXPOSURE_RANGE = (0.15, 1.0)
-"""Limits of the range of the exposure over the video [stops]."""
+MAX_EXPOSURE_RANGE = 0.15
+"""Range of the exposure over the video above which a warning is given [stops]. No range prevents a reconstruction,
+because the drift is corrected; pixels that it saturates are counted on their own."""
 MAX_WHITE_BALANCE_RANGE = 0.08
 """Range of the gain of red or blue relative to green, over the video, above which a warning is given."""
 UNCERTAIN_FRAMES = (0.1, 0.4)
@@ -262,8 +263,7 @@ def _light(survey: Survey) -> list[Finding]:
     stops = float(np.ptp(np.log2(survey.gains[:, 1])))
     colour = float(np.ptp(survey.gains / survey.gains[:, 1:2], axis=0).max())
     advice = "lock exposure and white balance; the drift is corrected, but clipped colours are lost"
-    rating = _rate(stops, EXPOSURE_RANGE)
-    rating = "warn" if rating == "good" and colour > MAX_WHITE_BALANCE_RANGE else rating
+    rating = "warn" if stops > MAX_EXPOSURE_RANGE or colour > MAX_WHITE_BALANCE_RANGE else "good"
     exposure = _finding("exposure", rating, f"drifts by {stops:.2f} stops, colours by {100 * colour:.0f} %", advice)
     pixels = survey.images[survey.inside]
     saturated = float((pixels.min(-1) >= 250).mean()) if len(pixels) else 0.0
