@@ -247,10 +247,15 @@ def _poses(folder: _Folder, frames: Sequence[FrameRecord]) -> Trajectory | None:
     if without:
         rule = f"the frame {without[0]} has no pose, but others have"
         raise BadFile(folder.path, rule, "give all frames a pose, or none")
-    return Trajectory.from_camera_to_object(_rigid_matrices(folder.path, matrices.items()), folder.document.light)
+    return Trajectory.from_camera_to_object(rigid_matrices(folder.path, matrices.items()), folder.document.light)
 
 
-def _rigid_matrices(path: Path, named_matrices: Iterable[tuple[str, Any]]) -> Float[Tensor, "t 4 4"]:
+def rigid_matrices(path: Path, named_matrices: Iterable[tuple[str, Any]]) -> Float[Tensor, "t 4 4"]:
+    """Homogeneous matrices of rigid motions, from a file's rows of numbers by frame name.
+
+    Raises:
+        BadFile: One of them is no rotation and translation.
+    """
     matrices = []
     for name, values in named_matrices:
         with np.errstate(over="ignore"):
@@ -274,7 +279,7 @@ def read_poses(path: Path, names: Iterable[str]) -> Float[Tensor, "t 4 4"]:
     document, names = files.read_json(path, dict[str, Matrix]), list(names)
     if missing := [name for name in names if name not in document]:
         raise BadFile(path, f"has no pose for {', '.join(missing[:3])}")
-    return _rigid_matrices(path, ((name, document[name]) for name in names))
+    return rigid_matrices(path, ((name, document[name]) for name in names))
 
 
 def _true_poses(folder: _Folder) -> Trajectory | None:
