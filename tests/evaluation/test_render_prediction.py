@@ -274,14 +274,16 @@ def test_registration_inverts_a_similarity() -> None:
 def test_views_elsewhere_have_their_own_camera_and_light_in_every_object_frame() -> None:
     """They are the asset relit by hand; and the same for a run in another object frame, up to the noise of few rays."""
     asset = ellipsoid_asset("camera")
-    capture, truth = rendered_truth(asset)
     poses = trajectories.shared_views(2, 1.3 * DISTANCE)
     T_cam_obj = SE3(poses.wxyz.float(), poses.xyz.float())
+    black = torch.zeros(1, SIZE, SIZE, 3, dtype=torch.uint8)
+    capture = Capture(black, black[..., 0], CAMERA, NAMES[:1], "camera")
+    view = Trajectory(T_cam_obj[[0]], "camera")
     cameras = tuple(Camera.from_fov(math.radians(angle), SIZE, SIZE) for angle in (20, 28))
     lights = smooth_light(1.0), smooth_light(-2.0)
     seen = torch.ones(2, SIZE, SIZE, dtype=torch.bool)
     views = RelitViews(torch.zeros(2, SIZE, SIZE, 3), seen, cameras, T_cam_obj, lights)
-    truth = dataclasses.replace(truth, elsewhere=views)
+    truth = Truth(black, black[..., 0], NAMES[:1], ("shared",), trajectory=view, elsewhere=views)
     identity = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
     similar = OTHER.R_true_pred.inverse()
     back = Similarity(1 / OTHER.scale, similar, -(similar @ OTHER.shift) / OTHER.scale)

@@ -27,6 +27,16 @@ METRICS: dict[str, tuple[str, str]] = {
     "light.rmse_clip10": ("light RMSE", "{:.3f}"),
     "light.log_correlation": ("light log corr.", "{:.2f}"),
     "poses.rotation_median_degrees": ("rotation median [deg]", "{:.2f}"),
+    "tensoir.albedo_psnr": ("TensoIR albedo [dB]", "{:.2f}"),
+    "tensoir.relit_psnr": ("TensoIR relit [dB]", "{:.2f}"),
+    "tensoir.normal_mae_degrees": ("TensoIR normals [deg]", "{:.2f}"),
+    "orb.relit_psnr_h": ("ORB relit PSNR-H [dB]", "{:.2f}"),
+    "orb.relit_psnr_l": ("ORB relit PSNR-L [dB]", "{:.2f}"),
+    "orb.relit_ssim": ("ORB relit SSIM", "{:.3f}"),
+    "orb.image_psnr_h": ("ORB view PSNR-H [dB]", "{:.2f}"),
+    "orb.image_psnr_l": ("ORB view PSNR-L [dB]", "{:.2f}"),
+    "orb.albedo_psnr": ("ORB albedo [dB]", "{:.2f}"),
+    "orb.normal_cosine": ("ORB normals", "{:.3f}"),
     "seconds.run": ("run [s]", "{:.0f}"),
     "peak_memory_MiB": ("memory [MiB]", "{:.0f}"),
 }
@@ -80,6 +90,8 @@ def value_of(row: SuiteRow, key: str) -> float | None:
         "seconds": row.get("seconds", {}).get(second),
         "peak_memory_MiB": row.get("peak_memory_MiB"),
         "light": row.get("light", {}).get(key),
+        "tensoir": row.get("published", {}).get(key),
+        "orb": row.get("published", {}).get(key),
         "poses": row.get("poses", {}).get(key) if row["labels"]["poses"] == "estimate" else None,
     }
     return found[first] if first in found else row.get("regions", {}).get(REGION, {}).get(key)
