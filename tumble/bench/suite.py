@@ -7,8 +7,8 @@
     [[rows]]                            lists of values: one case for each object and each combination of the values
     [[compare]]                         two sets of rows whose scores are compared object by object
 
-The values of `[[rows]]` are options of `tumble synth`, `poses` ("given" or "estimate") and `method`; for captures of the
-user only the last two.
+The values of `[[rows]]` are options of `tumble synth`, `poses` ("given" or "estimate") and `method`; for captures of
+the user only the last two.
 """
 
 import dataclasses
