@@ -109,8 +109,10 @@ def varied_labels(rows: Sequence[SuiteRow], without: Sequence[str] = ()) -> list
 
 
 def of_object(results: SuiteResults) -> tuple[str, ...]:
-    """Labels over which means are taken: the light belongs to the object unless it is what the suite varies."""
-    return ("object", "seed") if results["suite"]["plot"] == "light" else ("object", "light", "seed")
+    """Labels over which means are taken: the light belongs to the object unless the suite varies or compares it."""
+    suite = results["suite"]
+    varied = suite["plot"] == "light" or any("light" in each["ahead"] for each in suite["compare"])
+    return ("object", "seed") if varied else ("object", "light", "seed")
 
 
 def grouped(rows: Sequence[SuiteRow], labels: Sequence[str]) -> dict[tuple[Any, ...], list[SuiteRow]]:
