@@ -42,6 +42,12 @@ def inputs(light: Light, *, n: int = 12, turning: bool = False) -> Inputs:
     if turning:
         turns = SO3.exp(2 * torch.randn(n, 3, generator=torch.Generator().manual_seed(0))).matrix()
         trajectory = replace(trajectory, light_turns=turns)
+    return painted(trajectory)
+
+
+def painted(trajectory: Trajectory) -> Inputs:
+    """Inputs of stage 3: photos along a trajectory, and the true sphere."""
+    n, light = len(trajectory), trajectory.light
     images, masks = zip(*(photo(trajectory, i) for i in range(n)), strict=True)
     labels = torch.where(torch.stack(masks), OBJECT, BACKGROUND).to(torch.uint8)
     names = tuple(f"{i:02}.png" for i in range(n))

@@ -214,7 +214,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         "directions": torch.stack(sets),
         "specular_penalty": cfg.weights.specular * torch.ones_like(params.gamma),
     }
-    state = State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
+    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, memory)
     _trace_visibility(cfg, inputs, state)
     if cfg.fit_specular and refined.light.log_specular_scale.exp() > specular_fit.MIN_REFINED_SCALE:
         fit_specular(cfg, inputs, state)
@@ -278,7 +278,7 @@ def _correction(params: Params, inputs: Inputs, frame: int | slice) -> SE3:
     return correction @ pose_network.correction(params.poses, before, frame).inverse() if now and before else correction
 
 
-def _rates(cfg: Config) -> dict[str, float]:
+def learning_rates(cfg: Config) -> dict[str, float]:
     """Learning rates by name prefix of the parameters."""
     rates, learned = cfg.rates, _learns_network(cfg)
     return {
