@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from tumble.evaluation import metrics
 from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
-from tumble.io import progress
+from tumble.io import progress, tree
 from tumble.maths import SO3, to_srgb8
 from tumble.rendering import Buffers, antialiased_gbuffer, relight
 from tumble.scene import Asset, Capture, Environment, RelitViews, Trajectory, Truth
@@ -150,9 +150,12 @@ def _views_elsewhere(
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     images = []
     for i in progress.track(range(len(views)), "rendering views in other places", len(views)):
-        light, view = views.lights[i].rotated(R_pred_true), poses.select([i])
-        buffers = [antialiased_gbuffer(asset, view.T_cam_obj[0], views.cameras[i])]
-        images += relight.relight(cfg, asset, light, view, views.cameras[i], geometry=geometry, buffers=buffers)
+        # A tree's tensors in tuples stay where they are.
+        light = tree.to(views.lights[i], R_pred_true.device).rotated(R_pred_true)
+        camera = tree.to(views.cameras[i], R_pred_true.device)
+        view = poses.select([i])
+        buffers = [antialiased_gbuffer(asset, view.T_cam_obj[0], camera)]
+        images += relight.relight(cfg, asset, light, view, camera, geometry=geometry, buffers=buffers)
     return torch.stack(images)
 
 

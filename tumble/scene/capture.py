@@ -141,7 +141,7 @@ class Truth:
     units: Units = "arbitrary"
     """Unit of the poses: metres, or unknown."""
     setting: str | None = None
-    """Label for reports: "handheld", "turntable" or "dome"."""
+    """Label for reports: "handheld", "turntable", "dome" or "turned"."""
     benchmark: Benchmark = ""
     """Benchmark by whose protocol the capture is scored, too."""
     alpha: UInt8[Tensor, "v h w"] | None = None
