@@ -176,7 +176,7 @@ def _refine_scores(state: State, capture: Capture, truth: Truth) -> dict[str, fl
     params, visibility, image, full = state.params, refine.cached_visibility(state), [], []
     albedo = torch.sigmoid(params.points.albedo_logits)
     for number in truth.views("shared"):
-        arguments = (truth.trajectory.T_cam_obj[number], truth.trajectory, capture.camera)
+        arguments = (truth.trajectory.T_cam_obj[number], truth.trajectory.R_env_obj[number], capture.camera)
         view = refine.render(params.points, params.gamma, params.light, *arguments, visibility=visibility)
         rendered, true_image = srgb_from_linear(view.rgb).clamp(0, 1), truth.images[number] / 255
         image.append(metrics.psnr(rendered, true_image, truth.foreground[number]))

@@ -489,6 +489,17 @@ def test_every_ablation_runs_and_changes_the_asset(finished: tuple[Path, Asset],
         assert any(not torch.equal(x, method[key]) for key, x in changed.items())
 
 
+@pytest.mark.parametrize("name", ["recap-10", "svg-ir", "irgs"])
+def test_every_baseline_runs_with_given_poses(capture: Path, name: str) -> None:
+    """The poses do not change in stage 3."""
+    loaded = folder.load(capture)
+    asset = pipeline.reconstruct(loaded, recipe=recipes.METHODS[name](RECIPE))
+    assert all(torch.isfinite(x).all() for x in tree.named_tensors(asset).values())
+    assert asset.trajectory.light == "camera"
+    assert loaded.trajectory is not None
+    torch.testing.assert_close(asset.trajectory.T_cam_obj.xyz, loaded.trajectory.T_cam_obj.xyz)
+
+
 @pytest.mark.parametrize("name", recipes.QUALITIES)
 def test_every_quality_runs_scaled_down(capture: Path, tmp_path: Path, name: str) -> None:
     """Into a run directory, with given poses, which stay."""

@@ -188,6 +188,8 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     row["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT // 2**20
     row["regions"] = {region: bench.rounded(scores) for region, scores in report["regions"].items()}
     row["light"], row["poses"] = bench.rounded(report["light"]), bench.rounded(report["poses"])
+    if report["published"]:
+        row["published"] = bench.rounded(report["published"])
     row["albedo_scale"], row["notes"] = report["albedo_scale"], report["notes"]
     if known.truth.light is not None:
         row["directionality"] = round(known.truth.light.directionality(), 3)

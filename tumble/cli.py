@@ -499,7 +499,7 @@ def _print_scores(report: "Report") -> None:
         table.add_column(heading, justify="left" if heading == "metric" else "right")
     for key in dict.fromkeys(key for scores in regions.values() for key in scores):
         table.add_row(escape(_line(key)), *(formatted(scores.get(key)) for scores in regions.values()))
-    for key, value in {**report["light"], **report["poses"]}.items():
+    for key, value in {**report["light"], **report["poses"], **report["published"]}.items():
         if value is None or isinstance(value, int | float):
             table.add_row(key, formatted(value))
     console = Console()

@@ -241,14 +241,52 @@ def no_sdf(recipe: Recipe) -> Recipe:
 
 def full_light(recipe: Recipe) -> Recipe:
     """Ablation: the environment map has its final resolution from the start."""
-    stage = recipe.decompose
-    assert isinstance(stage, inverse_rendering.decompose.Config), "an ablation of the method, not of a baseline"
+    stage = _decompose_of(recipe)
     return replace(recipe, decompose=replace(stage, rows=stage.rows * 2**stage.doublings, doublings=0))
 
 
 def mean_colour(recipe: Recipe) -> Recipe:
     """Baseline: albedo is the mean colour over the frames under a white light; no inverse rendering."""
     return replace(recipe, decompose=mean_colour_baseline.Config())
+
+
+def recap(lights: int, recipe: Recipe) -> Recipe:
+    """Baseline after ReCap (Li et al. 2025): a separate light for each of `lights` blocks of consecutive frames.
+
+    As in ReCap opacity is a free parameter and there are no shadows and no indirect light.
+    """
+    recipe = no_sdf(static_colour(recipe))
+    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False, fit_specular=False)
+    base = replace(base, rates=replace(base.rates, poses=0.0))
+    return replace(recipe, decompose=inverse_rendering.separate_lights.Config(base, lights))
+
+
+def svg_ir(recipe: Recipe) -> Recipe:
+    """Baseline after SVG-IR (Sun et al. 2025), extended to moving objects: the light is looked up in the env frame.
+
+    Opacity is a free parameter, geometry stays that of stage 2, both lobes are summed over 64 directions with
+    visibility cached at the Gaussians, indirect light is their mean radiance, and the light has 32 rows.
+    """
+    return _static_method(recipe, shadows="cached", directions=64, rows=32)
+
+
+def irgs(recipe: Recipe) -> Recipe:
+    """Baseline after IRGS (Gu et al. 2025), extended to moving objects: the light is looked up in the env frame.
+
+    Opacity is a free parameter, geometry stays that of stage 2, visibility is traced from the shaded points in each
+    step, indirect light is the mean radiance of the Gaussians, which have one material each, and the light has 64 rows.
+    """
+    return _static_method(recipe, shadows="traced", corners=False, rows=64)
+
+
+def _static_method(recipe: Recipe, **changes: Any) -> Recipe:
+    """What SVG-IR and IRGS have in common."""
+    recipe = no_sdf(static_colour(recipe))
+    stage = _decompose_of(recipe)
+    common = {"bounce": "average", "lobes": "sum", "sets": 1, "doublings": 0, "fit_specular": False}
+    weights, rates = replace(stage.weights, specular=0.0), replace(stage.rates, specular_scale=0.0)
+    # As long as the warm-up lasts, geometry does not change.
+    return _replace_decompose(recipe, warmup=stage.steps, weights=weights, rates=rates, **common, **changes)
 
 
 def no_specular_fit(recipe: Recipe) -> Recipe:
@@ -320,10 +358,14 @@ def _times(factor: float, number: int, least: int) -> int:
 
 
 def _replace_decompose(recipe: Recipe, **changes: Any) -> Recipe:
-    assert isinstance(recipe.decompose, inverse_rendering.decompose.Config), (
-        "an ablation of the method, not of a baseline"
-    )
-    return replace(recipe, decompose=replace(recipe.decompose, **changes))
+    return replace(recipe, decompose=replace(_decompose_of(recipe), **changes))
+
+
+def _decompose_of(recipe: Recipe) -> inverse_rendering.decompose.Config:
+    """Settings of our stage 3."""
+    stage = recipe.decompose
+    assert isinstance(stage, inverse_rendering.decompose.Config), "a variant of the method, not of a baseline"
+    return stage
 
 
 ABLATIONS: dict[str, Callable[[Recipe], Recipe]] = {
@@ -345,6 +387,15 @@ def unchanged(recipe: Recipe) -> Recipe:
     return recipe
 
 
-METHODS: dict[str, Callable[[Recipe], Recipe]] = {"tumble": unchanged, "average": mean_colour, **ABLATIONS}
+BASELINES: dict[str, Callable[[Recipe], Recipe]] = {
+    "average": mean_colour,
+    "recap-10": partial(recap, 10),
+    "recap-40": partial(recap, 40),
+    "recap-100": partial(recap, 100),
+    "svg-ir": svg_ir,
+    "irgs": irgs,
+}
+"""Baselines by name; docs/benchmarks.md says how they differ from the methods after which they are named."""
+METHODS: dict[str, Callable[[Recipe], Recipe]] = {"tumble": unchanged, **BASELINES, **ABLATIONS}
 """What a row of a benchmark suite can run, by the value of `--method`: the method, baselines, ablations. The floor is
 "average", the mean colour over the frames as albedo."""

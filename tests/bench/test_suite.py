@@ -72,9 +72,9 @@ def test_no_object_or_light_of_one_half_is_in_the_other() -> None:
     for name in suites.suite_names():
         suite = suites.read_suite(name)
         for case in suites.cases_of(suite):
-            halves[suite.half] |= {case.model, case.options.env}
+            halves[suite.half] |= {case.model} | ({case.options.env} if case.options else set())
     assert not halves["tune"] & halves["report"]
-    assert len(halves["report"] - {"white"}) == 10 + 5
+    assert len(halves["report"] - {"white"}) == 10 + 5 + 4 + 42  # with the folders of two datasets
 
 
 def test_the_directionality_in_a_suite_is_that_of_the_light(shared_data: Path) -> None:
@@ -101,6 +101,7 @@ def test_the_directionality_in_a_suite_is_that_of_the_light(shared_data: Path) -
         ("colour = 1\n" + HEAD + OBJECT + "[[rows]]\nviews = [8]", "has an unknown key 'colour'"),
         (HEAD + OBJECT + OBJECT + 'up = "z"\n[[rows]]\nviews = [8]', "several rows with the name pot-room-handheld"),
         ("title = ", "is not a suite"),
+        (HEAD + '[[object]]\nfolder = "a/b"\n[[rows]]\nviews = [8]', "'views' is not possible for a folder"),
     ],
 )
 def test_a_wrong_suite_is_refused_with_its_rule(text: str, rule: str, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from tests import spheres
 from tumble import datasets
 from tumble.datasets import _capture_folder, bop, folder, ho3d
 from tumble.evaluation import evaluate, metrics
@@ -192,7 +193,7 @@ def assert_points_project_to_their_disks(capture: Capture, truth: Truth, toleran
 
 
 def test_every_reader_has_a_test_layout() -> None:
-    assert set(LAYOUTS) == set(plugins.plugin_names("datasets"))
+    assert {*LAYOUTS, *spheres.WRITERS} == set(plugins.plugin_names("datasets"))
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -512,7 +513,7 @@ def test_a_scene_with_two_camera_matrices_is_resampled_to_one(tmp_path: Path) ->
 
 def test_the_documentation_names_every_layout() -> None:
     text = (Path(__file__).parents[2] / "docs" / "format.md").read_text()
-    for name in LAYOUTS:
+    for name in (*LAYOUTS, *spheres.WRITERS):
         assert f"`tumble.datasets.{name}`" in text
 
 

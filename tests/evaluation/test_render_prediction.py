@@ -19,7 +19,7 @@ from tumble.maths.se3 import SE3, SO3
 from tumble.rendering import relight
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture, Truth, truth_without_views
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture, RelitViews, Truth, truth_without_views
 from tumble.scene.environment import Environment
 from tumble.scene.gaussians import Gaussians
 from tumble.scene.material import Material
@@ -269,3 +269,32 @@ def test_registration_inverts_a_similarity() -> None:
     undone = found.to_truth(OTHER.to_truth(truth))
     torch.testing.assert_close(undone.T_cam_obj.matrix(), truth.T_cam_obj.matrix(), atol=1e-5, rtol=0)
     assert float(found.scale * OTHER.scale) == pytest.approx(1, abs=1e-5)
+
+
+def test_views_elsewhere_have_their_own_camera_and_light_in_every_object_frame() -> None:
+    """They are the asset relit by hand; and the same for a run in another object frame, up to the noise of few rays."""
+    asset = ellipsoid_asset("camera")
+    poses = trajectories.shared_views(2, 1.3 * DISTANCE)
+    T_cam_obj = SE3(poses.wxyz.float(), poses.xyz.float())
+    black = torch.zeros(1, SIZE, SIZE, 3, dtype=torch.uint8)
+    capture = Capture(black, black[..., 0], CAMERA, NAMES[:1], "camera")
+    view = Trajectory(T_cam_obj[[0]], "camera")
+    cameras = tuple(Camera.from_fov(math.radians(angle), SIZE, SIZE) for angle in (20, 28))
+    lights = smooth_light(1.0), smooth_light(-2.0)
+    seen = torch.ones(2, SIZE, SIZE, dtype=torch.bool)
+    views = RelitViews(torch.zeros(2, SIZE, SIZE, 3), seen, cameras, T_cam_obj, lights)
+    truth = Truth(black, black[..., 0], NAMES[:1], ("shared",), trajectory=view, elsewhere=views)
+    identity = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
+    similar = OTHER.R_true_pred.inverse()
+    back = Similarity(1 / OTHER.scale, similar, -(similar @ OTHER.shift) / OTHER.scale)
+    images = []
+    for run, alignment in ((asset, identity), (reexpressed(asset), back)):
+        rendered = render_prediction.predict_views(CONFIG, run, capture, truth, alignment, names=NAMES).elsewhere
+        assert rendered is not None
+        images.append(rendered)
+    for i in range(2):
+        path = Trajectory(T_cam_obj[[i]], "object")
+        (wanted,) = relight.relight(CONFIG, asset, lights[i], path, cameras[i])
+        torch.testing.assert_close(images[0][i], wanted)
+        assert (images[1][i] - wanted).abs().mean() < 0.03 * wanted.mean()
+    assert (images[0][0] - images[0][1]).abs().mean() > 0.1 * images[0].mean()

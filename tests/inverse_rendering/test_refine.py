@@ -36,7 +36,8 @@ def textured_sphere() -> tuple[Points, SE3, Capture]:
     axes = torch.tensor([[0.0, 0, 0], [0.0, 0.5, 0], [0.3, 0.7, 0.2], [0.5, 1.2, -0.4]])
     true = SE3.from_rotation(SO3.exp(axes), torch.tensor([0.02, 0.05, 4.0]).expand(4, 3).contiguous())
     light, camera = SHLight.constant(0.4, means), Camera.from_fov(0.6, 64, 64)
-    views = [refine.render(points, GAMMA, light, true[k], Trajectory(true, "camera"), camera) for k in range(4)]
+    R_env_obj = Trajectory(true, "camera").R_env_obj
+    views = [refine.render(points, GAMMA, light, true[k], R_env_obj[k], camera) for k in range(4)]
     images = torch.stack([(srgb_from_linear(v.rgb).clamp(0, 1) * 255).round().to(torch.uint8) for v in views])
     masks = torch.stack([torch.where(v.alpha > 0.5, OBJECT, BACKGROUND) for v in views]).to(torch.uint8)
     return points, true, Capture(images, masks, camera, tuple("abcd"), "camera")
@@ -114,7 +115,8 @@ def test_the_weight_of_the_gamma_term_is_the_stated_one() -> None:
     """All signed distances are 0, so that the median is the floor: 2 acosh(sqrt 2) / 0.02 - 30, times the weight."""
     points, true, capture = textured_sphere()
     params = Params(points, GAMMA, SHLight.constant(0.4, true.xyz), torch.zeros(4, 6))
-    view = refine.render(points, GAMMA, params.light, true[0], Trajectory(true, "camera"), capture.camera)
+    R_env_obj = Trajectory(true, "camera").R_env_obj[0]
+    view = refine.render(points, GAMMA, params.light, true[0], R_env_obj, capture.camera)
     cfg = replace(SMOKE.refine, weights=replace(SMOKE.refine.weights, gamma=5.0))
     terms = refine._terms(cfg, params, view, capture, 0, true[0], 1.0)
     assert float(terms["gamma"]) == pytest.approx(5 * (2 * math.acosh(math.sqrt(2)) / 0.02 - 30), rel=1e-5)

@@ -1,5 +1,6 @@
 """An asset in a rotated frame is the same object."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,6 +10,7 @@ from tests.export.test_bake import painted
 from tests.surfaces import torus
 from tumble.maths import spherical_harmonics as harmonics
 from tumble.maths.directions import fibonacci_sphere, random_rotation
+from tumble.maths.se3 import SO3
 from tumble.rendering.gbuffer import render_gbuffer
 from tumble.scene.asset import Asset
 from tumble.scene.trajectory import Trajectory
@@ -45,3 +47,18 @@ def test_a_light_that_is_fixed_to_the_object_rotates_with_it(asset: Asset) -> No
     d = fibonacci_sphere(20)
     found = fixed.rotated(over).environment.lookup(d @ over.mT)
     torch.testing.assert_close(found, asset.environment.lookup(d), atol=1e-3, rtol=0)
+
+
+def test_a_turning_light_is_rotated_with_the_object_that_it_is_fixed_to(asset: Asset) -> None:
+    """A direction of the object meets the same radiance before and after."""
+    over = SO3.exp(torch.tensor([0.0, 0.0, math.pi])).matrix()
+    turns = SO3.exp(0.7 * torch.arange(3.0) * torch.ones(len(asset.trajectory), 1)).matrix()
+    path = replace(asset.trajectory, light="object", light_turns=turns)
+    before = replace(asset, trajectory=path)
+    after = before.rotated(over)
+    d_obj = fibonacci_sphere(50)
+    seen = [
+        each.environment.lookup(d @ each.trajectory.R_env_obj[1].T)
+        for each, d in ((before, d_obj), (after, d_obj @ over.T))
+    ]
+    torch.testing.assert_close(seen[1], seen[0], rtol=2e-2, atol=0)

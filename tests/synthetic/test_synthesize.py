@@ -16,7 +16,8 @@ from tumble.datasets import folder  # noqa: E402
 from tumble.io import files, video  # noqa: E402
 from tumble.io.files import BadFile  # noqa: E402
 from tumble.maths import images  # noqa: E402
-from tumble.maths.directions import fibonacci_sphere  # noqa: E402
+from tumble.maths.directions import fibonacci_sphere, texel_directions, texel_solid_angles  # noqa: E402
+from tumble.maths.images import linear_from_srgb  # noqa: E402
 from tumble.maths.se3 import SE3, SO3  # noqa: E402
 from tumble.scene.camera import Camera  # noqa: E402
 from tumble.scene.environment import Environment  # noqa: E402
@@ -64,8 +65,6 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def room(h: int = 32) -> Environment:
     """A smooth light with a bright side at +x, a warm top and a dim red floor."""
-    from tumble.maths.directions import texel_directions
-
     d = texel_directions(h, 2 * h)
     warm = torch.tensor([1.0, 0.8, 0.5])
     return Environment.from_radiance(
@@ -485,3 +484,70 @@ def test_white_and_files_are_read_as_lights(tmp_path: Path) -> None:
     files.write_exr(tmp_path / "x.exr", np.ones((4, 4, 3), np.float32))
     with pytest.raises(BadFile, match="twice as wide"):
         synthesize._read_light(str(tmp_path / "x.exr"))
+
+
+def test_a_turned_light_is_the_one_that_the_trajectory_of_the_folder_says(tmp_path: Path) -> None:
+    """The shading of a Lambertian sphere is the irradiance of the stored light at the normal, in the turned frame."""
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    mesh = trimesh.Trimesh(sphere.vertices, sphere.faces, vertex_normals=sphere.vertices, process=False)
+    path = export(
+        tmp_path / "sphere.glb", mesh, np.full((4, 4, 3), 180, np.uint8), 1.0, np.zeros((len(mesh.vertices), 2))
+    )
+    room(16).write(tmp_path / "room.hdr")
+    few = {"views": 12, "resolution": 32, "samples": 64, "eval_shared": 1, "eval_sphere": 0, "truth_samples": 4}
+    options = SynthOptions(env=str(tmp_path / "room.hdr"), setting="turned", turns=3, material="diffuse", **few)
+    out = synthesize.render_capture(path, tmp_path / "out", options)
+    capture, truth = folder.load(out), folder.load_truth(out)
+    assert truth is not None
+    assert truth.light is not None
+    assert truth.trajectory is not None
+    trajectory = capture.trajectory
+    assert trajectory is not None
+    assert trajectory.light_turns is not None
+    torch.testing.assert_close(trajectory.light_turns[3], torch.eye(3))  # the first of three turns again
+    dome = trajectories.dome(12, trajectories.distance_for(math.radians(30)))
+    torch.testing.assert_close(trajectory.T_cam_obj.xyz, dome.xyz.float())
+
+    def mismatch(view: Trajectory, i: int, image: torch.Tensor, R_env_obj: torch.Tensor) -> float:
+        """1 - correlation between the image and the irradiance."""
+        T_obj_cam = view.T_cam_obj[i].inverse()
+        d = T_obj_cam.rotation @ capture.camera.directions()
+        along = d @ T_obj_cam.xyz
+        inside = along.square() - T_obj_cam.xyz @ T_obj_cam.xyz + 1
+        normals = (T_obj_cam.xyz + (-along - inside.clamp_min(0).sqrt())[..., None] * d)[inside > 0.1]
+        light = truth.light  # type: ignore
+        d_env = texel_directions(*light.log_radiance.shape[:2]).reshape(-1, 3)
+        weight = texel_solid_angles(*light.log_radiance.shape[:2]).reshape(-1, 1)
+        cosines = (normals @ R_env_obj.T @ d_env.T).clamp_min(0)
+        irradiance = cosines @ (light.radiance.reshape(-1, 3) * weight)
+        photo = linear_from_srgb(image[inside > 0.1] / 255)
+        return 1 - float(torch.corrcoef(torch.stack([irradiance.flatten(), photo.flatten()]))[0, 1])
+
+    for i in range(4):
+        assert mismatch(trajectory, i, capture.images[i], trajectory.R_env_obj[i]) < 0.003
+    for i in (1, 2):
+        wrong = trajectory.light_turns[i].T
+        assert mismatch(trajectory, i, capture.images[i], wrong) > 0.03
+        assert mismatch(trajectory, i, capture.images[i], torch.eye(3)) > 0.03
+    # An evaluation view is under the light of the first frame.
+    assert mismatch(truth.trajectory, 0, truth.images[0], torch.eye(3)) < 0.003
+
+
+def test_the_light_turns_by_as_many_poses_as_asked() -> None:
+    turns = trajectories.light_turns(12, 4, seed=3)
+    torch.testing.assert_close(turns[0], torch.eye(3).double())
+    torch.testing.assert_close(turns[4:8], turns[:4])
+    angles = torch.linalg.matrix_norm(turns[:4, None] - turns[None, :4])
+    assert (angles + 9 * torch.eye(4)).min() > 0.3
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).double().expand_as(turns))
+
+
+def test_a_light_is_turned_only_in_its_setting() -> None:
+    for wrong, message in (
+        ({"turns": 3}, "not turned in the setting handheld"),
+        ({"setting": "turned", "turns": 65}, "turns is out of range"),
+        ({"setting": "turned", "pose_free": True}, "leave out --pose-free"),
+        ({"setting": "turned", "film": True}, "the camera of a dome moves"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            SynthOptions(env="white", **wrong)  # type: ignore[arg-type]

@@ -19,7 +19,7 @@ from tumble.io import BadFile, files
 from tumble.maths import texel_directions
 from tumble.report import preset_lights
 from tumble.scene import Environment
-from tumble.synthetic import render_capture, room_environment, sunset_environment, write_pot
+from tumble.synthetic import SynthOptions, render_capture, room_environment, sunset_environment, write_pot
 
 DATA_VARIABLE = "TUMBLE_BENCH_DATA"
 """Environment variable with the data folder of the suites."""
@@ -78,12 +78,15 @@ def require_inputs(cases: Sequence[Case], data: Path | None) -> None:
         BadFile: One is missing, or there is no data folder.
     """
     for case in cases:
+        if case.options is None:
+            _given_folder(data, case.model)
+            continue
         for name in (case.model, case.options.env, *case.options.relight):
             _file(data, name)
 
 
 def make_capture(task: CaptureTask) -> Path:
-    """The folder of a capture, which is rendered if it is missing, in a process of its own.
+    """The folder of a capture; one that is not given is rendered if it is missing, in a process of its own.
 
     Other processes that need the same capture wait. The folder's key covers the files, the options and the sources of
     the room `synthetic`.
@@ -92,10 +95,12 @@ def make_capture(task: CaptureTask) -> Path:
         BadFile: The model or a light is missing, or there is no data folder.
         ChildProcessError: The capture could not be rendered.
     """
-    folder = task.out / CAPTURES / f"{task.name}-{_key(task)[:10]}"
+    if task.case.options is None:
+        return _given_folder(task.data, task.case.model)
+    folder = task.out / CAPTURES / f"{task.name}-{_key(task, task.case.options)[:10]}"
     with _exclusive(folder.parent / f"{folder.name}.lock"):
         if not (folder / "transforms.json").is_file():
-            rendering = _Rendering(task, folder)
+            rendering = _Rendering(task, task.case.options, folder)
             (outcome,) = in_processes(_render, [rendering], 1, task.out / "logs")
             if outcome.error:
                 raise ChildProcessError(f"{folder.name} could not be rendered: {outcome.error}")
@@ -107,6 +112,7 @@ class _Rendering:
     """A capture to be rendered, and where."""
 
     task: CaptureTask
+    options: SynthOptions
     folder: Path
 
     @property
@@ -115,30 +121,44 @@ class _Rendering:
 
 
 def _render(rendering: _Rendering) -> None:
-    case, inputs = rendering.task.case, rendering.task.out / "inputs"
+    case, options, inputs = rendering.task.case, rendering.options, rendering.task.out / "inputs"
     model = _file(rendering.task.data, case.model)
     if model is None:
         model = inputs / f"{case.model}.glb"
         files.write_atomically(model, write_pot)
     lights = {}
-    for name in (case.options.env, *case.options.relight):
+    for name in (options.env, *options.relight):
         path = _file(rendering.task.data, name)
         if path is None and name != "white":
             path = inputs / f"{name}.hdr"
             LIGHTS[name]().write(path)
         lights[name] = str(path or name)
-    options = case.options
     relight = tuple(lights[name] for name in options.relight)
     render_capture(model, rendering.folder, dataclasses.replace(options, env=lights[options.env], relight=relight))
 
 
-def _key(task: CaptureTask) -> str:
-    """Hash of everything that determines a capture."""
-    names = (task.case.model, task.case.options.env, *task.case.options.relight)
+def _key(task: CaptureTask, options: SynthOptions) -> str:
+    """Hash of everything that determines a rendered capture."""
+    names = (task.case.model, options.env, *options.relight)
     contents = [
         hashlib.sha256(path.read_bytes()).hexdigest() if (path := _file(task.data, name)) else "" for name in names
     ]
-    return loop.fingerprint(names, contents, task.case.options, source_fingerprint(("synthetic",)))
+    return loop.fingerprint(names, contents, options, source_fingerprint(("synthetic",)))
+
+
+def _given_folder(data: Path | None, name: str) -> Path:
+    """The folder of a given capture.
+
+    Raises:
+        BadFile: It is not in the data folder, or there is no data folder.
+    """
+    fix = f"give the folder that holds the dataset with --data or in {DATA_VARIABLE}"
+    if data is None:
+        raise BadFile(Path(name), "is needed, and no data folder is given", fix)
+    path = files.path_inside(data, name)
+    if not path.is_dir():
+        raise BadFile(path, "is missing", fix)
+    return path
 
 
 def _file(data: Path | None, name: str) -> Path | None:

@@ -55,6 +55,8 @@ class SuiteRow(TypedDict):
     """Scores by region of evaluation views and key (docs/metrics.md)."""
     light: NotRequired[dict[str, float | None]]
     poses: NotRequired[dict[str, float | None]]
+    published: NotRequired[dict[str, float | None]]
+    """Scores by the protocol of the benchmark that the capture is of (docs/metrics.md)."""
     albedo_scale: NotRequired[list[float] | None]
     notes: NotRequired[list[str]]
 

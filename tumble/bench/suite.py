@@ -2,11 +2,13 @@
 
     title = "..."                       half = "tune", "report" or "none"        recipe = "draft"        seeds = [0, 1]
     [capture]                           options of `tumble synth` for all captures, such as `resolution = 128`
-    [[object]]                          `model` and more options for its captures, such as `env` and `up`
+    [[object]]                          `model` and more options for its captures, such as `env` and `up`; or `folder`,
+                                        a capture of the user in the data folder, in any layout that `tumble run` reads
     [[rows]]                            lists of values: one case for each object and each combination of the values
     [[compare]]                         two sets of rows whose scores are compared object by object
 
-The values of `[[rows]]` are options of `tumble synth`, `poses` ("given" or "estimate") and `method`.
+The values of `[[rows]]` are options of `tumble synth`, `poses` ("given" or "estimate") and `method`; for captures of
+the user only the last two.
 """
 
 import dataclasses
@@ -26,6 +28,8 @@ from tumble.synthetic import SynthOptions
 
 RUN_LABELS = ("poses", "method")
 """Keys of `[[rows]]` that are not options of `tumble synth`."""
+GIVEN = "given"
+"""Label of light and material of captures that are not rendered."""
 FIX = "tumble bench list names the suites; the head of tumble/bench/suite.py explains their files"
 """What errors about suites suggest."""
 
@@ -35,9 +39,9 @@ class Case:
     """One capture, and how it is reconstructed: what one row is about."""
 
     model: str
-    """File of the object in the data folder, or the name of a built-in one."""
-    options: SynthOptions
-    """How the capture is rendered; lights are files in the data folder or names of built-in ones."""
+    """File of the object in the data folder, or the name of a built-in one; or the folder of a given capture."""
+    options: SynthOptions | None
+    """How the capture is rendered; lights are files in the data folder or names of built-in ones. None: it is given."""
     recipe: str
     """Name of the recipe that the method changes."""
     seed: int
@@ -51,14 +55,13 @@ class Case:
     @property
     def labels(self) -> dict[str, Any]:
         """What distinguishes the case from others of its suite, by heading."""
-        first = {
-            "object": Path(self.model).stem,
-            "light": Path(self.options.env).stem.removesuffix("_1k"),
-            "setting": self.options.setting,
-            "material": self.options.material,
-        }
-        others = {name: getattr(self.options, name) for name in self.varied}
-        return {**first, **others, "poses": self.poses, "method": Path(self.method).stem, "seed": self.seed}
+        path, options = Path(self.model), self.options
+        about = {"object": path.stem, "light": GIVEN, "setting": path.parent.name, "material": GIVEN}
+        if options is not None:
+            light = Path(options.env).stem.removesuffix("_1k")
+            about |= {"light": light, "setting": options.setting, "material": options.material}
+        others = {name: getattr(options, name, GIVEN) for name in self.varied}
+        return {**about, **others, "poses": self.poses, "method": Path(self.method).stem, "seed": self.seed}
 
     @property
     def name(self) -> str:
@@ -146,17 +149,32 @@ def cases_of(
     cases: dict[str, Case] = {}
     for seed, about, grid in itertools.product(seeds or suite.seeds, suite.object, grids):
         for values in itertools.product(*grid.values()):
-            options = suite.capture | about | dict(zip(grid, values, strict=True)) | {"seed": seed}
-            about_run = {name: options.pop(name) for name in (*RUN_LABELS, "model") if name in options}
-            # The directionality of a light is there for the reader of the file.
-            options.pop("directionality", None)
-            if unknown := options.keys() - {part.name for part in dataclasses.fields(SynthOptions)}:
-                raise ValueError(f"{min(unknown)!r} is not an option of tumble synth")
-            more = {"options": options, "recipe": suite.recipe, "seed": seed, "varied": rest}
-            case = msgspec.convert(about_run | more, Case)
+            chosen = dict(zip(grid, values, strict=True))
+            of_case = _given(about | chosen) if "folder" in about else _rendered(suite.capture | about | chosen, seed)
+            more = {"recipe": suite.recipe, "seed": seed, "varied": rest}
+            case = msgspec.convert(of_case | more, Case)
             if all(word in case.name for word in only):
                 cases[case.key] = case
     return list(cases.values())
+
+
+def _given(about: dict[str, Any]) -> dict[str, Any]:
+    """What a case says of a given capture."""
+    labels = {name: value for name, value in about.items() if name != "folder"}
+    if unknown := labels.keys() - set(RUN_LABELS):
+        raise ValueError(f"{min(unknown)!r} is not possible for a folder, which is not rendered")
+    return labels | {"model": about["folder"], "options": None}
+
+
+def _rendered(about: dict[str, Any], seed: int) -> dict[str, Any]:
+    """What a case says of a capture that is rendered."""
+    options = about | {"seed": seed}
+    labels = {name: options.pop(name) for name in (*RUN_LABELS, "model") if name in options}
+    # The directionality of a light is there for the reader of the file.
+    options.pop("directionality", None)
+    if unknown := options.keys() - {part.name for part in dataclasses.fields(SynthOptions)}:
+        raise ValueError(f"{min(unknown)!r} is not an option of tumble synth")
+    return labels | {"options": options}
 
 
 def _folder() -> Any:

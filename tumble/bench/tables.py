@@ -27,6 +27,16 @@ METRICS: dict[str, tuple[str, str]] = {
     "light.rmse_clip10": ("light RMSE", "{:.3f}"),
     "light.log_correlation": ("light log corr.", "{:.2f}"),
     "poses.rotation_median_degrees": ("rotation median [deg]", "{:.2f}"),
+    "tensoir.albedo_psnr": ("TensoIR albedo [dB]", "{:.2f}"),
+    "tensoir.relit_psnr": ("TensoIR relit [dB]", "{:.2f}"),
+    "tensoir.normal_mae_degrees": ("TensoIR normals [deg]", "{:.2f}"),
+    "orb.relit_psnr_h": ("ORB relit PSNR-H [dB]", "{:.2f}"),
+    "orb.relit_psnr_l": ("ORB relit PSNR-L [dB]", "{:.2f}"),
+    "orb.relit_ssim": ("ORB relit SSIM", "{:.3f}"),
+    "orb.image_psnr_h": ("ORB view PSNR-H [dB]", "{:.2f}"),
+    "orb.image_psnr_l": ("ORB view PSNR-L [dB]", "{:.2f}"),
+    "orb.albedo_psnr": ("ORB albedo [dB]", "{:.2f}"),
+    "orb.normal_cosine": ("ORB normals", "{:.3f}"),
     "seconds.run": ("run [s]", "{:.0f}"),
     "peak_memory_MiB": ("memory [MiB]", "{:.0f}"),
 }
@@ -80,6 +90,8 @@ def value_of(row: SuiteRow, key: str) -> float | None:
         "seconds": row.get("seconds", {}).get(second),
         "peak_memory_MiB": row.get("peak_memory_MiB"),
         "light": row.get("light", {}).get(key),
+        "tensoir": row.get("published", {}).get(key),
+        "orb": row.get("published", {}).get(key),
         "poses": row.get("poses", {}).get(key) if row["labels"]["poses"] == "estimate" else None,
     }
     return found[first] if first in found else row.get("regions", {}).get(REGION, {}).get(key)
@@ -97,8 +109,10 @@ def varied_labels(rows: Sequence[SuiteRow], without: Sequence[str] = ()) -> list
 
 
 def of_object(results: SuiteResults) -> tuple[str, ...]:
-    """Labels over which means are taken: the light belongs to the object unless it is what the suite varies."""
-    return ("object", "seed") if results["suite"]["plot"] == "light" else ("object", "light", "seed")
+    """Labels over which means are taken: the light belongs to the object unless the suite varies or compares it."""
+    suite = results["suite"]
+    varied = suite["plot"] == "light" or any("light" in each["ahead"] for each in suite["compare"])
+    return ("object", "seed") if varied else ("object", "light", "seed")
 
 
 def grouped(rows: Sequence[SuiteRow], labels: Sequence[str]) -> dict[tuple[Any, ...], list[SuiteRow]]:

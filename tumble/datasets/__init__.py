@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 from tumble.datasets import folder
+from tumble.datasets._bounding_sphere import bounding_sphere
 from tumble.datasets._capture_folder import MAPS, capture_document, evaluation_frame, save_capture, training_frame
 from tumble.datasets._plausibility import MAX_DISTORTION, check_plausible, plausible_focal
 from tumble.datasets.folder import read_poses
@@ -20,6 +21,7 @@ from tumble.io import BadFile, load_plugin, plugin_names
 __all__ = [
     "MAPS",
     "MAX_DISTORTION",
+    "bounding_sphere",
     "check_plausible",
     "plausible_focal",
     "capture_document",

@@ -37,9 +37,17 @@ def capture_document(
     return head | {"frames": frames}
 
 
-def training_frame(name: str, matrix: list[list[float]] | None) -> dict[str, Any]:
-    """Entry of a training frame; `matrix` is camera to object with OpenGL camera axes, None if unknown."""
+def training_frame(
+    name: str, matrix: list[list[float]] | None, light_turn: list[list[float]] | None = None
+) -> dict[str, Any]:
+    """Entry of a training frame.
+
+    Args:
+        matrix: Camera to object with OpenGL camera axes; None if unknown.
+        light_turn: Rotation of the light in this frame; None if the light does not turn by itself.
+    """
     entry: dict[str, Any] = {"file_path": f"images/{name}", "mask_path": f"masks/{name}", "split": "train"}
+    entry |= {} if light_turn is None else {"light_turn": light_turn}
     return entry if matrix is None else entry | {"transform_matrix": matrix}
 
 
@@ -63,7 +71,11 @@ def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, se
     for name, image, mask in zip(capture.names, capture.images, capture.masks, strict=True):
         _save_image_and_mask(path, name, image, mask)
     matrices = [None] * len(capture) if capture.trajectory is None else capture.trajectory.camera_to_object().tolist()
-    frames = [training_frame(name, matrix) for name, matrix in zip(capture.names, matrices, strict=True)]
+    turns = None if capture.trajectory is None else capture.trajectory.light_turns
+    frames = [
+        training_frame(name, matrix, None if turns is None else turns[i].tolist())
+        for i, (name, matrix) in enumerate(zip(capture.names, matrices, strict=True))
+    ]
     if truth is not None:
         frames += _save_truth(path, capture, truth)
     with_light = truth is not None and truth.light is not None

@@ -18,6 +18,8 @@ Name = Annotated[str, msgspec.Meta(min_length=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
+Direction = tuple[float, float, float]
+Rotation = tuple[Direction, Direction, Direction]
 
 
 class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,6 +47,7 @@ class FrameRecord(Intrinsics, frozen=True, kw_only=True):
     file_path: Name
     mask_path: Name = ""
     transform_matrix: Matrix | None = None
+    light_turn: Rotation | None = None
     split: Literal["train", "eval"] = "train"
     region: Literal["shared", "sphere"] = "sphere"
     albedo_path: Name = ""

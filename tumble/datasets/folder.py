@@ -6,7 +6,7 @@ Frames with different lenses are resampled to one pinhole camera (`_lens`).
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -243,14 +243,37 @@ def _poses(folder: _Folder, frames: Sequence[FrameRecord]) -> Trajectory | None:
     matrices = {frame.name: frame.transform_matrix for frame in frames}
     without = [name for name, matrix in matrices.items() if matrix is None]
     if len(without) == len(frames):
+        if any(frame.light_turn for frame in frames):
+            raise BadFile(folder.path, 'has "light_turn" without poses', "give the poses, too")
         return None
     if without:
         rule = f"the frame {without[0]} has no pose, but others have"
         raise BadFile(folder.path, rule, "give all frames a pose, or none")
-    return Trajectory.from_camera_to_object(_rigid_matrices(folder.path, matrices.items()), folder.document.light)
+    T_obj_cam, turns = rigid_matrices(folder.path, matrices.items()), _light_turns(folder, frames)
+    return replace(Trajectory.from_camera_to_object(T_obj_cam, folder.document.light), light_turns=turns)
 
 
-def _rigid_matrices(path: Path, named_matrices: Iterable[tuple[str, Any]]) -> Float[Tensor, "t 4 4"]:
+def _light_turns(folder: _Folder, frames: Sequence[FrameRecord]) -> Float[Tensor, "t 3 3"] | None:
+    """Rotations of the light of frames with poses; None if the light does not turn."""
+    turns = [frame.light_turn for frame in frames]
+    if not any(turns):
+        return None
+    if without := [frame.name for frame in frames if frame.light_turn is None]:
+        rule = f'the frame {without[0]} has no "light_turn", but others have'
+        raise BadFile(folder.path, rule, "give it for all training frames, or for none")
+    homogeneous = [(*((*row, 0.0) for row in turn or ()), (0.0, 0.0, 0.0, 1.0)) for turn in turns]
+    names = [frame.name for frame in frames]
+    return rigid_matrices(folder.path, zip(names, homogeneous, strict=True), "light_turn")[:, :3, :3].contiguous()
+
+
+def rigid_matrices(
+    path: Path, named_matrices: Iterable[tuple[str, Any]], key: str = "transform_matrix"
+) -> Float[Tensor, "t 4 4"]:
+    """Homogeneous matrices of rigid motions, from a file's rows of numbers by frame name.
+
+    Raises:
+        BadFile: One of them is no rotation and translation.
+    """
     matrices = []
     for name, values in named_matrices:
         with np.errstate(over="ignore"):
@@ -259,7 +282,7 @@ def _rigid_matrices(path: Path, named_matrices: Iterable[tuple[str, Any]]) -> Fl
         finite = np.isfinite(matrix).all()
         deviation = max(np.abs(R.T @ R - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max()) if finite else np.inf
         if deviation > RIGID_TOLERANCE or np.linalg.det(R) < 0:
-            rule = f'frame {name}: "transform_matrix" is not a rotation and a translation'
+            rule = f'frame {name}: "{key}" is not a rotation and a translation'
             raise BadFile(path, rule, f"the deviation is {deviation:.2g}")
         matrices.append(np.array(values, np.float64))
     return torch.from_numpy(np.stack(matrices)).float()
@@ -274,7 +297,7 @@ def read_poses(path: Path, names: Iterable[str]) -> Float[Tensor, "t 4 4"]:
     document, names = files.read_json(path, dict[str, Matrix]), list(names)
     if missing := [name for name in names if name not in document]:
         raise BadFile(path, f"has no pose for {', '.join(missing[:3])}")
-    return _rigid_matrices(path, ((name, document[name]) for name in names))
+    return rigid_matrices(path, ((name, document[name]) for name in names))
 
 
 def _true_poses(folder: _Folder) -> Trajectory | None:

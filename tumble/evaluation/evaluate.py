@@ -18,6 +18,7 @@ from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.evaluation import lpips, metrics, score_sheet
 from tumble.evaluation.prediction import Prediction
+from tumble.evaluation.published import published_scores
 from tumble.io import BadFile, files, progress
 from tumble.scene import REGIONS, UNKNOWN, Capture, Truth
 
@@ -92,6 +93,8 @@ class Report(TypedDict):
     """By region and key, the mean over the region's evaluation views."""
     light: dict[str, Any]
     poses: dict[str, Any]
+    published: dict[str, float]
+    """Scores by the protocol of the benchmark that the capture is of (`evaluation/published.py`); empty for others."""
     views: list[dict[str, Any]]
     """Name, region and scores of each view."""
     protocol: dict[str, str]
@@ -175,12 +178,13 @@ def compare(predicted: Prediction, capture: Capture, truth: Truth, networks: Seq
     light: dict[str, Any] = {}
     if predicted.light is not None and truth.light is not None:
         light = metrics.light_scores(predicted.light, truth.light, torch.ones(3) if scale is None else scale)
-    scores = {
+    scores: dict[str, Any] = {
         "albedo_scale": None if scale is None else scale.tolist(),
         "regions": {region: _mean([rows[i] for i in truth.views(region)]) for region in REGIONS if truth.views(region)},
         "light": {f"light.{key}": value for key, value in light.items()},
         "poses": _pose_scores(predicted, capture, truth, notes),
     }
+    scores["published"], definitions = published_scores(predicted, truth, networks)
     keys = {key for part in (*scores["regions"].values(), scores["light"], scores["poses"]) for key in part}
     return {
         **scores,
@@ -188,7 +192,7 @@ def compare(predicted: Prediction, capture: Capture, truth: Truth, networks: Seq
             {"name": name, "region": region, **row}
             for name, region, row in zip(truth.names, truth.regions, rows, strict=True)
         ],
-        "protocol": {key: text for key in sorted(keys) if (text := protocol(key))},
+        "protocol": {key: text for key in sorted(keys) if (text := protocol(key))} | definitions,
         "notes": notes,
     }
 

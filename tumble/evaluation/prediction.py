@@ -18,9 +18,9 @@ from torch import Tensor
 
 from tumble.datasets import read_poses
 from tumble.io import BadFile, files
-from tumble.scene import Capture, Environment, Trajectory, Truth
+from tumble.scene import Capture, Environment, RelitViews, Trajectory, Truth
 
-PARTS = ("albedo", "normal", "roughness", "mask", "image", "relit", "light.exr", "poses.json")
+PARTS = ("albedo", "normal", "roughness", "mask", "image", "relit", "elsewhere", "light.exr", "poses.json")
 """Files and folders of a prediction; any others in the folder are ignored."""
 
 
@@ -47,6 +47,8 @@ class Prediction:
     """Estimated poses of training frames, in any object frame and unit."""
     pose_names: tuple[str, ...] = ()
     """Names of the training frames that `poses` belong to, in the capture's order."""
+    elsewhere: Float[Tensor, "n i j 3"] | None = None
+    """Views in other places (`RelitViews`), linear radiance over black, rendered with the albedo as estimated."""
 
     def __post_init__(self) -> None:
         views = [self.albedo, self.normals, self.roughness, self.masks, self.images, *self.relit.values()]
@@ -92,7 +94,7 @@ class Prediction:
         names, poses = _read_poses(path / "poses.json", capture)
         relit = sorted(p for p in (path / "relit").iterdir() if p.is_dir()) if (path / "relit").is_dir() else []
         return Prediction(
-            albedo=views.read(path / "albedo", ".exr", _read_albedo),
+            albedo=views.read(path / "albedo", ".exr", _read_positive),
             normals=views.read(path / "normal", ".exr", _read_normal),
             roughness=None if roughness is None else roughness[..., 0],
             masks=None if masks is None else masks[..., 0] >= 128,
@@ -103,6 +105,7 @@ class Prediction:
             light=Environment.read(path / "light.exr") if (path / "light.exr").exists() else None,
             poses=poses,
             pose_names=names,
+            elsewhere=_read_elsewhere(path / "elsewhere", truth.elsewhere),
         )
 
 
@@ -129,6 +132,7 @@ def _view_files(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
         ("roughness", "exr"): None if roughness is None else roughness[..., None],
         ("mask", "png"): None if masks is None else 255 * masks[..., None].to(torch.uint8),
         ("image", "png"): prediction.images,
+        ("elsewhere", "exr"): prediction.elsewhere,
         **{(f"relit/{light}", "png"): pixels for light, pixels in prediction.relit.items()},
     }
     for (folder, suffix), views in parts.items():
@@ -166,18 +170,25 @@ class _ViewReader:
         return pixels
 
 
+def _read_elsewhere(folder: Path, views: RelitViews | None) -> Tensor | None:
+    """The views in other places; None if the prediction or the truth has none."""
+    if views is None:
+        return None
+    return _ViewReader(len(views), *views.foreground.shape[1:]).read(folder, ".exr", _read_positive)
+
+
 def _check_channels(path: Path, pixels: np.ndarray, expected: int) -> np.ndarray:
     if pixels.shape[2] != expected:
         raise BadFile(path, f"has {pixels.shape[2]} channels, {path.parent.name} needs {expected}")
     return pixels
 
 
-def _read_albedo(path: Path) -> np.ndarray:
+def _read_positive(path: Path) -> np.ndarray:
     pixels = _check_channels(path, files.read_radiance(path), 3)
     if pixels.min() < 0:
-        raise BadFile(
-            path, f"holds a negative albedo, {pixels.min():.3g}", "linear albedo must not be negative: clamp it at 0"
-        )
+        what = "radiance" if path.parent.name == "elsewhere" else "albedo"
+        rule = f"holds a negative {what}, {pixels.min():.3g}"
+        raise BadFile(path, rule, f"linear {what} must not be negative: clamp it at 0")
     return pixels
 
 

@@ -12,10 +12,10 @@ from torch.nn.functional import normalize
 from tumble.evaluation import metrics
 from tumble.evaluation.metrics import Similarity
 from tumble.evaluation.prediction import Prediction
-from tumble.io import progress
+from tumble.io import progress, tree
 from tumble.maths import SO3, to_srgb8
 from tumble.rendering import Buffers, antialiased_gbuffer, relight
-from tumble.scene import Asset, Capture, Environment, Trajectory, Truth
+from tumble.scene import Asset, Capture, Environment, RelitViews, Trajectory, Truth
 
 MIN_OBJECT_COVERAGE = 0.55
 """Coverage from which a pixel belongs to the silhouette: coverage falls off more slowly inside an edge than outside, so
@@ -65,6 +65,9 @@ def predict_views(
         masks=coverage >= MIN_OBJECT_COVERAGE,
         images=_rendered_views(cfg, asset, geometry, buffers, estimated_light, views, capture, "the estimated light"),
         relit=_relit_views(cfg, asset, geometry, albedo, alignment, capture, truth),
+        elsewhere=None
+        if truth.elsewhere is None
+        else _views_elsewhere(cfg, asset, geometry, alignment, truth.elsewhere),
     )
 
 
@@ -137,6 +140,23 @@ def _relit_views(
         name: _rendered_views(cfg, scaled, geometry, buffers, light.rotated(R_pred_true), views, capture, name)
         for name, light in truth.lights.items()
     }
+
+
+def _views_elsewhere(
+    cfg: relight.Config, asset: Asset, geometry: relight.TracedGeometry, alignment: Similarity, views: RelitViews
+) -> Float[Tensor, "n i j 3"]:
+    """The views in other places, each with its own camera and light, from the albedo as estimated."""
+    poses = alignment.to_prediction(Trajectory(views.T_cam_obj, "object"))
+    R_pred_true = alignment.R_true_pred.inverse().matrix()
+    images = []
+    for i in progress.track(range(len(views)), "rendering views in other places", len(views)):
+        # A tree's tensors in tuples stay where they are.
+        light = tree.to(views.lights[i], R_pred_true.device).rotated(R_pred_true)
+        camera = tree.to(views.cameras[i], R_pred_true.device)
+        view = poses.select([i])
+        buffers = [antialiased_gbuffer(asset, view.T_cam_obj[0], camera)]
+        images += relight.relight(cfg, asset, light, view, camera, geometry=geometry, buffers=buffers)
+    return torch.stack(images)
 
 
 def _gbuffers(asset: Asset, views: Trajectory, capture: Capture, task: str) -> list[Buffers]:

@@ -1,10 +1,20 @@
 """Inverse rendering: stage 2 (`refine`) and stage 3 (`decompose`) with their losses and densification.
 
 `refine` optimises Gaussians, poses and a low-order light; `decompose` then optimises albedo, roughness and an
-environment map. `mean_colour_baseline` takes the place of stage 3 as a baseline without inverse rendering.
+environment map. `mean_colour_baseline` takes the place of stage 3 as a baseline without inverse rendering,
+`separate_lights` as one that does not know how the light moves.
 """
 
-from tumble.inverse_rendering import decompose, densify, losses, mean_colour_baseline, refine, sh_lighting, specular_fit
+from tumble.inverse_rendering import (
+    decompose,
+    densify,
+    losses,
+    mean_colour_baseline,
+    refine,
+    separate_lights,
+    sh_lighting,
+    specular_fit,
+)
 from tumble.inverse_rendering.refine import Refined
 
 __all__ = [
@@ -14,6 +24,7 @@ __all__ = [
     "losses",
     "mean_colour_baseline",
     "refine",
+    "separate_lights",
     "sh_lighting",
     "specular_fit",
 ]

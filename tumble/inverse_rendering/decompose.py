@@ -50,8 +50,6 @@ from tumble.scene import (
     Environment,
     Gaussians,
     Material,
-    Trajectory,
-    env_from_obj,
     target_view,
 )
 
@@ -216,7 +214,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         "directions": torch.stack(sets),
         "specular_penalty": cfg.weights.specular * torch.ones_like(params.gamma),
     }
-    state = State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
+    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, memory)
     _trace_visibility(cfg, inputs, state)
     if cfg.fit_specular and refined.light.log_specular_scale.exp() > specular_fit.MIN_REFINED_SCALE:
         fit_specular(cfg, inputs, state)
@@ -239,7 +237,8 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
         pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view, inner > 0.5, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
-        R_env_obj, white = env_from_obj(T_cam_obj, capture.light), torch.ones_like(points.normals)
+        R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
+        white = torch.ones_like(points.normals)
         gaussian, rough = _dominant_gaussian(view, points), points.sample(view.features["roughness"])
         lobes = [(white, rough, 0.0), *((0 * white, torch.full_like(rough, r), DIELECTRIC) for r in roughnesses)]
         diffuse, *specular = (_shade(cfg, state, params, points, gaussian, R_env_obj, *x, bounce) for x in lobes)
@@ -279,7 +278,7 @@ def _correction(params: Params, inputs: Inputs, frame: int | slice) -> SE3:
     return correction @ pose_network.correction(params.poses, before, frame).inverse() if now and before else correction
 
 
-def _rates(cfg: Config) -> dict[str, float]:
+def learning_rates(cfg: Config) -> dict[str, float]:
     """Learning rates by name prefix of the parameters."""
     rates, learned = cfg.rates, _learns_network(cfg)
     return {
@@ -371,7 +370,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     points = surface(
         view, T_cam_obj, capture.camera, pixels=_sample_pixels(cfg.pixels, view, mask == OBJECT, state.rng)
     )
-    R_env_obj, f0 = env_from_obj(T_cam_obj, capture.light), params.material.f0 * params.log_specular_scale.exp()
+    R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
+    f0 = params.material.f0 * params.log_specular_scale.exp()
     albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
     gaussian, bounce = _dominant_gaussian(view, points), _bounce(cfg, state, params, mean_albedo)
     shaded = _shade(cfg, state, params, points, gaussian, R_env_obj, albedo, rough, f0, bounce)
@@ -490,6 +490,6 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
         gamma=params.gamma,
         material=params.material,
         environment=params.environment,
-        trajectory=Trajectory(T_cam_obj, inputs.capture.light),
+        trajectory=replace(inputs.refined.trajectory, T_cam_obj=T_cam_obj),
         camera=inputs.capture.camera,
     )

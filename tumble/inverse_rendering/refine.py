@@ -29,7 +29,6 @@ from tumble.scene import (
     TargetView,
     Trajectory,
     constant_sh,
-    env_from_obj,
     opacity,
     quats_from_normals,
     sdf_from_opacity,
@@ -276,7 +275,7 @@ def render(
     gamma: Tensor,
     light: SHLight,
     T_cam_obj: SE3,
-    trajectory: Trajectory,
+    R_env_obj: Float[Tensor, "3 3"],
     camera: Camera,
     mask: Tensor | None = None,
     *,
@@ -289,14 +288,13 @@ def render(
         gamma: Sharpness of the opacity [1 / object radius].
         light: Light in the env frame.
         T_cam_obj: Pose of the view.
-        trajectory: Defines the env frame; its poses are not used.
+        R_env_obj: Rotation from the object frame to the env frame.
         camera: Intrinsics of the view.
         mask: Pixels that count in `Buffers.touched`; all when None.
         visibility: For self-shadowing; no self-shadowing when None.
     """
     gaussians = _with_radiance(points)
     if gaussians.sh.shape[1] == 1:
-        R_env_obj = env_from_obj(T_cam_obj, trajectory.light)
         lit = (visibility, R_env_obj, -(T_cam_obj.translation @ T_cam_obj.rotation.matrix()))
         colour = sh_lighting.radiance(light, gaussians, points.albedo_logits, *lit)
         gaussians = replace(gaussians, sh=constant_sh(colour))
@@ -323,7 +321,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     params, camera = state.params, inputs.capture.camera
     frame = _next_frame(state, len(inputs.capture))
     T_cam_obj = pose(params, inputs, frame, corrected=_corrects_poses(cfg, state.step))
-    arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+    R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
+    arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, camera)
     view = render(*arguments, visibility=cached_visibility(state))
     state.memory["max_weight"] = torch.maximum(state.memory["max_weight"], view.weight.detach())
     terms = _terms(cfg, params, view, inputs.capture, frame, T_cam_obj, progress)
@@ -396,7 +395,8 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     frames = torch.randperm(len(inputs.capture), generator=state.rng)[: growth.score_views].tolist()
     for frame in frames:
         T_cam_obj = pose(params, inputs, frame)
-        arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, camera)
+        R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
+        arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, camera)
         view = render(*arguments, visibility=cached_visibility(state))
         truth = target_view(inputs.capture, frame, view.alpha)
         error = (losses.srgb_as_captured(view.rgb, truth.image) - truth.image).abs().mean(-1)
@@ -422,16 +422,22 @@ def _align_poses(inputs: Inputs, state: State) -> None:
     params, base = state.params, inputs.trajectory.T_cam_obj
     for frame in range(len(inputs.capture)):
         truth = target_view(inputs.capture, frame, params.gamma)
-        residual = partial(_residuals, params, inputs, truth, cached_visibility(state))
+        residual = partial(_residuals, params, inputs, frame, truth, cached_visibility(state))
         T_cam_obj = align_pose(residual, pose(params, inputs, frame))
         params.poses[frame] = (T_cam_obj @ base[frame].inverse()).log()
 
 
 def _residuals(
-    params: Params, inputs: Inputs, truth: TargetView, visibility: VisibilityTransfer | None, T_cam_obj: SE3
+    params: Params,
+    inputs: Inputs,
+    frame: int,
+    truth: TargetView,
+    visibility: VisibilityTransfer | None,
+    T_cam_obj: SE3,
 ) -> Float[Tensor, " r"]:
     """Residuals of colour [sRGB] and of weighted coverage between the view at a pose and the input image."""
-    arguments = (params.points, params.gamma, params.light, T_cam_obj, inputs.trajectory, inputs.capture.camera)
+    R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
+    arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, inputs.capture.camera)
     view = render(*arguments, visibility=visibility)
     colour = losses.srgb_as_captured(view.rgb, truth.image) - truth.image
     coverage = COVERAGE_WEIGHT * (view.alpha - truth.mask)[..., None]
@@ -444,7 +450,7 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
     params = state.params
     every = slice(None)
     T_cam_obj = pose_network.correction(params.poses, params.pose_network, every) @ inputs.trajectory.T_cam_obj
-    trajectory = Trajectory(T_cam_obj, inputs.trajectory.light)
+    trajectory = replace(inputs.trajectory, T_cam_obj=T_cam_obj)
     gaussians, albedo = _with_radiance(params.points), torch.sigmoid(params.points.albedo_logits)
     if cfg.colour == "light":
         mean = torch.zeros_like(albedo)

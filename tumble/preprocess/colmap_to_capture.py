@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
 
-from tumble.datasets import capture_document, training_frame
+from tumble.datasets import bounding_sphere, capture_document, training_frame
 from tumble.io import BadFile, files
-from tumble.maths import SE3, smallest_enclosing_sphere
+from tumble.maths import SE3
 from tumble.preprocess import colmap, video_to_capture
 from tumble.preprocess.colmap import PosedImage, SparseModel
 from tumble.preprocess.footage import PROVENANCE, find_mask, read_mask
@@ -27,14 +27,10 @@ from tumble.preprocess.options import MIN_FRAMES, FootageOptions
 from tumble.preprocess.survey import downsample_mask
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Trajectory, mask_from_alpha, undistortion
 
-RADIUS_MARGIN = 1.02
-"""Radius of the object's sphere divided by the radius that the silhouettes determine."""
 MAX_SLOPE = 100.0
 """Maximum distance of an undistorted ray from the optical axis, on the plane at depth 1: 89.4 degrees."""
 MIN_PART_FRACTION = 0.05
 """Minimum area of a component of a mask, as a fraction of the largest one; a smaller one is noise."""
-SPHERE_STEPS = 2000
-"""Number of steps of the search for the smallest sphere; the last ones move it by a thousandth of its radius."""
 MIN_UP_LENGTH = 0.3
 """Minimum length of the mean of the cameras' up directions (unit vectors); below it there is no common one."""
 
@@ -107,7 +103,7 @@ def collect_silhouettes(path: Path, options: FootageOptions) -> PosedImages:
     empty = tuple(silhouette.view.name for silhouette in candidates if not len(silhouette.rays))
     if not silhouettes:
         raise BadFile(path, "has only empty masks", "the object must be white; use --invert-masks if it is black")
-    centre, radius, ray_distance = bounding_sphere(silhouettes)
+    centre, radius, ray_distance = _bounding_sphere(silhouettes)
     for silhouette in silhouettes:
         depth = silhouette.view.R_cam_world[2] @ centre + silhouette.view.t_cam_world[2]
         if depth <= 1.05 * radius:
@@ -116,36 +112,11 @@ def collect_silhouettes(path: Path, options: FootageOptions) -> PosedImages:
     return PosedImages(model, root, silhouettes, empty, centre, radius, ray_distance)
 
 
-def bounding_sphere(silhouettes: tuple[Silhouette, ...]) -> tuple[Float64[np.ndarray, "3"], float, float]:
-    """Centre and radius of the smallest sphere that reaches all rays [unit of the model], and their `ray_distance`.
-
-    The surface point farthest from the centre lies on the contour in the views perpendicular to it, so with many views
-    this is the sphere around the object, up to `RADIUS_MARGIN`.
-    """
+def _bounding_sphere(silhouettes: tuple[Silhouette, ...]) -> tuple[Float64[np.ndarray, "3"], float, float]:
+    """Centre and radius of the sphere around the object [unit of the model], and its `ray_distance`."""
     starts = [-s.view.R_cam_world.T @ s.view.t_cam_world for s in silhouettes]
     rays = [_unit(np.c_[s.rays, np.ones(len(s.rays))]) @ s.view.R_cam_world for s in silhouettes]
-    axes = _unit(np.stack([direction.mean(0) for direction in rays]))
-    P = np.eye(3) - axes[:, :, None] * axes[:, None]
-    # Least squares, because the solution stays finite for parallel rays, which do not intersect.
-    centre = np.linalg.lstsq(P.sum(0), (P @ np.stack(starts)[..., None]).sum(0)[:, 0], rcond=None)[0]
-    ray_distance = np.median(np.linalg.norm(_offsets_to_rays(centre, np.stack(starts), axes), axis=1))
-    distances = np.linalg.norm(np.stack(starts) - centre, axis=1)
-    radii = [np.linalg.norm(r - axis, axis=1).max() for r, axis in zip(rays, axes, strict=True)]
-    start = np.repeat(np.stack(starts), [len(r) for r in rays], 0)
-    direction = np.concatenate(rays)
-
-    def offsets(x: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(_offsets_to_rays(x.numpy(), start, direction))
-
-    solution = smallest_enclosing_sphere(offsets, torch.from_numpy(centre), steps=SPHERE_STEPS)
-    radius = float(offsets(solution).norm(dim=-1).max())
-    return solution.numpy(), RADIUS_MARGIN * radius, float(ray_distance / np.median(distances * radii))
-
-
-def _offsets_to_rays(x: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Vectors from a point to the closest points of lines."""
-    offset = start - x
-    return offset - (offset * direction).sum(1, keepdims=True) * direction
+    return bounding_sphere(starts, rays)
 
 
 def _unit(x: np.ndarray) -> np.ndarray:

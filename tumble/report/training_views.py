@@ -23,7 +23,7 @@ from tumble.rendering import (
     surface,
     visibility,
 )
-from tumble.scene import OBJECT, UNKNOWN, Asset, Camera, Capture, env_from_obj
+from tumble.scene import OBJECT, UNKNOWN, Asset, Camera, Capture
 
 MAX_SIDE = 256
 """Maximum longer side of a window's images [pixels]: enough for display, and for scores close to those at full size."""
@@ -123,7 +123,7 @@ def render(scene: LitScene, number: int, camera: Camera) -> tuple[Float[Tensor, 
         points.sample(view.features["albedo"]),
         points.sample(view.features["roughness"]),
         scene.prefiltered,
-        env_from_obj(T_cam_obj, trajectory.light),
+        trajectory.R_env_obj_at(number, T_cam_obj),
         visibility(scene.tracer, points.points, points.normals, directions),
         f0=float(material.f0),
     )

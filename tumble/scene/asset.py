@@ -42,7 +42,10 @@ class Asset:
         T_cam_new = trajectory.T_cam_obj @ SE3.from_rotation_matrix(R_new_obj.mT)
         fixed_to_object = trajectory.light == "object"
         environment = self.environment.rotated(R_new_obj) if fixed_to_object else self.environment
-        motion = Trajectory(T_cam_new, trajectory.light)
+        turns = trajectory.light_turns
+        if turns is not None and fixed_to_object:
+            turns = R_new_obj @ turns @ R_new_obj.mT
+        motion = Trajectory(T_cam_new, trajectory.light, turns)
         return Asset(turned, self.gamma, material, environment, motion, self.camera)
 
 

@@ -12,10 +12,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from tumble.io import tree
+from tumble.maths import SE3
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Light, Trajectory
@@ -29,9 +30,11 @@ BACKGROUND = 0
 REGIONS = ("shared", "sphere")
 """Regions of evaluation views."""
 Units = Literal["m", "arbitrary"]
+Benchmark = Literal["", "tensoir", "stanford-orb"]
+"""Published benchmark with a scoring protocol of its own; empty for all other captures."""
 
 
-def mask_from_alpha(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+def mask_from_alpha(alpha: UInt8[np.ndarray, "*b h w"]) -> UInt8[np.ndarray, "*b h w"]:
     """Mask from an alpha channel: opaque pixels are OBJECT, transparent ones BACKGROUND, all others UNKNOWN."""
     return np.select([alpha >= 250, alpha <= 5], [OBJECT, BACKGROUND], UNKNOWN).astype(np.uint8)
 
@@ -86,6 +89,24 @@ class Capture:
 
 
 @dataclass(frozen=True)
+class RelitViews:
+    """Views of the object in other places than that of the capture, each with a light and a lens of its own."""
+
+    radiance: Float[Tensor, "n h w 3"]
+    """Photos, linear radiance in any unit, 0 outside the object; float32."""
+    foreground: Bool[Tensor, "n h w"]
+    """Pixels that show the object."""
+    cameras: tuple[Camera, ...]
+    T_cam_obj: SE3
+    """Object poses, in the object frame of the capture."""
+    lights: tuple[Environment, ...]
+    """Light of each view, object frame."""
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+@dataclass(frozen=True)
 class Truth:
     """Ground truth of a capture, for evaluation only. Everything except the evaluation views is optional."""
 
@@ -120,7 +141,15 @@ class Truth:
     units: Units = "arbitrary"
     """Unit of the poses: metres, or unknown."""
     setting: str | None = None
-    """Label for reports: "handheld", "turntable" or "dome"."""
+    """Label for reports: "handheld", "turntable", "dome" or "turned"."""
+    benchmark: Benchmark = ""
+    """Benchmark by whose protocol the capture is scored, too."""
+    alpha: UInt8[Tensor, "v h w"] | None = None
+    """Fraction of each pixel that the object covers, times 255."""
+    radiance: Float[Tensor, "v h w 3"] | None = None
+    """Photos of the evaluation views in linear radiance, over black, if they were stored in more than 8 bits."""
+    elsewhere: RelitViews | None = None
+    """Views of the same object in other places."""
 
     def __len__(self) -> int:
         return len(self.names)

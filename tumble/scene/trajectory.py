@@ -2,11 +2,12 @@
 
 Frames: `obj` (the object, inside the unit sphere), `cam` (OpenCV), `env` (the frame of the environment map). With
 `light == "camera"` the env frame is the camera with OpenGL axes (x right, y up, z backwards), so that the top of the
-map is up in the image; with `light == "object"` it is the object frame (docs/format.md).
+map is up in the image; with `light == "object"` it is the object frame (docs/format.md). In some synthetic captures the
+light also turns by itself, from frame to frame.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -41,6 +42,8 @@ class Trajectory:
     """Object to camera (OpenCV axes), one per frame [object radius]."""
     light: Light
     """"camera" for hand-held and turntable captures, "object" for a static dome."""
+    light_turns: Float[Tensor, "t 3 3"] | None = None
+    """Rotation of each frame from the frame named by `light` to the env frame; None if the light does not turn."""
 
     @staticmethod
     def from_camera_to_object(matrices: Float[Tensor, "t 4 4"], light: Light) -> "Trajectory":
@@ -57,7 +60,13 @@ class Trajectory:
     @property
     def R_env_obj(self) -> Float[Tensor, "t 3 3"]:
         """Object to environment; rotation only, because the light is distant (eq. 3)."""
-        return env_from_obj(self.T_cam_obj, self.light)
+        R_env_obj = env_from_obj(self.T_cam_obj, self.light)
+        return R_env_obj if self.light_turns is None else self.light_turns @ R_env_obj
+
+    def R_env_obj_at(self, frame: int, T_cam_obj: SE3) -> Float[Tensor, "3 3"]:
+        """`R_env_obj` of a frame at another pose, such as a corrected one."""
+        R_env_obj = env_from_obj(T_cam_obj, self.light)
+        return R_env_obj if self.light_turns is None else self.light_turns[frame] @ R_env_obj
 
     @property
     def camera_positions(self) -> Float[Tensor, "t 3"]:
@@ -70,4 +79,5 @@ class Trajectory:
     def select(self, frames: Sequence[int] | Tensor) -> "Trajectory":
         """The trajectory reduced to the given frames, in the given order."""
         index = torch.as_tensor(frames, dtype=torch.long, device=self.T_cam_obj.xyz.device)
-        return Trajectory(self.T_cam_obj[index], self.light)
+        turns = None if self.light_turns is None else self.light_turns[index]
+        return replace(self, T_cam_obj=self.T_cam_obj[index], light_turns=turns)

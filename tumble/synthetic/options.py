@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-Setting = Literal["dome", "turntable", "handheld"]
+Setting = Literal["dome", "turntable", "handheld", "turned"]
 Background = Literal["none", "wall", "desk", "clutter", "torso"]
 
 
@@ -18,7 +18,10 @@ class SynthOptions:
     """Environment map: an equirectangular .hdr or .exr file (+y up), or "white" for uniform light."""
     setting: Setting = "handheld"
     """dome: the camera moves around a still object. Camera and light are still in the other two:
-    turntable: the object rotates about the vertical; handheld: it rotates about changing axes."""
+    turntable: the object rotates about the vertical; handheld: it rotates about changing axes.
+    turned: the cameras of the dome, and the light is turned by the poses of a hand-held motion."""
+    turns: int = 0
+    """Only with --setting turned: number of poses of the motion by which the light is turned; 0: one a frame."""
     views: int = 64
     """Number of training frames."""
     stride: int = 1
@@ -70,6 +73,7 @@ class SynthOptions:
     def __post_init__(self) -> None:
         in_range = {
             "views": self.views >= 1,
+            "turns": 0 <= self.turns <= self.views,
             "stride": self.stride >= 1,
             "resolution": 8 <= self.resolution <= 4096 and self.resolution % 2 == 0,
             "fov": 1 <= self.fov <= 120,
@@ -86,7 +90,11 @@ class SynthOptions:
             raise ValueError(f"a hand does not hold the object in the setting {self.setting}: use --setting handheld")
         if self.stride > 1 and (self.setting != "handheld" or self.hand or self.film):
             raise ValueError("a stride needs --setting handheld, without a hand and a film, which need every frame")
-        if self.setting == "dome" and (self.film or self.background != "none"):
+        if self.turns and self.setting != "turned":
+            raise ValueError(f"the light is not turned in the setting {self.setting}: use --setting turned")
+        if self.setting == "turned" and self.pose_free:
+            raise ValueError("the turns of the light are known only together with the poses: leave out --pose-free")
+        if self.setting in ("dome", "turned") and (self.film or self.background != "none"):
             raise ValueError("the camera of a dome moves: a film or a background needs another --setting")
         stems = [Path(name).stem for name in self.relight]
         if len(set(stems)) < len(stems):

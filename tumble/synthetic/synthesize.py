@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tumble import __version__
 from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
@@ -28,6 +29,7 @@ from tumble.synthetic.trajectories import (
     ELEVATION,
     LIGHT_FRAME,
     distance_for,
+    light_turns,
     shared_views,
     sphere_views,
     trajectory,
@@ -59,6 +61,8 @@ class _Frame:
     """Region of an evaluation view; None for a training frame."""
     time: float = 0.0
     """Time of a training frame [frames]."""
+    light_turn: Tensor | None = None
+    """Rotation of the light in a training frame, `[3 3]`; None if it does not turn by itself."""
 
 
 @dataclass
@@ -89,6 +93,7 @@ class _RenderContext:
         """Linear radiance and coverage of a frame under a light that is at rest in `light_frame`; the coverage includes
         the surroundings."""
         R_env_obj = env_from_obj(frame.T_cam_obj, light_frame)
+        R_env_obj = R_env_obj if frame.light_turn is None else frame.light_turn @ R_env_obj
         scene = self.scenes[light]
         camera = self.camera if camera is None else camera
         return pathtracer.radiance(scene, frame.T_cam_obj, camera, R_env_obj, samples=samples, seed=seed)
@@ -180,10 +185,13 @@ def _frames(options: SynthOptions, poses: SE3) -> Iterator[_Frame]:
         ("shared", shared_views(options.eval_shared, distance), options.eval_shared),
         ("sphere", sphere_views(options.eval_sphere, distance), options.eval_sphere),
     )
+    turned = options.setting == "turned"
+    turns = light_turns(options.views, options.turns or options.views, seed=options.seed).float() if turned else None
     number = 0
     for region, poses, n in groups:
         for i in range(n):
-            yield _Frame(f"{number:04}.png", SE3(poses.wxyz[i].float(), poses.xyz[i].float()), region, number)
+            turn = turns[i] if turns is not None and region is None else None
+            yield _Frame(f"{number:04}.png", SE3(poses.wxyz[i].float(), poses.xyz[i].float()), region, number, turn)
             number += 1
 
 
@@ -364,7 +372,14 @@ def _write_documents(context: _RenderContext, frames: list[_Frame], lights: dict
     options = context.options
     training = [frame for frame in frames if frame.region is None]
     files.write_json(context.out / "truth" / "poses.json", {frame.name: _matrix(frame) for frame in training})
-    entries = [training_frame(f.name, None if options.pose_free else _matrix(f)) for f in training]
+    entries = [
+        training_frame(
+            f.name,
+            None if options.pose_free else _matrix(f),
+            None if f.light_turn is None else f.light_turn.tolist(),
+        )
+        for f in training
+    ]
     entries += [
         evaluation_frame(f.name, _matrix(f), f.region, maps=_map_names(options), lights=filter(None, lights))
         for f in frames

@@ -7,6 +7,8 @@ The object lies in the unit sphere around the origin of its frame, +y up; its *h
   to the camera.
 - *handheld*: the camera is still and the object rotates about changing axes, so that all its sides are visible; the
   light is fixed to the camera.
+- *turned*: the views of the dome, under a light that is turned from frame to frame by the poses of a hand-held motion.
+  So the light is as diverse as for a hand-held object, while views and visible geometry are those of the dome.
 """
 
 import math
@@ -18,12 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.maths import SE3, SO3, fibonacci_sphere
-from tumble.scene import Light
+from tumble.scene import Light, env_from_obj
 from tumble.synthetic.options import Setting
 
 SETTINGS: tuple[str, ...] = get_args(Setting)
 """Names of the capture settings."""
-LIGHT_FRAME: dict[str, Light] = {"dome": "object", "turntable": "camera", "handheld": "camera"}
+LIGHT_FRAME: dict[str, Light] = {"dome": "object", "turntable": "camera", "handheld": "camera", "turned": "object"}
 """Frame in which the light is at rest, by setting."""
 
 ELEVATION = math.radians(25)
@@ -127,8 +129,21 @@ def trajectory(setting: str, n: int, distance: float, *, seed: int, stride: int 
         "dome": lambda: dome(n, distance),
         "turntable": lambda: turntable(n, distance),
         "handheld": lambda: handheld(n * stride, distance, seed=seed)[::stride],
+        "turned": lambda: dome(n, distance),
     }
     return paths[setting]()
+
+
+def light_turns(n: int, turns: int, *, seed: int) -> Float[Tensor, "n 3 3"]:
+    """Rotations of the light in the `n` frames of the setting "turned", from the object frame to the env frame.
+
+    Args:
+        turns: Number of poses, taken evenly from a hand-held motion of `n` frames; frame i has pose i modulo `turns`.
+        seed: Seed of the motion.
+    """
+    R_env_obj = env_from_obj(handheld(n, 1.0, seed=seed), "camera")
+    chosen = R_env_obj[torch.arange(n) % turns * n // turns]
+    return chosen @ R_env_obj[0].T  # the first frame is one of the dome
 
 
 def shared_views(n: int, distance: float) -> SE3:
