@@ -144,6 +144,7 @@ def run(
     size: Size = None,
     poses: Literal["given", "estimate"] = "given",
     up: Annotated[str, arg(metavar="{auto,[-]x,[-]y,[-]z,FRAME}")] = "auto",
+    white: Annotated[tuple[int, int, str] | None, arg(metavar="X Y FRAME", help_behavior_hint="")] = None,
     matcher: str = "mixed",
     pick: bool = False,
     device: Device = "cpu",
@@ -168,6 +169,9 @@ def run(
         up: Direction of the object that points up in the results; a finished run is only turned, in seconds.
             auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.
             FRAME: up in this frame, such as 0012.png.
+        white: A pixel of the capture's images that shows a neutral white or grey, on the object or on a card beside it
+            that faces the camera: column, row [pixels], frame, such as 0012.png. It sets the colour of the light, which
+            is else taken to be about neutral; a finished run is only recoloured, in seconds.
         matcher: Finds corresponding pixels in two frames, for estimated poses.
             mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
             xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
@@ -182,7 +186,7 @@ def run(
 
     recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
     options = at_quality(options, quality, frames=frames, size=size)
-    print(run_capture(capture, out, recipe, options, poses=poses, up=up, pick=pick, device=device))
+    print(run_capture(capture, out, recipe, options, poses=poses, up=up, white=white, pick=pick, device=device))
 
 
 def batch(

@@ -55,7 +55,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 16
+VERSION = 17
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -148,6 +148,9 @@ class Config:
     lobes: Literal["split", "sum"] = "split"
     """split: narrow specular lobes from a prefiltered map (`shading.shade_split`). sum: both lobes summed over the
     directions (`shading.shade`), as in the paper."""
+    smooth_light: Literal["radiance", "log radiance"] = "log radiance"
+    """Of what the smoothness of the environment map is measured. radiance: as in the paper; the term then depends on the
+    absolute scale of the light and dims a sun."""
     bounce: Literal["none", "average", "frame"] = "frame"
     """Indirect light. average: from the mean radiance over all frames, as in the paper. frame: from the radiance under
     the light of the frame."""
@@ -380,11 +383,12 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         points.sample(photo)[None].to(albedo) / 255,
     )
     difference = (losses.srgb_as_captured(rendered, wanted) - wanted).abs().sum()
-    of_view = losses.material_terms(view, photo, mask)
+    of_view, light = losses.material_terms(view, photo, mask), params.environment
+    texels = light.log_radiance if cfg.smooth_light == "log radiance" else light.radiance
     terms = {
         # A frame may have no pixel that certainly shows the object.
         "render": difference / (3 * max(1, len(points.pixels))),
-        "light": cfg.weights.light * losses.light_smoothness(params.environment.radiance),
+        "light": cfg.weights.light * losses.light_smoothness(texels),
         "mask": cfg.weights.mask * of_view["mask"],
         "material": cfg.weights.material * of_view["material"],
         "specular": state.memory["specular_penalty"]
