@@ -32,21 +32,21 @@ PIXELS = 1024
 """Maximum number of pixels shaded per frame."""
 DIRECTIONS = 256
 """Number of directions over which light is integrated."""
-NEUTRAL_SD = 0.2
+NEUTRAL_SD = 0.15
 """Standard deviation of the light's colour from neutral after a camera's white balance [log radiance]."""
-HIGHLIGHT_BIAS = -0.15
+HIGHLIGHT_BIAS = -0.08
 """Mean error of the highlights' brightness: logarithm of the specular scale that fits frames best under the true light
 (docs/method.md)."""
 SHADING_ERROR = 0.1
 """Relative error of the diffuse lobe that may look like a specular lobe: what the error of a highlight scales with."""
-HIGHLIGHT_SD = 0.35
-"""Standard deviation of the highlights' brightness, the same in all channels: F0 of dielectrics (0.2: indices of
-refraction of 1.4 to 1.65 have an F0 of 0.03 to 0.06) and the roughness on which it depends."""
+HIGHLIGHT_SD = 0.1
+"""Standard deviation of the logarithm of the highlights' brightness, the same in all channels, times the contrast of the
+diffuse light (its standard deviation over its mean): a flat light hardly separates the lobes."""
 WHITE_QUANTILE = 0.99
 """Quantile of the albedo per channel that counts as the object's brightest paint."""
-WHITE_SD = 0.15
+WHITE_SD = 0.2
 """Standard deviation of the brightest paint's colour from neutral, if it is white [log albedo]."""
-WHITE_CUTOFF = 0.9
+WHITE_CUTOFF = 0.6
 """Length of the deviation from which the brightest paint rather counts as coloured (Geman-McClure) [log albedo]."""
 MEAN_ALBEDO = 0.25
 """Typical mean albedo of an object."""
@@ -132,7 +132,9 @@ def estimate(pixels: ShadedPixels, f0: float, known_white: Float[Tensor, "3"] | 
     lightness = (albedo @ albedo.new_tensor(LUMINANCE)).mean().log()
     highlights = f0 / DIELECTRIC * pixels.specular.double().mean(0)
     ratio = (albedo * pixels.diffuse).mean(0) / highlights.clamp_min(1e-6)
-    of_highlights = torch.linalg.inv((SHADING_ERROR * ratio).square().diag() + HIGHLIGHT_SD**2 * ones)
+    contrast = pixels.diffuse.mean(-1).std() / pixels.diffuse.mean()
+    grey = HIGHLIGHT_SD / contrast.clamp_min(0.01)
+    of_highlights = torch.linalg.inv((SHADING_ERROR * ratio).square().diag() + grey**2 * ones)
     fixed = [
         (colour / NEUTRAL_SD**2, light),
         (of_highlights, torch.full_like(light, math.log(DIELECTRIC / f0) + HIGHLIGHT_BIAS)),

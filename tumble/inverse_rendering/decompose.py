@@ -149,8 +149,8 @@ class Config:
     """split: narrow specular lobes from a prefiltered map (`shading.shade_split`). sum: both lobes summed over the
     directions (`shading.shade`), as in the paper."""
     smooth_light: Literal["radiance", "log radiance"] = "log radiance"
-    """Of what the smoothness of the environment map is measured. radiance: as in the paper; the term then depends on the
-    absolute scale of the light and dims a sun."""
+    """What the smoothness of the environment map is measured on. radiance: as in the paper; the term then depends on
+    the absolute scale of the light and dims a sun."""
     bounce: Literal["none", "average", "frame"] = "frame"
     """Indirect light. average: from the mean radiance over all frames, as in the paper. frame: from the radiance under
     the light of the frame."""
