@@ -40,8 +40,9 @@ HIGHLIGHT_BIAS = -0.08
 SHADING_ERROR = 0.1
 """Relative error of the diffuse lobe that may look like a specular lobe: what the error of a highlight scales with."""
 HIGHLIGHT_SD = 0.1
-"""Standard deviation of the logarithm of the highlights' brightness, the same in all channels, times the contrast of the
-diffuse light (its standard deviation over its mean): a flat light hardly separates the lobes."""
+"""Standard deviation of the highlights' brightness, the same in all channels, under diffuse light of contrast 1; it is
+inversely proportional to this contrast (standard deviation over mean), since a flat light hardly separates the lobes
+[log radiance]."""
 WHITE_QUANTILE = 0.99
 """Quantile of the albedo per channel that counts as the object's brightest paint."""
 WHITE_SD = 0.2
