@@ -383,12 +383,11 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         points.sample(photo)[None].to(albedo) / 255,
     )
     difference = (losses.srgb_as_captured(rendered, wanted) - wanted).abs().sum()
-    of_view, light = losses.material_terms(view, photo, mask), params.environment
-    texels = light.log_radiance if cfg.smooth_light == "log radiance" else light.radiance
+    of_view = losses.material_terms(view, photo, mask)
     terms = {
         # A frame may have no pixel that certainly shows the object.
         "render": difference / (3 * max(1, len(points.pixels))),
-        "light": cfg.weights.light * losses.light_smoothness(texels),
+        "light": cfg.weights.light * _light_smoothness(cfg, params.environment),
         "mask": cfg.weights.mask * of_view["mask"],
         "material": cfg.weights.material * of_view["material"],
         "specular": state.memory["specular_penalty"]
@@ -399,6 +398,11 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
+
+
+def _light_smoothness(cfg: Config, light: Environment) -> Float[Tensor, ""]:
+    """The smoothness term of the environment map before its weight."""
+    return losses.light_smoothness(light.log_radiance if cfg.smooth_light == "log radiance" else light.radiance)
 
 
 def _sample_pixels(n: int, view: Buffers, mask: Bool[Tensor, "h w"], rng: torch.Generator) -> Tensor:
