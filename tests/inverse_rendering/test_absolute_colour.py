@@ -81,8 +81,8 @@ def test_no_paint_is_brighter_than_white() -> None:
     brightest = shaded.albedo.quantile(0.99, dim=0)
     found = absolute_colour.estimate(shaded, 1e-4)
     assert 0.9 < float((brightest * found.log_factor.exp()).max()) < 1.1
-    # Without the print only the mean counts, whose deviation is larger.
-    assert found.deviation.max() < 0.5 * absolute_colour.estimate(black, 1e-4).deviation.max()
+    # The limit is one-sided and makes nothing more certain.
+    torch.testing.assert_close(found.deviation, absolute_colour.estimate(black, 1e-4).deviation, atol=0.01, rtol=0)
 
 
 def test_highlights_make_the_estimate_more_certain_and_darker_objects_more_so() -> None:

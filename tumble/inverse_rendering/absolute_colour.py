@@ -87,7 +87,8 @@ class Estimate:
     log_factor: Float[Tensor, "3"]
     """Natural logarithm of the factor on the albedo; the light is divided by the factor."""
     deviation: Float[Tensor, "3"]
-    """Standard deviation of `log_factor`, about the relative error of the albedo."""
+    """Standard deviation of `log_factor`, about the relative error of the albedo. The limit of the brightest paint does
+    not lower it, since below the limit the other cues alone decide."""
 
 
 @torch.no_grad()
@@ -147,13 +148,11 @@ def estimate(pixels: ShadedPixels, f0: float, known_white: Float[Tensor, "3"] | 
     for _ in range(REWEIGHTINGS):
         tint = (colour @ (paint + factor)).square().sum() / WHITE_CUTOFF**2
         too_bright = (paint + factor > math.log(MAX_ALBEDO)).double()
-        cues = [
-            *fixed,
-            (colour / (WHITE_SD * (1 + tint)) ** 2, -paint),
-            ((too_bright / MAX_ALBEDO_SD**2).diag(), math.log(MAX_ALBEDO) - paint),
-        ]
+        cues = [*fixed, (colour / (WHITE_SD * (1 + tint)) ** 2, -paint)]
         precision = torch.stack([weight for weight, _ in cues]).sum(0)
-        factor = torch.linalg.solve(precision, torch.stack([weight @ target for weight, target in cues]).sum(0))
+        limit = (too_bright / MAX_ALBEDO_SD**2).diag()
+        target = torch.stack([weight @ target for weight, target in cues]).sum(0)
+        factor = torch.linalg.solve(precision + limit, target + limit @ (math.log(MAX_ALBEDO) - paint))
     deviation = torch.linalg.inv(precision).diagonal().sqrt()
     return Estimate(factor.to(pixels.albedo), deviation.to(pixels.albedo))
 
