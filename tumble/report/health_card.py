@@ -27,7 +27,7 @@ LIMITS = {
     "lost": (0.0, 0.1),
     "residual": (1.5, 3.0),
     "few_lights": (0.2, 0.6),
-    "colour": (0.5, 1.0),
+    "colour": (0.3, 1.0),
 }
 """Limits beyond which a row is rated "warn" and "bad", rules of thumb: median PSNR [dB], median IoU, range of exposure
 [stops], fraction of lost frames, median match residual [pixels], fraction of the surface lit from few directions,
