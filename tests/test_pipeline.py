@@ -367,6 +367,41 @@ def test_a_turning_object_is_in_the_middle_of_its_film(
     assert (films[0] == films[1]).all()
 
 
+def test_a_finished_run_is_recoloured_by_a_known_white(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No stage runs again. Albedo times light stays the same in each channel, and the pixel becomes neutral."""
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    monkeypatch.setattr(loop, "drive", None)
+    white = (16, 16, "0.png")
+    asset = pipeline.reconstruct(capture, out, RECIPE, white=white)
+    products = [x.material.albedo.mean((0, 1)) * x.environment.integral() for x in (finished[1], asset)]
+    torch.testing.assert_close(products[1], products[0], rtol=1e-3, atol=0)
+    shown = gbuffer.render_gbuffer(asset, asset.trajectory.T_cam_obj[0], asset.camera).features["albedo"][14:19, 14:19]
+    middle = shown.flatten(0, 1).median(0).values
+    # The known white has a standard deviation of 0.03, and other cues pull at it with theirs.
+    torch.testing.assert_close(middle, middle.mean().expand(3), rtol=0.05, atol=0)
+    estimates = [r for r in runs.log_records(out) if r.get("event") == "colour"]
+    assert [r["white"] for r in estimates] == [False, True]
+    assert max(estimates[1]["deviation"]) < max(estimates[0]["deviation"])
+    assert_same(pipeline.reconstruct(capture, out, RECIPE), finished[1])
+
+
+@pytest.mark.parametrize(
+    ("white", "rule"),
+    [((3, 3, "9999.png"), "no such frame"), ((32, 3, "0.png"), "outside"), ((0, 0, "0.png"), "too dark")],
+)
+def test_an_unsuitable_white_is_refused(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, white: tuple[int, int, str], rule: str
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    with pytest.raises(ValueError, match=rule):
+        pipeline.reconstruct(capture, out, RECIPE, white=white)
+    assert_same(tree.load(Asset, out / "asset.safetensors"), finished[1])
+
+
 def test_the_third_axis_is_the_smallest_after_training(finished: tuple[Path, Asset]) -> None:
     """Our normal is the third axis by construction; the paper's is that of the smallest scale."""
     scales = finished[1].gaussians.scales

@@ -192,6 +192,7 @@ def run_capture(
     *,
     poses: Literal["given", "estimate"] = "given",
     up: str = "auto",
+    white: tuple[int, int, str] | None = None,
     pick: bool = False,
     device: str = "cpu",
 ) -> Path:
@@ -201,17 +202,18 @@ def run_capture(
         path: A video, a folder of images, or a capture.
         options: How footage is converted to a capture.
         up: See `pipeline.reconstruct`.
+        white: See `pipeline.reconstruct`.
         pick: Let the user draw a box around the object in the browser.
 
     Raises:
-        ValueError: There is no such matcher, device or up direction.
+        ValueError: There is no such matcher, device, up direction or white pixel.
         BadFile: See `pipeline.capture_of` and `pipeline.reconstruct`.
     """
     place = usable_device(device)
     load_plugin("matching", recipe.matcher)  # fail before the video is converted
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
     capture = pipeline.capture_of(path, out, options)
-    pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, device=place)
+    pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, white=white, device=place)
     return write_report(out, capture=capture, device=place)
 
 

@@ -14,6 +14,7 @@ import warnings
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -56,6 +57,20 @@ Size = Annotated[
     ),
 ]
 OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Orientation and colour of the results of a run; a finished run takes on others in seconds."""
+
+    up: Annotated[str, arg(metavar="{auto,[-]x,[-]y,[-]z,FRAME}")] = "auto"
+    """Direction of the object that points up in the results.
+    auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.
+    FRAME: up in this frame, such as 0012.png."""
+    white: Annotated[tuple[int, int, str] | None, arg(metavar="X Y FRAME", help_behavior_hint="")] = None
+    """A pixel of the capture's images that shows a neutral white or grey, on the object or on a card beside it that
+    faces the camera: column, row [pixels], frame, such as 0012.png. It sets the colour of the light, which else is
+    taken to be about neutral."""
 
 
 Jobs = Annotated[int, arg(metavar="N", help="Number at the same time on this machine. 0: one for every two cores.")]
@@ -138,12 +153,12 @@ def run(
     capture: Positional[Path],
     /,
     options: Annotated[FootageOptions, arg(name="")],
+    adjustment: Annotated[Adjustment, arg(name="")],
     out: Folder,
     quality: Quality = "draft",
     frames: Frames = None,
     size: Size = None,
     poses: Literal["given", "estimate"] = "given",
-    up: Annotated[str, arg(metavar="{auto,[-]x,[-]y,[-]z,FRAME}")] = "auto",
     matcher: str = "mixed",
     pick: bool = False,
     device: Device = "cpu",
@@ -165,9 +180,7 @@ def run(
             paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
             (docs/method.md), where it is far behind draft.
         poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
-        up: Direction of the object that points up in the results; a finished run is only turned, in seconds.
-            auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.
-            FRAME: up in this frame, such as 0012.png.
+        adjustment: Orientation and colour of the results.
         matcher: Finds corresponding pixels in two frames, for estimated poses.
             mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
             xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
@@ -182,7 +195,7 @@ def run(
 
     recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
     options = at_quality(options, quality, frames=frames, size=size)
-    print(run_capture(capture, out, recipe, options, poses=poses, up=up, pick=pick, device=device))
+    print(run_capture(capture, out, recipe, options, poses=poses, pick=pick, device=device, **vars(adjustment)))
 
 
 def batch(

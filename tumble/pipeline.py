@@ -14,7 +14,7 @@ import torch
 from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
-from tumble.inverse_rendering import decompose, refine
+from tumble.inverse_rendering import absolute_colour, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
 from tumble.poses import PoseResult, mask_refinement, neighbours
 from tumble.poses.progressive import stage as progressive
@@ -129,6 +129,7 @@ def reconstruct(
     *,
     poses: Literal["given", "estimate"] | Trajectory | PoseResult = "given",
     up: str = "auto",
+    white: tuple[int, int, str] | None = None,
     device: torch.device | str = "cpu",
     progress: Callable[[Progress], None] | None = None,
 ) -> Asset:
@@ -147,6 +148,8 @@ def reconstruct(
         up: Up direction of the object, which becomes +y of the asset's frame. "auto": that of the poses, which for
             estimated ones is up in the first frame. Or one of `ROTATIONS_TO_UP`, an axis of the frame of "auto"; or
             the name of a frame in which the object is upright. No stage depends on it.
+        white: Column and row of a pixel and the name of its frame, which shows a neutral white or grey, on the object
+            or on a card beside it that faces the camera. It determines the colour of the light. No stage depends on it.
         device: Where stages 2 and 3 and the network of a matcher run.
         progress: Called every few seconds.
 
@@ -155,7 +158,7 @@ def reconstruct(
 
     Raises:
         BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
-        ValueError: There is no such direction or frame, or the capture's own poses define its frame.
+        ValueError: There is no such direction, frame or pixel, or the capture's own poses define its frame.
         NotFinite: A NaN occurred in training; the message names the tensor, the step and the saved state.
     """
     where = IN_MEMORY if isinstance(capture, Capture) else Path(capture)
@@ -167,19 +170,25 @@ def reconstruct(
     check_plausible(capture, where)
     found = poses if isinstance(poses, PoseResult) else None
     _check_up(up, capture, where)
+    _check_white(white, capture)
     if out is None:
-        return _upright(*_reconstruct(run.Run(None, recipe, progress), capture, where, found, device), up)
+        return _upright(*_reconstruct(run.Run(None, recipe, progress), capture, where, found, white, device), up)
     out = Path(out)
     with run.exclusive_access(out):
         opened = run.open(out, where, recipe, content=content_key(capture), report=progress)
-        asset, names = _reconstruct(opened, capture, where, found, device)
+        asset, names = _reconstruct(opened, capture, where, found, white, device)
         asset = _upright(asset, names, up)
         _keep(asset, names, out)
     return asset
 
 
 def _reconstruct(
-    opened: run.Run, capture: Capture, where: Path, found: PoseResult | None, device: torch.device | str
+    opened: run.Run,
+    capture: Capture,
+    where: Path,
+    found: PoseResult | None,
+    white: tuple[int, int, str] | None,
+    device: torch.device | str,
 ) -> tuple[Asset, tuple[str, ...]]:
     """The asset on the CPU, and the names of its frames."""
     recipe, trajectory, key = opened.recipe, capture.trajectory, content_key(capture)
@@ -197,7 +206,27 @@ def _reconstruct(
     )
     inputs = decompose.Inputs(capture, refined)
     asset, _ = run.stage(opened, run.DECOMPOSE, stage_of(recipe.decompose), recipe.decompose, inputs, [key])
+    asset = _in_absolute_colour(opened, asset, inputs.capture, white)
     return tree.to(asset, "cpu"), capture.names
+
+
+def _in_absolute_colour(opened: run.Run, asset: Asset, capture: Capture, white: tuple[int, int, str] | None) -> Asset:
+    """The asset with the most likely division of each colour channel between albedo and light; logs the estimate.
+
+    Raises:
+        ValueError: The pixel `white` is unsuitable, or the pose of its frame was not found.
+    """
+    target = None
+    if white is not None:
+        column, row, name = white
+        if name not in capture.names:
+            raise ValueError(f"the pose of frame {name} was not found; choose another frame for --white")
+        target = absolute_colour.known_white(asset, capture, capture.names.index(name), column, row)
+    pixels = absolute_colour.shaded_pixels(asset, capture)
+    found = absolute_colour.estimate(pixels, float(asset.material.f0), target)
+    values = {"factor": found.log_factor.exp().tolist(), "deviation": found.deviation.tolist()}
+    run.log(opened, {"name": "decompose", "event": "colour", **values, "white": white is not None})
+    return absolute_colour.apply(asset, found.log_factor)
 
 
 def stage_of(cfg: Any) -> Any:
@@ -281,6 +310,19 @@ def _check_up(up: str, capture: Capture, where: Path) -> None:
         raise ValueError(f"--up {up} is neither a direction nor a frame; choose {choices}, or a frame's file name")
     if capture.trajectory is not None and not (where / PROVENANCE).is_file():
         raise ValueError("--up is for estimated poses: the poses of this capture define its frame, in which +y is up")
+
+
+def _check_white(white: tuple[int, int, str] | None, capture: Capture) -> None:
+    """Raise `ValueError` unless the pixel exists."""
+    if white is None:
+        return
+    column, row, name = white
+    if name not in capture.names:
+        shown = f"{capture.names[0]} to {capture.names[-1]}"
+        raise ValueError(f"--white {column} {row} {name}: there is no such frame; choose one of {shown}")
+    height, width = capture.masks.shape[1:]
+    if not (0 <= column < width and 0 <= row < height):
+        raise ValueError(f"--white {column} {row} is outside of the images of {width} x {height} pixels")
 
 
 def _upright(asset: Asset, names: tuple[str, ...], up: str) -> Asset:

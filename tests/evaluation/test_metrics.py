@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tumble.evaluation import lpips, metrics
 from tumble.io.files import BadFile
+from tumble.maths.images import srgb_from_linear
 from tumble.maths.se3 import SE3, SO3, angle_between
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Trajectory
@@ -242,6 +243,8 @@ def test_albedo_scores_use_the_scale() -> None:
     assert scores["psnr_fg_linear"] == scores["psnr_full_linear"] == metrics.MAX_PSNR
     error = (0.1 * truth[0][mask[0]]).square().mean()
     assert scores["psnr_fg_linear_unscaled"] == pytest.approx(-10 * math.log10(error), abs=1e-4)
+    difference = (srgb_from_linear((truth[0] * 1.1).clamp(0, 1)) - srgb_from_linear(truth[0]))[mask[0]]
+    assert scores["psnr_fg_srgb_unscaled"] == pytest.approx(-10 * math.log10(difference.square().mean()), abs=1e-4)
     linear = skimage_metrics.peak_signal_noise_ratio(truth[0].numpy() * 0.5, truth[0].numpy(), data_range=1)
     rest = (mask[0], torch.ones(3), mask[0], everywhere(mask[0]), [])
     halved = metrics.albedo_scores(truth[0], truth[0] * 0.5, *rest)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.surfaces import GAMMA, MAJOR, MINOR, sphere, torus
+from tumble import recipes
 from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose
 from tumble.rendering.shading import Surface
@@ -45,6 +46,17 @@ def test_an_object_without_a_specular_lobe_keeps_an_albedo_below_one() -> None:
     # The lobe is too faint for its colour to be used: still 0.6, 0.3, 0.05, scaled to the largest allowed albedo.
     torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.9, 0.45, 0.075]), rtol=1e-5, atol=0)
     assert after.material.f0.item() < 0.1 * DIELECTRIC
+
+
+def test_the_smoothness_of_the_light_does_not_depend_on_its_scale() -> None:
+    """Else it would decide how albedo and light share each colour. The paper's does, and grows with the square."""
+    radiance = 0.1 + torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(0))
+    dim, bright = Environment.from_radiance(radiance), Environment.from_radiance(radiance * torch.tensor([3.0, 2, 0.5]))
+    one, other = (decompose._light_smoothness(recipes.DRAFT.decompose, light) for light in (dim, bright))
+    torch.testing.assert_close(one, other, rtol=1e-5, atol=0)
+    tripled = Environment.from_radiance(3 * radiance)
+    one, other = (decompose._light_smoothness(recipes.PAPER.decompose, light) for light in (dim, tripled))
+    torch.testing.assert_close(other, 9 * one, rtol=1e-5, atol=0)
 
 
 def test_traced_shadows_are_those_of_the_shaded_points() -> None:

@@ -48,6 +48,7 @@ RECORDS = [
 RECIPE = {"refine": {"steps": 200, "weights": {"mask": 0.125}}, "decompose": {"bounce": "none"}, "seed": 7}
 HOSTILE = """--><!--</script></style></title><script>alert(1)</script><img src=x onerror=alert(2)>"' onload='alert(3)"""
 RECORDS += [
+    {"name": "decompose", "event": "colour", "factor": [1.0, 1.0, 1.0], "deviation": [0.25, 0.23, 0.21]},
     {"name": HOSTILE, "step": 1, "of": HOSTILE, "seconds": 0.0, "metrics": {"render": 1.0, HOSTILE: 1.0}},
     {"name": HOSTILE, "event": "done", "seconds": 0.0},
 ]
@@ -269,8 +270,8 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
     quality = PoseQuality(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), observability)
     frames = list(training_views.frames(training_views.prepare(asset), damaged))
-    photo, silhouette, exposure, lost_frames, match, _ = health_card.card(
-        frames, quality, confidence.confidence_of(asset, asset.camera)
+    photo, silhouette, exposure, lost_frames, match, _, colour = health_card.card(
+        frames, quality, confidence.confidence_of(asset, asset.camera), [0.2, 0.6, 0.1]
     )
     assert photo.marks[0] == "bad" or photo.rating != "good"
     # One frame's mask is shifted by a quarter of the image.
@@ -282,6 +283,7 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     assert float(exposure.value.split()[0]) == pytest.approx(1.0, abs=0.05)
     assert (lost_frames.value, lost_frames.rating) == ("1 of 10", "warn")
     assert (match.value, match.rating) == ("4.00 px", "bad")
+    assert (colour.value, colour.rating) == ("± 60%", "warn")
     assert health_card.overall([photo, silhouette, exposure, lost_frames, match])[0] == "bad"
 
 

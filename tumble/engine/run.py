@@ -112,6 +112,8 @@ class _LogRecord(TypedDict, total=False):
     of: int
     eta: float
     metrics: dict[str, float | None]
+    factor: list[float]
+    deviation: list[float]
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ PROTOCOLS = {
     "psnr_fg_linear": f"PSNR [dB], peak 1, foreground pixels only, linear values clipped to [0, 1], {_VIEWS}",
     "psnr_full_linear": f"PSNR [dB], peak 1, all pixels over black, linear values clipped to [0, 1], {_VIEWS}",
     "psnr_fg_linear_unscaled": f"as psnr_fg_linear, without the albedo scale, {_VIEWS}",
+    "psnr_fg_srgb_unscaled": f"as psnr_fg_srgb, without the albedo scale, {_VIEWS}",
     "psnr_fg_srgb": f"PSNR [dB], peak 1, foreground pixels only, sRGB, {_VIEWS}",
     "psnr_full_srgb": f"PSNR [dB], peak 1, all pixels over black, sRGB, {_VIEWS}",
     "ssim_full_srgb": f"SSIM, Gaussian window 11 x 11 (sigma 1.5), windows inside the image, RGB, {_VIEWS}",

@@ -152,6 +152,7 @@ def albedo_scores(
         "psnr_fg_linear": psnr(scaled, truth, foreground),
         "psnr_full_linear": psnr(masked, truth, valid),
         "psnr_fg_linear_unscaled": psnr(unscaled, truth, foreground),
+        "psnr_fg_srgb_unscaled": psnr(srgb_from_linear(unscaled), srgb_from_linear(truth), foreground),
     }
 
 

@@ -20,6 +20,7 @@ MAX_ERRORS = {"albedo": 0.25, "normal": 30.0, "roughness": 0.5, "relit": 0.25}
 """Error at the bright end of the error maps' colours [sRGB, degrees, roughness, sRGB]."""
 TABLE_COLUMNS = {
     "albedo.psnr_fg_srgb": ("albedo PSNR fg, sRGB", "{:.2f} dB"),
+    "albedo.psnr_fg_srgb_unscaled": ("the same unscaled", "{:.2f} dB"),
     "albedo.lpips_full_srgb_alex": ("albedo LPIPS, full", "{:.4f}"),
     "relit.psnr_fg_srgb": ("relit PSNR fg", "{:.2f} dB"),
     "relit.psnr_full_srgb": ("relit PSNR full", "{:.2f} dB"),

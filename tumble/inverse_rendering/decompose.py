@@ -53,7 +53,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 16
+VERSION = 17
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -146,6 +146,9 @@ class Config:
     lobes: Literal["split", "sum"] = "split"
     """split: narrow specular lobes from a prefiltered map (`shading.shade_split`). sum: both lobes summed over the
     directions (`shading.shade`), as in the paper."""
+    smooth_light: Literal["radiance", "log radiance"] = "log radiance"
+    """What the smoothness of the environment map is measured on. radiance: as in the paper; the term then depends on
+    the absolute scale of the light and dims a sun."""
     bounce: Literal["none", "average", "frame"] = "frame"
     """Indirect light. average: from the mean radiance over all frames, as in the paper. frame: from the radiance under
     the light of the frame."""
@@ -384,7 +387,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     terms = {
         # A frame may have no pixel that certainly shows the object.
         "render": difference / (3 * max(1, len(points.pixels))),
-        "light": cfg.weights.light * losses.light_smoothness(params.environment.radiance),
+        "light": cfg.weights.light * _light_smoothness(cfg, params.environment),
         "mask": cfg.weights.mask * of_view["mask"],
         "material": cfg.weights.material * of_view["material"],
         "specular": state.memory["specular_penalty"]
@@ -395,6 +398,11 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
+
+
+def _light_smoothness(cfg: Config, light: Environment) -> Float[Tensor, ""]:
+    """The smoothness term of the environment map before its weight."""
+    return losses.light_smoothness(light.log_radiance if cfg.smooth_light == "log radiance" else light.radiance)
 
 
 def _sample_pixels(n: int, view: Buffers, mask: Bool[Tensor, "h w"], rng: torch.Generator) -> Tensor:

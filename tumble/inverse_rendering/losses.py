@@ -106,9 +106,9 @@ def gaussian_terms(
     return dict(zip(("rank", "gamma", "proj"), terms.unbind(), strict=True))
 
 
-def light_smoothness(radiance: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+def light_smoothness(texels: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Mean squared difference of neighbouring texels of an environment map, also across its seam (L_light, eq. 14)."""
-    down, across = radiance[1:] - radiance[:-1], radiance.roll(-1, 1) - radiance
+    down, across = texels[1:] - texels[:-1], texels.roll(-1, 1) - texels
     return (down**2).mean() + (across**2).mean()
 
 

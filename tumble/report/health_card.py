@@ -27,9 +27,11 @@ LIMITS = {
     "lost": (0.0, 0.1),
     "residual": (1.5, 3.0),
     "few_lights": (0.2, 0.6),
+    "colour": (0.3, 1.0),
 }
 """Limits beyond which a row is rated "warn" and "bad", rules of thumb: median PSNR [dB], median IoU, range of exposure
-[stops], fraction of lost frames, median match residual [pixels], fraction of the surface lit from few directions."""
+[stops], fraction of lost frames, median match residual [pixels], fraction of the surface lit from few directions,
+relative error of the albedo's scale."""
 MIN_LIGHT_DIRECTIONS = N_LIGHTS + 1
 """Number of light directions below which a point counts as lit from few directions: light that is fixed to the object
 gives at most one per bright light, `N_LIGHTS` in all."""
@@ -51,8 +53,20 @@ class Row:
     """Rating of each bar."""
 
 
-def card(frames: Sequence[RenderedFrame], quality: PoseQuality | None, confidence: Confidence) -> list[Row]:
-    """All rows of the card, in the order of the page; `quality` is None if the poses came with the capture."""
+def card(
+    frames: Sequence[RenderedFrame],
+    quality: PoseQuality | None,
+    confidence: Confidence,
+    colour_deviation: Sequence[float] = (),
+) -> list[Row]:
+    """All rows of the card, in the order of the page.
+
+    Args:
+        frames: The training frames with their renders.
+        quality: Quality of the poses; None if they came with the capture.
+        confidence: How well the surface was seen and lit.
+        colour_deviation: Standard deviation of the albedo's scale per channel; empty if it was not estimated.
+    """
     return [
         _photo_row(frames),
         _silhouette_row(frames),
@@ -60,6 +74,7 @@ def card(frames: Sequence[RenderedFrame], quality: PoseQuality | None, confidenc
         _lost_row(quality),
         _match_row(quality),
         _light_row(confidence),
+        _colour_row(colour_deviation),
     ]
 
 
@@ -182,6 +197,19 @@ def _light_row(confidence: Confidence) -> Row:
         "none": "No part of the surface is visible in any frame.",
     }[rating]
     return Row("Lit from few directions", "-" if math.isnan(few) else f"{few:.0%} of the surface", rating, sentence)
+
+
+def _colour_row(deviation: Sequence[float]) -> Row:
+    error = max(deviation, default=math.nan)
+    rating = _lower_is_better(error, LIMITS["colour"])
+    if rating == "none":
+        return Row("Absolute colour", "-", rating, "How albedo and light share each colour was not estimated.")
+    sentence = (
+        "Photos show the product of albedo and light; this is the standard deviation of the factor between the two in "
+        "the least certain channel. A matte object or a flat light leaves its brightness open; a pixel that shows "
+        "white or grey (tumble run --white) makes its hue certain."
+    )
+    return Row("Absolute colour", f"± {error:.0%}", rating, sentence)
 
 
 def _median(values: Sequence[float]) -> float:

@@ -164,7 +164,7 @@ def build(
     selected = figures.select_diverse(asset, frames, N_COMPARISONS)
     views = selected[:N_VIEWS]
     confidence = confidence_of(asset, figures.small_camera(asset.camera))
-    rows = health_card.card(frames, quality, confidence)
+    rows = health_card.card(frames, quality, confidence, _colour_deviation(summary.records))
     rating, word, sentence = health_card.overall(rows)
     covered = coverage.coverage_of(asset, capture)
     told = coverage.advice(covered, light_turns=asset.trajectory.light == "camera")
@@ -224,6 +224,12 @@ def _what_to_record(sentence: str, quality: PoseQuality | None, n_lost: int) -> 
         sentence = f"The poses are not reliable, so this may be wrong: {sentence[0].lower()}{sentence[1:]}"
     uncounted = "A frame without a pose is" if n_lost == 1 else f"{n_lost} frames without a pose are"
     return f"{sentence} {uncounted} not counted." if n_lost else sentence
+
+
+def _colour_deviation(records: Sequence[dict[str, Any]]) -> Sequence[float]:
+    """Standard deviation of the albedo's scale per channel, as the run logged it last; empty if it did not."""
+    estimates = [r["deviation"] for r in records if r.get("event") == "colour" and "deviation" in r]
+    return estimates[-1] if estimates else ()
 
 
 def _facts(asset: Asset, capture: Capture, summary: RunSummary) -> dict[str, str]:
