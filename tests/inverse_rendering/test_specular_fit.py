@@ -41,8 +41,8 @@ def synthetic_samples(scale: float, *, true: int = 1, dark: float = 0.0, n: int 
 
 @pytest.mark.parametrize(("glossy", "near"), [(True, {0.3, 0.4}), (False, {0.6})])
 def test_the_roughness_of_mitsubas_images_is_found(glossy: bool, near: set[float]) -> None:
-    """The figure of `tests.learning` with its true shape and light, from roughness 0.5. The body has 0.25, the rest 0.7,
-    and only one of them is shown to the fit; the grid goes from 0.3 to 0.6. Seen: 0.3 and 0.6."""
+    """The figure of `tests.learning` with its true shape and light, from roughness 0.5. Its body has 0.25, the rest 0.7
+    and only one of the two is shown to the fit. The grid goes from 0.3 to 0.6. Seen: 0.3 and 0.6."""
     asset, taken = true_asset(2500), folder.load(CAPTURE)
     assert taken.trajectory is not None
     masks = []
