@@ -149,9 +149,9 @@ def test_the_committed_capture_is_what_the_script_renders(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_estimated_poses_are_good_enough_to_learn(tmp_path: Path) -> None:
-    """48 frames of 96 x 96 pixels, 5 to 12 degrees apart. Seen with two seeds: rotations 1.5 degrees off, albedo 26.2 and
-    25.9 dB, normals 7.7 and 7.8 degrees, lamp 7.4 and 6.8 degrees; the bars are the worse one less twice the difference.
-    Roughness is not found (RMSE 0.36 and 0.28, a constant has 0.225), and has no bar."""
+    """48 frames of 96 x 96 pixels, 5 to 12 degrees apart. Seen with two seeds: rotations 1.5 degrees off, albedo 26.2
+    and 25.9 dB, normals 7.7 and 7.8 degrees, lamp 7.4 and 6.8 degrees; a bar is the worse one less twice the
+    difference. Roughness is not found (RMSE 0.36 and 0.28, where a constant has 0.225), and has no bar."""
     pytest.importorskip("mitsuba", reason="needs the extra `synth`")
     path = render(tmp_path / "capture", resolution=96, views=48, stride=1, samples=256, truth_samples=1, pose_free=True)
     capture, truth = folder.load(path), folder.load_truth(path)
