@@ -5,14 +5,14 @@ import sys
 from functools import partial
 
 import torch
+from torch.nn.functional import normalize
 
 from tests.lopsided import truth, tumbling
-from tests.poses.progressive.test_tracker import INPUTS, SMOKE, TRUTH
+from tests.poses.progressive.test_tracker import INPUTS, ON_A_SPHERE, SMOKE, TRUTH
 from tumble import recipes
 from tumble.engine.loop import Stage, drive
 from tumble.maths.se3 import angle_between
 from tumble.poses.progressive import stage as progressive
-from tumble.poses.progressive import tracker, virtual_camera
 from tumble.poses.sfm import stage as sfm
 
 
@@ -28,19 +28,20 @@ def test_true_poses_are_rated_good() -> None:
     assert angle_between(between[1:], between[:-1]).max() < 1e-3
 
 
-def test_the_stage_has_the_poses_of_the_tracker() -> None:
-    """On five frames of a textured sphere, with too few steps to be accurate."""
+def test_the_stage_finds_the_motion_of_a_sphere() -> None:
+    """Five frames, 24 degrees; as far as `test_tracker` says that these settings can."""
     assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
     inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
-    cfg = progressive.Config(**vars(SMOKE))
     assert isinstance(sys.modules["tumble.poses.progressive.stage"], Stage)
-    assert progressive.length(cfg, inputs) == tracker.length(SMOKE, inputs.track)
-    both = drive(progressive, cfg, inputs, seed=1)
-    alone = drive(tracker, SMOKE, inputs.track, seed=1)
-    lifted = virtual_camera.lift(alone.aim, alone.T_aim_obj, "camera").T_cam_obj
-    between = both.trajectory.T_cam_obj.rotation.inverse() @ lifted.rotation
-    assert angle_between(between[1:], between[:-1]).max() < 1e-3
-    assert len(both.quality) == len(TRUTH.xyz)
+    found = drive(progressive, progressive.Config(**vars(ON_A_SPHERE)), inputs, seed=0)
+    assert len(found.quality) == len(TRUTH.xyz)
+    R_cam_obj, direction = found.trajectory.T_cam_obj.rotation, normalize(found.trajectory.T_cam_obj.xyz, dim=-1)
+    for frame in range(1, 5):
+        motion, true = (R[frame] @ R[0].inverse() for R in (R_cam_obj, TRUTH.rotation))
+        assert math.degrees(float(angle_between(motion, true))) < 4
+    # The centre of the sphere is off the camera's axis by 0.045 radians in the true camera. The origin of the object
+    # frame lies within a fifth of the radius from it; seen: 0.026.
+    assert (direction - normalize(TRUTH.xyz, dim=-1)).norm(dim=-1).max() < 0.2 * 0.9 / 4
 
 
 def test_lifting_by_epnp_gives_the_poses_of_the_closed_form() -> None:

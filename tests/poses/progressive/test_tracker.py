@@ -71,6 +71,19 @@ def rotating_sphere(n: int = 5, size: int = 40) -> tuple[Inputs, SE3]:
 INPUTS, TRUTH = rotating_sphere()
 
 
+ON_A_SPHERE = replace(
+    SMOKE,
+    warmup=1,
+    rays=96,
+    pose_steps=20,
+    joint_steps=20,
+    # The initial distance is 0.9 / tan of the silhouette's angle, so this is the sphere's radius in its unit.
+    sizes=replace(SMOKE.sizes, width=48, depth=3, octaves=0, radius=0.9 * math.cos(math.asin(0.9 / DISTANCE))),
+    rates=replace(SMOKE.rates, fields=1e-9, sharpness=1e-9),
+)
+"""Settings with the right shape from the start, so that a few steps find the poses."""
+
+
 def bits(output: tracker.ProgressiveResult) -> dict[str, bytes]:
     return {name: x.numpy().tobytes() for name, x in tree.named_tensors(output).items()}
 
@@ -87,18 +100,7 @@ def test_the_first_distance_fits_the_silhouette() -> None:
 
 def test_a_rotating_sphere_is_tracked_against_the_right_shape() -> None:
     """Constant poses would be off by 24 degrees at the end; only texture and matches determine a sphere's rotation."""
-    # The initial distance is 0.9 / tan of the silhouette's angle, so this is the sphere's radius in its unit.
-    radius = 0.9 * math.cos(math.asin(0.9 / DISTANCE))
-    cfg = replace(
-        SMOKE,
-        warmup=1,
-        rays=96,
-        pose_steps=20,
-        joint_steps=20,
-        sizes=replace(SMOKE.sizes, width=48, depth=3, octaves=0, radius=radius),
-        rates=replace(SMOKE.rates, fields=1e-9, sharpness=1e-9),
-    )
-    tracked = drive(tracker, cfg, INPUTS, seed=0)
+    tracked = drive(tracker, ON_A_SPHERE, INPUTS, seed=0)
     found = lift(tracked.aim, tracked.T_aim_obj, "camera").T_cam_obj
     for frame in range(1, 5):
         motion = found.rotation[0].inverse() @ found.rotation[frame]
