@@ -8,6 +8,7 @@ import hashlib
 import itertools
 import math
 import tempfile
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -31,11 +32,12 @@ from tumble.evaluation import (
 from tumble.export import EXPORT_FILE, PresetName, write_asset
 from tumble.io import BadFile, files, load_plugin, outputs, progress, tree, video
 from tumble.maths import SE3, to_srgb8
+from tumble.poses import mask_refinement
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
 from tumble.rendering import relight as relighting
-from tumble.report import write_report
+from tumble.report import frames_of_run, write_report
 from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "relight.json"
@@ -101,6 +103,7 @@ def export_asset(
     *,
     names: list[str] | None = None,
     scale_mm: float | None = None,
+    capture: Capture | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Export an asset for other programs (docs/export.md): textured GLB, Gaussian PLYs, environment map, poses.
@@ -111,6 +114,8 @@ def export_asset(
         names: File names of the training frames. Default: their numbers.
         scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
             metres.
+        capture: The frames of the asset's trajectory. With them, the base colour of the mesh is solved from the
+            photographs; otherwise it is baked from the Gaussians alone.
         overwrite: Write into the folder even if it holds something else than an earlier export.
 
     Raises:
@@ -118,7 +123,7 @@ def export_asset(
     """
     outputs.claim_folder(Path(folder), EXPORT_FILE, overwrite=overwrite)
     names = names or [f"{number:04}.png" for number in range(len(asset.trajectory))]
-    write_asset(asset, names, Path(folder), preset, scale_mm)
+    write_asset(asset, names, Path(folder), preset, scale_mm, capture=capture)
     return Path(folder)
 
 
@@ -408,6 +413,8 @@ def export_run(
 ) -> Path:
     """Export a run's object for other programs; returns the folder, by default `RUN/export/PRESET`.
 
+    Without the run's capture, which may have been moved since, the base colour is baked from the Gaussians alone.
+
     Raises:
         BadFile: There is no finished run in `out`, or `folder` holds something else than an export.
     """
@@ -416,7 +423,18 @@ def export_run(
     folder = folder or out / run.EXPORT / preset
     asset = finished(out, device)
     names = run.frame_names(out, len(asset.trajectory))
-    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, overwrite=overwrite)
+    capture = None if preset == "splat" else _capture_of_run(out, asset, names)
+    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, capture=capture, overwrite=overwrite)
+
+
+def _capture_of_run(out: Path, asset: Asset, names: list[str]) -> Capture | None:
+    """The frames of a run's trajectory, with the masks of the run; None with a warning if the capture is gone."""
+    path = run.capture_source(out)
+    if not path.exists():
+        text = f"{path} is gone: the base colour is baked from the Gaussians, not solved from the photographs"
+        warnings.warn(text, stacklevel=3)
+        return None
+    return frames_of_run(mask_refinement.stored_result(out, pipeline.read_capture(path))[1], asset, names, path)
 
 
 def _relighting(out: Path) -> relighting.Config:
