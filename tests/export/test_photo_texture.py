@@ -143,19 +143,13 @@ def test_a_photograph_off_by_pixels_is_registered_and_an_exact_one_left_alone(te
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.012])
-def test_the_offset_of_the_surface_is_found(texels: Texels, offset: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_offset_of_the_surface_is_found(offset: float) -> None:
     """A plane above the mesh by 0.012, 0.34 pixels."""
     frames = [frame(T, i, height=offset) for i, T in enumerate(POSES)]
-    monkeypatch.setattr(photo_texture, "bake", lambda *_, **__: Baked)
-    moved = photo_texture.aligned_surface(None, quad(), frames)  # type: ignore[arg-type]
+    grey = np.full((2 * SIDE, 2 * SIDE, 3), 170, np.uint8)
+    moved = photo_texture.aligned_surface(quad(), grey, frames)
     assert moved.vertices[:, 2] == pytest.approx(offset, abs=0.003)
     assert (moved.vertices[:, :2] == quad().vertices[:, :2]).all()
-
-
-class Baked:
-    """Texture of the mean colour, in place of that of Gaussians."""
-
-    base_color = np.full((2 * SIDE, 2 * SIDE, 3), 170, np.uint8)
 
 
 def test_the_texture_keeps_what_the_baked_one_has_beyond_the_photographs() -> None:

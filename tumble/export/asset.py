@@ -45,6 +45,8 @@ EXPORT_FILE = "export.json"
 """Unit and settings of an exported folder, by which it is recognised; written first."""
 CONFIDENCE_FILE = "confidence.png"
 """Confidence of the material as a texture, beside the GLB and over the same UVs."""
+COARSE_VIEWS = 12
+"""Number of views of the coarse texture with which the surface is aligned."""
 SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
 """Settings of the mesh that is extracted only to measure the object's size."""
 
@@ -124,7 +126,9 @@ def textured_mesh(
         found = lit_frames.lit_frames(asset, capture)
         frames = list(progress.track(found, "light of the photographs", lit_frames.count(capture)))
         with progress.task("aligning the surface"):
-            flat = photo_texture.aligned_surface(asset, flat, frames)
+            side = photo_texture.solved_side(asset.camera)
+            coarse = bake.bake(asset, flat, resolution=side, views=COARSE_VIEWS, pixels=side)
+            flat = photo_texture.aligned_surface(flat, coarse.base_color, frames)
     with progress.task("baking textures"):
         textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
     if frames:

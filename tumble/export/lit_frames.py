@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb
 from tumble.rendering import (
@@ -55,13 +55,13 @@ class LitFrame:
 
 
 def usable_pixels(
-    photo: Float[np.ndarray, "h w 3"], mask: np.ndarray, coverage: Float[np.ndarray, "h w"]
+    photo: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], coverage: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Unsaturated pixels of the object, away from background, unknown pixels and the Gaussians' contour.
 
     Args:
-        photo: Code values of the photograph, 0 to 255.
-        mask: Mask of the capture, u8[h w].
+        photo: Code values of the photograph.
+        mask: Mask of the capture.
         coverage: Coverage by the Gaussians.
     """
     inside = ((mask == OBJECT) & (coverage > MIN_COVERAGE)).astype(np.uint8)

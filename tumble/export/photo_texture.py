@@ -22,10 +22,10 @@ from scipy import sparse
 from torch.nn.functional import max_pool2d
 
 from tumble.export.atlas import UnwrappedMesh
-from tumble.export.bake import Texels, bake, locate_texels, pad
+from tumble.export.bake import Texels, locate_texels, pad
 from tumble.export.lit_frames import LitFrame
 from tumble.maths import linear_from_srgb, to_srgb8
-from tumble.scene import Asset, Camera
+from tumble.scene import Camera
 
 TEXELS_PER_PIXEL = 2.0
 """Side of the solved texture, relative to that of the photographs: about four texels then lie in a pixel."""
@@ -80,7 +80,7 @@ def solved_base_color(
 ) -> UInt8[np.ndarray, "r r 3"]:
     """The sRGB base colour solved from photographs, started from and regularised towards `base_color`."""
     resolution = len(base_color)
-    side = min(resolution, _side(frames))
+    side = min(resolution, solved_side(frames[0].camera))
     texels = locate_texels(mesh, side)
     linear = linear_from_srgb(torch.from_numpy(base_color).float() / 255).numpy()
     at = (texels.rows.numpy(), texels.columns.numpy())
@@ -92,16 +92,22 @@ def solved_base_color(
     return to_srgb8(torch.from_numpy(linear + correction)).numpy()
 
 
-def aligned_surface(asset: Asset, mesh: UnwrappedMesh, frames: Sequence[LitFrame]) -> UnwrappedMesh:
+def aligned_surface(
+    mesh: UnwrappedMesh, base_color: UInt8[np.ndarray, "r r 3"], frames: Sequence[LitFrame]
+) -> UnwrappedMesh:
     """The mesh moved along its normals by the distance at which the photographs agree best on its texture.
 
     The mean depth of soft Gaussians lies behind the surface that they draw, by a quarter of a pixel of the photographs.
+
+    Args:
+        mesh: The surface of the Gaussians.
+        base_color: Its sRGB base colour, which may be coarse; it is solved at the same resolution.
+        frames: Photographs with their light.
     """
     few = frames[:: -(-len(frames) // OFFSET_FRAMES)]
-    side = _side(few)
-    texels = locate_texels(mesh, side)
-    color = bake(asset, mesh, resolution=side, views=OFFSET_FRAMES, pixels=side).base_color
-    baked = linear_from_srgb(torch.from_numpy(color[texels.rows.numpy(), texels.columns.numpy()]).float() / 255).numpy()
+    texels = locate_texels(mesh, len(base_color))
+    at = (texels.rows.numpy(), texels.columns.numpy())
+    baked = linear_from_srgb(torch.from_numpy(base_color[at]).float() / 255).numpy()
     distance = float(torch.stack([frame.T_cam_obj.xyz.norm() for frame in few]).median())
     pixel = distance / float(few[0].camera.fx_fy_cx_cy[0])
     losses = []
@@ -120,9 +126,8 @@ def _lowest(losses: Sequence[float]) -> float:
     return float(np.clip(-b / (2 * a), OFFSETS[0], OFFSETS[-1]))
 
 
-def _side(frames: Sequence[LitFrame]) -> int:
-    """Side of a texture with `TEXELS_PER_PIXEL` [texels]."""
-    camera = frames[0].camera
+def solved_side(camera: Camera) -> int:
+    """Side of the texture that photographs of a camera resolve [texels]."""
     return round(TEXELS_PER_PIXEL * max(camera.height, camera.width))
 
 
