@@ -30,6 +30,7 @@ from tumble.evaluation import (
     score,
 )
 from tumble.export import EXPORT_FILE, PresetName, write_asset
+from tumble.glb_scores import score_glb
 from tumble.io import BadFile, files, load_plugin, outputs, progress, tree, video
 from tumble.maths import SE3, to_srgb8
 from tumble.poses import mask_refinement
@@ -44,6 +45,8 @@ LIGHT_FILE = "relight.json"
 """File in a folder of relit images that records the environment map, and by which the folder is recognised."""
 SCORES = Path("runs/evaluate")
 """Folder of the scores of prediction folders."""
+GLB_SCORES = "glb"
+"""Folder of a run for the scores of its exported GLB."""
 MAX_RAYS = 1 << 16
 """Maximum number of rays per pixel."""
 MAX_EXPOSURE = 32
@@ -271,15 +274,41 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     Raises:
         BadFile: There is no finished run in `out`, or the capture has no ground truth.
     """
-    asset = finished(out, device)
-    known = read_with_truth(capture or run.capture_source(out))
+    asset, known = finished(out, device), read_with_truth(capture or run.capture_source(out))
+    names = source_names(out, known.capture)
+    return _scored(asset, known, _aligned(out, asset, known), names, where or out, _relighting(out))
+
+
+def evaluate_glb(
+    out: Path, glb: Path, capture: Path | None = None, where: Path | None = None, *, overwrite: bool = False
+) -> Report:
+    """Score an exported GLB of a run in a capture's evaluation views, path traced by Mitsuba (extra `synth`).
+
+    Args:
+        glb: `asset.glb` in a folder of `export_run`.
+        capture: Capture with ground truth. Default: the capture of the run.
+        where: Folder for `prediction/`, `report.json` and `sheet.png`. Default: `RUN/glb`.
+        overwrite: Write into `where` even if it holds something else than an earlier evaluation.
+
+    Raises:
+        BadFile: There is no finished run in `out`, the capture has no ground truth, the GLB cannot be read, or `where`
+            holds something else.
+        ModuleNotFoundError: Mitsuba is not installed.
+    """
+    asset, known = finished(out), read_with_truth(capture or run.capture_source(out))
+    where = where or out / GLB_SCORES
+    outputs.claim_folder(where, SHEET, overwrite=overwrite)
+    return score_glb(glb, asset, known, _aligned(out, asset, known), where)
+
+
+def _aligned(out: Path, asset: Asset, known: CaptureWithTruth) -> tuple[Any, str]:
+    """Result of `align_views` for a run's asset: a run with its own object frame is aligned."""
     names = source_names(out, known.capture)
     own_frame = (out / run.TRACK).is_dir() or (out / run.CAPTURE / PROVENANCE).is_file()
     given = known.capture.trajectory is not None and not own_frame
     lens = _focal_ratio(out, asset, known.capture)
     training = asset.trajectory, names, known.capture, known.truth
-    aligned = align_views(*training, known_poses=given, focal_ratio=lens)
-    return _scored(asset, known, aligned, names, where or out, _relighting(out))
+    return align_views(*training, known_poses=given, focal_ratio=lens)
 
 
 def _focal_ratio(out: Path, asset: Asset, capture: Capture) -> float:
