@@ -52,8 +52,11 @@ def glb_maps(model: ObjectModel, views: Sequence[SE3], camera: Camera) -> GlbMap
     unlit = pathtracer.unlit_scenes(model, None)
     found = [pathtracer.maps(unlit, view, camera, samples=MAP_SAMPLES) for view in views]
     mask = np.stack([view.coverage >= 0.5 for view in found])
-    parts = [np.stack([getattr(view, name) for view in found]) for name in ("albedo", "roughness", "normal")]
-    return GlbMaps(*(np.stack([_continued(*pair) for pair in zip(part, mask, strict=True)]) for part in parts), mask)
+
+    def continued(name: str) -> np.ndarray:
+        return np.stack([_continued(getattr(view, name), view.coverage >= 0.5) for view in found])
+
+    return GlbMaps(continued("albedo"), continued("roughness"), continued("normal"), mask)
 
 
 def glb_images(
