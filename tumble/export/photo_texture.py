@@ -223,6 +223,7 @@ def _flow(x: Float[np.ndarray, "h w 3"], y: Float[np.ndarray, "h w 3"]) -> Float
     height, width, _ = x.shape
     # At twice the size, because DIS compares patches of 8 x 8 pixels.
     grey = [cv2.cvtColor(to_srgb8(torch.from_numpy(image)).numpy(), cv2.COLOR_RGB2GRAY) for image in (x, y)]
-    large = [cv2.resize(image, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR) for image in grey]
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*large, np.zeros(0))
+    first, second = (cv2.resize(image, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR) for image in grey)
+    flow = np.zeros((2 * height, 2 * width, 2), np.float32)
+    cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, flow)
     return cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / 2

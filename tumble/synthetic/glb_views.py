@@ -93,6 +93,7 @@ def _continued(values: Float[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"]
     distance, label = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    source = np.zeros((int(np.max(label)) + 1, values.shape[2]), values.dtype)
-    source[np.asarray(label)[mask]] = values[mask]
+    label = np.asarray(label, np.int64)
+    source = np.zeros((label.max() + 1, values.shape[2]), values.dtype)
+    source[label[mask]] = values[mask]
     return np.where((distance <= REACH)[..., None], source[label], values)
