@@ -28,8 +28,8 @@ Used by all of these:
     maths, io           rotations, directions, spherical harmonics, images; files, video, safetensors, weights
 
 Files beside the rooms: `pipeline` (the stages in order), `recipes` (their settings), `actions` (relight, export,
-evaluate), `batch` (many runs, suites), `cli`, `demo`, `doctor`, `viewer` with `viewer_access`. `tests/test_guards.py`
-lists which room may import which.
+evaluate), `glb_scores`, `batch` (many runs, suites), `cli`, `demo`, `doctor`, `viewer` with `viewer_access`.
+`tests/test_guards.py` lists which room may import which.
 """
 
 from typing import TYPE_CHECKING

@@ -8,6 +8,7 @@ import hashlib
 import itertools
 import math
 import tempfile
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,19 +30,23 @@ from tumble.evaluation import (
     score,
 )
 from tumble.export import EXPORT_FILE, PresetName, write_asset
+from tumble.glb_scores import score_glb
 from tumble.io import BadFile, files, load_plugin, outputs, progress, tree, video
 from tumble.maths import SE3, to_srgb8
+from tumble.poses import mask_refinement
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
 from tumble.rendering import relight as relighting
-from tumble.report import write_report
+from tumble.report import frames_of_run, write_report
 from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "relight.json"
 """File in a folder of relit images that records the environment map, and by which the folder is recognised."""
 SCORES = Path("runs/evaluate")
 """Folder of the scores of prediction folders."""
+GLB_SCORES = "glb"
+"""Folder of a run for the scores of its exported GLB."""
 MAX_RAYS = 1 << 16
 """Maximum number of rays per pixel."""
 MAX_EXPOSURE = 32
@@ -101,6 +106,7 @@ def export_asset(
     *,
     names: list[str] | None = None,
     scale_mm: float | None = None,
+    capture: Capture | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Export an asset for other programs (docs/export.md): textured GLB, Gaussian PLYs, environment map, poses.
@@ -111,6 +117,8 @@ def export_asset(
         names: File names of the training frames. Default: their numbers.
         scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
             metres.
+        capture: The frames of the asset's trajectory. With them, the base colour of the mesh is solved from the
+            photographs; otherwise it is baked from the Gaussians alone.
         overwrite: Write into the folder even if it holds something else than an earlier export.
 
     Raises:
@@ -118,7 +126,7 @@ def export_asset(
     """
     outputs.claim_folder(Path(folder), EXPORT_FILE, overwrite=overwrite)
     names = names or [f"{number:04}.png" for number in range(len(asset.trajectory))]
-    write_asset(asset, names, Path(folder), preset, scale_mm)
+    write_asset(asset, names, Path(folder), preset, scale_mm, capture=capture)
     return Path(folder)
 
 
@@ -268,15 +276,41 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     Raises:
         BadFile: There is no finished run in `out`, or the capture has no ground truth.
     """
-    asset = finished(out, device)
-    known = read_with_truth(capture or run.capture_source(out))
+    asset, known = finished(out, device), read_with_truth(capture or run.capture_source(out))
+    names = source_names(out, known.capture)
+    return _scored(asset, known, _aligned(out, asset, known), names, where or out, _relighting(out))
+
+
+def evaluate_glb(
+    out: Path, glb: Path, capture: Path | None = None, where: Path | None = None, *, overwrite: bool = False
+) -> Report:
+    """Score an exported GLB of a run in a capture's evaluation views, path traced by Mitsuba (extra `synth`).
+
+    Args:
+        glb: `asset.glb` in a folder of `export_run`.
+        capture: Capture with ground truth. Default: the capture of the run.
+        where: Folder for `prediction/`, `report.json` and `sheet.png`. Default: `RUN/glb`.
+        overwrite: Write into `where` even if it holds something else than an earlier evaluation.
+
+    Raises:
+        BadFile: There is no finished run in `out`, the capture has no ground truth, the GLB cannot be read, or `where`
+            holds something else.
+        ModuleNotFoundError: Mitsuba is not installed.
+    """
+    asset, known = finished(out), read_with_truth(capture or run.capture_source(out))
+    where = where or out / GLB_SCORES
+    outputs.claim_folder(where, SHEET, overwrite=overwrite)
+    return score_glb(glb, asset, known, _aligned(out, asset, known), where)
+
+
+def _aligned(out: Path, asset: Asset, known: CaptureWithTruth) -> tuple[Any, str]:
+    """Result of `align_views` for a run's asset: a run with its own object frame is aligned."""
     names = source_names(out, known.capture)
     own_frame = (out / run.TRACK).is_dir() or (out / run.CAPTURE / PROVENANCE).is_file()
     given = known.capture.trajectory is not None and not own_frame
     lens = _focal_ratio(out, asset, known.capture)
     training = asset.trajectory, names, known.capture, known.truth
-    aligned = align_views(*training, known_poses=given, focal_ratio=lens)
-    return _scored(asset, known, aligned, names, where or out, _relighting(out))
+    return align_views(*training, known_poses=given, focal_ratio=lens)
 
 
 def _focal_ratio(out: Path, asset: Asset, capture: Capture) -> float:
@@ -410,6 +444,8 @@ def export_run(
 ) -> Path:
     """Export a run's object for other programs; returns the folder, by default `RUN/export/PRESET`.
 
+    Without the run's capture, which may have been moved since, the base colour is baked from the Gaussians alone.
+
     Raises:
         BadFile: There is no finished run in `out`, or `folder` holds something else than an export.
     """
@@ -418,7 +454,18 @@ def export_run(
     folder = folder or out / run.EXPORT / preset
     asset = finished(out, device)
     names = run.frame_names(out, len(asset.trajectory))
-    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, overwrite=overwrite)
+    capture = None if preset == "splat" else _capture_of_run(out, asset, names)
+    return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, capture=capture, overwrite=overwrite)
+
+
+def _capture_of_run(out: Path, asset: Asset, names: list[str]) -> Capture | None:
+    """The frames of a run's trajectory, with the masks of the run; None with a warning if the capture is gone."""
+    path = run.capture_source(out)
+    if not path.exists():
+        text = f"{path} is gone: the base colour is baked from the Gaussians, not solved from the photographs"
+        warnings.warn(text, stacklevel=3)
+        return None
+    return frames_of_run(mask_refinement.stored_result(out, pipeline.read_capture(path))[1], asset, names, path)
 
 
 def _relighting(out: Path) -> relighting.Config:

@@ -319,6 +319,7 @@ def evaluate(
     capture: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="")] = None,
     /,
     out: OptionalFolder = None,
+    glb: OptionalFile = None,
     overwrite: Overwrite = False,
     device: Device = "cpu",
 ) -> None:
@@ -329,11 +330,16 @@ def evaluate(
         capture: Capture with ground truth (docs/format.md). Default: the capture of the run.
         out: Folder for report.json, the contact sheet sheet.png and, for a run, its prediction/.
             Default: the run directory; for a prediction folder, which is not written to, runs/evaluate/NAME.
+        glb: Exported asset.glb of the run, to be scored beside it, path traced by Mitsuba; its report is in OUT/glb.
     """
-    from tumble.actions import evaluate_folder, score_folder
+    from tumble.actions import GLB_SCORES, evaluate_folder, evaluate_glb, score_folder
 
-    _print_scores(evaluate_folder(prediction, capture, out, overwrite=overwrite, device=device))
-    print((out or score_folder(prediction)) / "report.json")
+    folder, of_glb = out or score_folder(prediction), None
+    report = evaluate_folder(prediction, capture, out, overwrite=overwrite, device=device)
+    if glb is not None:
+        of_glb = evaluate_glb(prediction, glb, capture, folder / GLB_SCORES, overwrite=overwrite)
+    _print_scores(report, of_glb)
+    print(folder / "report.json")
 
 
 def bench(
@@ -496,8 +502,8 @@ def _print_finding(mark: str, subject: str, state: str, advice: str, *, width: i
         console.print(f"   {'':{width}} -> {_line(advice)}", markup=False, soft_wrap=True)
 
 
-def _print_scores(report: "Report") -> None:
-    """Print the scores of a report, one column per region, and its notes."""
+def _print_scores(report: "Report", of_glb: "Report | None" = None) -> None:
+    """Print the scores of a report, one column per region, beside those of the exported GLB, and its notes."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -507,7 +513,9 @@ def _print_scores(report: "Report") -> None:
 
     title = _line(f"{report['prediction']} on {report['capture']['name']}")
     table = Table(title=escape(title), title_justify="left")
-    regions = report["regions"]
+    regions = dict(report["regions"])
+    if of_glb is not None:
+        regions |= {f"{region}, GLB": scores for region, scores in of_glb["regions"].items()}
     for heading in ("metric", *regions):
         table.add_column(heading, justify="left" if heading == "metric" else "right")
     for key in dict.fromkeys(key for scores in regions.values() for key in scores):

@@ -4,17 +4,17 @@ All files use the object frame, which has +y up as in glTF (if the object has an
 the object's size is given, else the object radius.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from tumble import __version__
-from tumble.export import atlas, bake, confidence, gltf, mesh, ply
+from tumble.export import atlas, bake, confidence, gltf, lit_frames, mesh, photo_texture, ply
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
 from tumble.io import files, progress
-from tumble.scene import Asset
+from tumble.scene import Asset, Capture
 
 
 @dataclass(frozen=True)
@@ -45,23 +45,37 @@ EXPORT_FILE = "export.json"
 """Unit and settings of an exported folder, by which it is recognised; written first."""
 CONFIDENCE_FILE = "confidence.png"
 """Confidence of the material as a texture, beside the GLB and over the same UVs."""
+COARSE_VIEWS = 12
+"""Number of views of the coarse texture with which the surface is aligned."""
 SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
 """Settings of the mesh that is extracted only to measure the object's size."""
 
 
-def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, scale_mm: float | None = None) -> None:
+def write_asset(
+    asset: Asset,
+    names: list[str],
+    out: Path,
+    preset: PresetName,
+    scale_mm: float | None = None,
+    *,
+    capture: Capture | None = None,
+) -> None:
     """Write a folder: `asset.glb` and `confidence.png` (not for "splat"), both PLYs, `light.*`, `poses*`, `bop/`.
 
     Args:
         names: Names of the frames, in the order of the trajectory.
         scale_mm: Largest distance between two points of the object, measured with a ruler [mm].
+        capture: Frames of the trajectory, from which the base colour is solved; without it, it is baked from the
+            Gaussians alone.
 
     Raises:
         ValueError: A mesh is needed, but the Gaussians have no surface.
     """
     settings = PRESETS[preset]
     shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
-    metres = 1.0 if scale_mm is None or shape is None else scale_mm / 1000 / mesh.diameter(shape.vertices)
+    flat, textures = textured_mesh(asset, shape, settings, capture) if settings and shape else (None, None)
+    surface = flat or shape
+    metres = 1.0 if scale_mm is None or surface is None else scale_mm / 1000 / mesh.diameter(surface.vertices)
     facts = {
         "preset": preset,
         "metres_per_object_radius": metres,
@@ -72,8 +86,8 @@ def write_asset(asset: Asset, names: list[str], out: Path, preset: PresetName, s
         "tumble": __version__,
     }
     files.write_json(out / EXPORT_FILE, facts)
-    if settings and shape:
-        flat = write_textured_mesh(asset, shape, settings, metres, out / "asset.glb")
+    if flat and textures:
+        gltf.write_glb(out / "asset.glb", flat, textures, f0=float(asset.material.f0), metres=metres)
         with progress.task("confidence of the material"):
             score = confidence.confidence_of(asset, asset.camera).score
             texture = bake.nearest_gaussian_texture(score, asset, flat, resolution=512)
@@ -101,15 +115,33 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
         return mesh.simplify(mesh.smooth(whole), preset.triangles)
 
 
-def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> atlas.UnwrappedMesh:
-    """Unwrap the mesh, bake its textures, and write the GLB; returns the unwrapped mesh."""
+def textured_mesh(
+    asset: Asset, shape: Mesh, preset: Preset, capture: Capture | None = None
+) -> tuple[atlas.UnwrappedMesh, bake.Textures]:
+    """The unwrapped mesh and its textures; with a capture, both are fitted to its photographs (`photo_texture`)."""
     with progress.task("texture coordinates"):
         flat = atlas.unwrap(shape, preset.texture)
+    frames: list[lit_frames.LitFrame] = []
+    if capture is not None:
+        found = lit_frames.lit_frames(asset, capture)
+        frames = list(progress.track(found, "light of the photographs", lit_frames.count(capture)))
+        with progress.task("aligning the surface"):
+            side = photo_texture.solved_side(asset.camera)
+            coarse = bake.bake(asset, flat, resolution=side, views=COARSE_VIEWS, pixels=side)
+            flat = photo_texture.aligned_surface(flat, coarse.base_color, frames)
     with progress.task("baking textures"):
         textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
-    assert asset.material is not None, "the asset has no material"
+    if frames:
+        with progress.task("solving the albedo"):
+            color = photo_texture.solved_base_color(textures.base_color, flat, frames)
+        textures = replace(textures, base_color=color)
+    return flat, textures
+
+
+def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
+    """Unwrap the mesh, bake its textures, and write the GLB."""
+    flat, textures = textured_mesh(asset, shape, preset)
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
-    return flat
 
 
 def _write_light(asset: Asset, out: Path) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
@@ -127,7 +127,7 @@ def locate_texels(mesh: UnwrappedMesh, resolution: int) -> Texels:
     )
 
 
-def pad(image: UInt8[np.ndarray, "r r c"], covered: Bool[np.ndarray, "r r"]) -> UInt8[np.ndarray, "r r c"]:
+def pad(image: Shaped[np.ndarray, "r r c"], covered: Bool[np.ndarray, "r r"]) -> Shaped[np.ndarray, "r r c"]:
     """The texture with uncovered texels set to their nearest covered texel, so that filtering at seams is correct."""
     if not covered.any():
         return image
@@ -135,7 +135,7 @@ def pad(image: UInt8[np.ndarray, "r r c"], covered: Bool[np.ndarray, "r r"]) -> 
         (~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     label = np.asarray(label, np.int64)
-    source = np.zeros((label.max() + 1, image.shape[2]), np.uint8)
+    source = np.zeros((label.max() + 1, image.shape[2]), image.dtype)
     source[label[covered]] = image[covered]
     return source[label]
 

@@ -14,6 +14,7 @@ from tumble.rendering.shading import (
     Surface,
     shade,
     shade_split,
+    split_lobes,
     surface,
 )
 from tumble.rendering.trace import (
@@ -46,6 +47,7 @@ __all__ = [
     "render_gbuffer",
     "shade",
     "shade_split",
+    "split_lobes",
     "surface",
     "surface_points",
     "threads_for_kernels",

@@ -175,6 +175,20 @@ def shade_split(
     lobes (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the
     lobe (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
     """
+    diffuse, specular = split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce=bounce)
+    return albedo * diffuse + f0 * specular
+
+
+def split_lobes(
+    surface: Surface,
+    roughness: Float[Tensor, "p 1"],
+    prefiltered: Prefiltered,
+    R_env_obj: Float[Tensor, "3 3"],
+    visibility: Visibility,
+    *,
+    bounce: Bounce | AveragedBounce | None = None,
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
+    """Diffuse and specular radiance of `shade_split` for an albedo and a reflectance at normal incidence of 1."""
     # One lookup for both kinds of directions, since its gradient is an image of the size of all levels.
     mirrored = reflect(surface.views, surface.normals)
     in_env = torch.cat([visibility.directions, mirrored]) @ R_env_obj.mT
@@ -186,7 +200,7 @@ def shade_split(
         lobes.specular_visibility[:, None] * _reflectance(surface.normals, surface.views, roughness)
     )
     wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
-    return albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wideness)
+    return lobes.diffuse, torch.lerp(narrow, lobes.specular, wideness)
 
 
 def specular(

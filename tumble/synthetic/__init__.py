@@ -7,6 +7,7 @@ from tumble._lazy import lazy_getattr
 
 if TYPE_CHECKING:
     from tumble.synthetic.demo_object import room_environment, sunset_environment, write_pot
+    from tumble.synthetic.glb_views import glb_images, glb_maps, read_glb
     from tumble.synthetic.options import SynthOptions
     from tumble.synthetic.pathtracer import MIN_LLVM, find_llvm
     from tumble.synthetic.synthesize import SETTINGS_FILE, render_capture, render_captures
@@ -16,6 +17,9 @@ __all__ = [
     "SETTINGS_FILE",
     "SynthOptions",
     "find_llvm",
+    "glb_images",
+    "glb_maps",
+    "read_glb",
     "render_capture",
     "render_captures",
     "room_environment",
@@ -27,6 +31,7 @@ __getattr__ = lazy_getattr(
     __name__,
     {
         "demo_object": ("room_environment", "sunset_environment", "write_pot"),
+        "glb_views": ("glb_images", "glb_maps", "read_glb"),
         "options": ("SynthOptions",),
         "pathtracer": ("MIN_LLVM", "find_llvm"),
         "synthesize": ("SETTINGS_FILE", "render_capture", "render_captures"),

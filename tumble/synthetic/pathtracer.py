@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tumble.io import BadFile
 from tumble.maths import SE3, direction_from_equirect
-from tumble.scene import Camera, Environment
+from tumble.scene import DIELECTRIC, Camera, Environment
 from tumble.synthetic.glb import require_glb
 
 MIN_LLVM = 17
@@ -125,12 +125,8 @@ class ObjectModel:
         return {f"part_{i}": part for i, part in enumerate(self.parts)}
 
 
-def read_model(path: Path, up: str = "y") -> ObjectModel:
-    """Read a GLB with its base colour and roughness; metalness, normal maps and emission are ignored.
-
-    Args:
-        path: The GLB file.
-        up: Upward axis of the file, "y" (glTF) or "z" (scans).
+def read_parts(path: Path) -> tuple[Part, ...]:
+    """The meshes of a GLB with base colour and roughness, in the file's frame; other properties are ignored.
 
     Raises:
         BadFile: The file is missing, is not readable, or has no triangles or more than `MAX_TRIANGLES`.
@@ -148,6 +144,20 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
     n_triangles = sum(len(part.faces) for part in parts)
     if not 0 < n_triangles <= MAX_TRIANGLES:
         raise BadFile(path, f"has {n_triangles} triangles", f"1 to {MAX_TRIANGLES} can be rendered")
+    return tuple(parts)
+
+
+def read_model(path: Path, up: str = "y") -> ObjectModel:
+    """Read a GLB with its base colour and roughness; metalness, normal maps and emission are ignored.
+
+    Args:
+        path: The GLB file.
+        up: Upward axis of the file, "y" (glTF) or "z" (scans).
+
+    Raises:
+        BadFile: The file is missing, is not readable, or has no triangles or more than `MAX_TRIANGLES`.
+    """
+    parts = read_parts(path)
     R_obj_file = np.eye(3) if up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     vertices = np.concatenate([part.vertices for part in parts]) @ R_obj_file.T
     center = (vertices.min(0) + vertices.max(0)) / 2
@@ -240,13 +250,16 @@ class Maps:
     """Fraction of each pixel that the object covers."""
 
 
-def mitsuba_shapes(model: ObjectModel, shading: Shading, roughness: float | None) -> dict[str, Any]:
+def mitsuba_shapes(
+    model: ObjectModel, shading: Shading, roughness: float | None, f0: float = DIELECTRIC
+) -> dict[str, Any]:
     """The model's parts as Mitsuba shapes by name, which scenes with different lights can share.
 
     Args:
         model: The model.
-        shading: "original": a dielectric (F0 = 0.04) with the file's base colour and roughness; "diffuse": Lambertian.
+        shading: "original": a dielectric with the file's base colour and roughness; "diffuse": Lambertian.
         roughness: Constant roughness that replaces the file's; None keeps the file's.
+        f0: Reflectance at normal incidence.
     """
 
     def bsdf(part: Part) -> dict[str, Any]:
@@ -254,7 +267,8 @@ def mitsuba_shapes(model: ObjectModel, shading: Shading, roughness: float | None
             return {"type": "diffuse", "reflectance": _bitmap(part.albedo)}
         rough = _bitmap(part.roughness) if roughness is None else roughness
         # Mitsuba's "specular" 0.5 means a refractive index of 1.5, hence F0 = 0.04.
-        return {"type": "principled", "base_color": _bitmap(part.albedo), "roughness": rough, "specular": 0.5}
+        specular = f0 / DIELECTRIC / 2
+        return {"type": "principled", "base_color": _bitmap(part.albedo), "roughness": rough, "specular": specular}
 
     return {name: _mesh(part, bsdf(part)) for name, part in model.named_parts().items()}
 

@@ -1,0 +1,102 @@
+"""Photographs with the light of each pixel, as stage 3 found it: photograph = albedo * diffuse + specular.
+
+Light, normals, roughness and shadows are those of the Gaussians. Radiance is linear RGB.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb
+from tumble.rendering import (
+    Bounce,
+    build_tracer,
+    prefilter,
+    render_gbuffer,
+    split_lobes,
+    surface,
+    surface_points,
+    transfer,
+    visibility,
+)
+from tumble.scene import OBJECT, Asset, Camera, Capture
+
+MAX_FRAMES = 72
+"""Maximum number of photographs that are used, evenly spaced over the capture; time and memory are linear in it."""
+DIRECTIONS = 256
+"""Number of directions over which the light of a pixel is integrated."""
+BORDER = 2
+"""Distance to the contour of the mask, to its unknown pixels and to the Gaussians' contour up to which pixels are left
+out, since they show more than one surface [pixels]."""
+MIN_COVERAGE = 0.9
+"""Minimum coverage by the Gaussians of a pixel that is used."""
+SATURATED = 250
+"""Code value from which a channel may be clipped; such pixels are left out."""
+
+
+@dataclass(frozen=True)
+class LitFrame:
+    """One photograph, the light of its pixels, and its view."""
+
+    photo: Float[np.ndarray, "h w 3"]
+    """Linear radiance."""
+    usable: Bool[np.ndarray, "h w"]
+    """Pixels that show one surface of the object for certain, unsaturated."""
+    diffuse: Float[np.ndarray, "h w 3"]
+    """Radiance of a white surface without highlights."""
+    specular: Float[np.ndarray, "h w 3"]
+    """Radiance of the highlights."""
+    T_cam_obj: SE3
+    camera: Camera
+
+
+def usable_pixels(
+    photo: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], coverage: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Unsaturated pixels of the object, away from background, unknown pixels and the Gaussians' contour.
+
+    Args:
+        photo: Code values of the photograph.
+        mask: Mask of the capture.
+        coverage: Coverage by the Gaussians.
+    """
+    inside = ((mask == OBJECT) & (coverage > MIN_COVERAGE)).astype(np.uint8)
+    kernel = np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)
+    inner = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    return inner & (photo.max(-1) < SATURATED)
+
+
+def count(capture: Capture) -> int:
+    """Number of frames that `lit_frames` yields."""
+    return min(MAX_FRAMES, len(capture))
+
+
+@torch.no_grad()
+def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
+    """Up to `MAX_FRAMES` photographs with their light; the capture's frames are those of the asset's trajectory."""
+    frames = torch.linspace(0, len(capture) - 1, count(capture)).round().long().tolist()
+    gaussians, material, camera = asset.gaussians, asset.material, asset.camera
+    poses = [asset.trajectory.T_cam_obj[i] for i in frames]
+    light, directions = prefilter(asset.environment), fibonacci_sphere(DIRECTIONS).to(gaussians.means)
+    points = surface_points(gaussians, asset.gamma, poses, camera)
+    tracer = build_tracer(gaussians, asset.gamma)
+    traced = visibility(tracer, points, gaussians.normals, directions, blockers=True)
+    bounce = Bounce(material.albedo.mean(1), transfer([traced], gaussians.normals))
+    for i, T_cam_obj in zip(frames, poses, strict=True):
+        view = render_gbuffer(asset, T_cam_obj, camera)
+        code_values = capture.images[i].cpu().numpy()
+        usable = usable_pixels(code_values, capture.masks[i].cpu().numpy(), view.alpha.cpu().numpy())
+        pixels = torch.where(torch.from_numpy(usable).to(view.alpha.device).flatten())[0]
+        shown = surface(view, T_cam_obj, camera, pixels=pixels)
+        gaussian = view.dominant.flatten()[pixels].clamp_min(0).long()
+        rough = shown.sample(view.features["roughness"])
+        lobes = split_lobes(shown, rough, light, asset.trajectory.R_env_obj[i], traced.gather(gaussian), bounce=bounce)
+        diffuse, specular = (shown.paint(x, camera.height, camera.width).cpu().numpy() for x in lobes)
+        photo = linear_from_srgb(capture.images[i].float() / 255).cpu().numpy()
+        pose = SE3(T_cam_obj.wxyz.cpu(), T_cam_obj.xyz.cpu())
+        lens = Camera(camera.fx_fy_cx_cy.cpu(), camera.height, camera.width)
+        yield LitFrame(photo, usable, diffuse, float(material.f0) * specular, pose, lens)

@@ -1,0 +1,58 @@
+"""Scores of the exported GLB, rendered by the renderer and with the protocol of the ground truth (extra `synth`)."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tumble.evaluation import CaptureWithTruth, Prediction, Report, metrics, score
+from tumble.export import EXPORT_FILE
+from tumble.io import BadFile, files, progress
+from tumble.maths import to_srgb8
+from tumble.scene import Asset
+from tumble.synthetic import glb_images, glb_maps, read_glb
+
+SAMPLES = 64
+"""Samples per pixel of relit images."""
+
+
+@torch.no_grad()
+def score_glb(glb: Path, asset: Asset, known: CaptureWithTruth, aligned: tuple[Any, str], out: Path) -> Report:
+    """Score a GLB of `tumble export` in a capture's evaluation views, and write prediction and scores into `out`.
+
+    Normals are those of the mesh without its normal map.
+
+    Args:
+        glb: The file, beside its `export.json`.
+        asset: The asset that was exported.
+        aligned: Result of `align_views`.
+
+    Raises:
+        BadFile: The file or its `export.json` is missing or broken, or the capture has no evaluation views.
+        ModuleNotFoundError: The extra `synth` is not installed.
+    """
+    (alignment, words), truth, camera = aligned, known.truth, known.capture.camera
+    if alignment is None or truth.trajectory is None or truth.albedo is None:
+        raise BadFile(known.path, "has no evaluation views in which a GLB could be scored")
+    model = read_glb(glb, float(files.read_json(glb.parent / EXPORT_FILE, dict[str, Any])["metres_per_object_radius"]))
+    poses = alignment.to_prediction(truth.trajectory).T_cam_obj
+    views = [poses[i] for i in range(len(truth))]
+    with progress.task("maps of the GLB"):
+        maps = glb_maps(model, views, camera)
+    R_true_pred = alignment.R_true_pred
+    albedo = torch.from_numpy(maps.albedo)
+    scale = metrics.albedo_scale(albedo, truth.albedo, truth.foreground)
+    relit = {}
+    for name, light in progress.track(truth.lights.items(), "path tracing the GLB", len(truth.lights)):
+        turned = light.rotated(R_true_pred.inverse().matrix())
+        options = {"albedo_scale": scale.numpy(), "f0": float(asset.material.f0), "samples": SAMPLES}
+        relit[name] = to_srgb8(torch.from_numpy(glb_images(model, views, camera, turned, **options)))
+    prediction = Prediction(
+        albedo=albedo,
+        normals=R_true_pred @ torch.from_numpy(maps.normal),
+        roughness=torch.from_numpy(maps.roughness[..., 0]),
+        masks=torch.from_numpy(maps.mask),
+        relit=relit,
+    )
+    prediction.write(out / "prediction")
+    return score(out / "prediction", known, out, notes=[words])
