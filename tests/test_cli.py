@@ -117,7 +117,7 @@ def test_what_is_printed_of_names_is_one_line_without_markup(capsys: pytest.Capt
     """Of predictions, captures, lights and videos of somebody else."""
     name = "a [/red] \x1b[2J\n"
     cli._print_finding("!", "video", name, name, width=10)
-    scores = {"regions": {"shared": {name: 1.0}}, "light": {}, "poses": {}, "notes": [name]}
+    scores = {"regions": {"shared": {name: 1.0}}, "light": {}, "poses": {}, "published": {}, "notes": [name]}
     cli._print_scores({"prediction": name, "capture": {"name": name}, **scores})  # type: ignore[arg-type]
     printed = capsys.readouterr().out
     assert printed.count(r"a [/red] \x1b[2J\n") >= 5

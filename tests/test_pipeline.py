@@ -383,8 +383,9 @@ def test_a_finished_run_is_recoloured_by_a_known_white(
     # The known white has a standard deviation of 0.03, and other cues pull at it with theirs.
     torch.testing.assert_close(middle, middle.mean().expand(3), rtol=0.05, atol=0)
     estimates = [r for r in runs.log_records(out) if r.get("event") == "colour"]
-    assert [r["white"] for r in estimates] == [False, True]
-    assert max(estimates[1]["deviation"]) < max(estimates[0]["deviation"])
+    before, after = estimates[-2:]
+    assert [before["white"], after["white"]] == [False, True]
+    assert max(after["deviation"]) < max(before["deviation"])
     assert_same(pipeline.reconstruct(capture, out, RECIPE), finished[1])
 
 
