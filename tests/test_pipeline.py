@@ -389,6 +389,26 @@ def test_a_finished_run_is_recoloured_by_a_known_white(
     assert_same(pipeline.reconstruct(capture, out, RECIPE), finished[1])
 
 
+def test_an_exported_glb_is_scored_like_its_run(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mitsuba")
+    pytest.importorskip("xatlas")
+    small = Preset(triangles=400, texture=64, cells=32, views=8, pixels=64)
+    monkeypatch.setitem(export.PRESETS, "web", small)
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    glb = actions.export_run(out, None, "web", None) / "asset.glb"
+    scores = actions.evaluate_glb(out, glb, capture)["regions"]["shared"]
+    assert {"albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "silhouette.iou"} <= set(scores)
+    shifted = tmp_path / "shifted"
+    shutil.copytree(capture, shifted)
+    document = files.read_json(shifted / folder.TRANSFORMS)
+    files.write_json(shifted / folder.TRANSFORMS, document | {"cx": document["cx"] + 2})
+    with pytest.raises(BadFile, match="shifted: has a camera with an uncentred principal point"):
+        actions.evaluate_glb(out, glb, shifted)
+
+
 @pytest.mark.parametrize(
     ("white", "rule"),
     [((3, 3, "9999.png"), "no such frame"), ((32, 3, "0.png"), "outside"), ((0, 0, "0.png"), "too dark")],
