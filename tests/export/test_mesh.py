@@ -126,6 +126,17 @@ def test_a_side_without_gaussians_is_closed() -> None:
     np.testing.assert_allclose(radii, 0.8, atol=CELL)
 
 
+def test_small_holes_do_not_let_the_outside_in() -> None:
+    """Four holes of half angle 0.3, through which few views look in or through; all of them made an inner surface."""
+    whole = sphere(3000, radius=0.8)
+    kept = (whole.means[:, :2].abs() < 0.8 * math.cos(0.3)).all(-1)
+    pierced = Gaussians(**{name: values[kept] for name, values in vars(whole).items()})
+    values = depth_fusion.signed_distances(pierced, GAMMA, cells=CELLS, views=100, pixels=128)
+    shape = mesh.remove_floaters(mesh.marching_tetrahedra(values, -depth_fusion.HALF_SIDE, CELL))
+    assert volume(shape) == pytest.approx(4 / 3 * math.pi * 0.8**3, rel=0.02)
+    assert area(shape) < 1.1 * 4 * math.pi * 0.8**2
+
+
 def test_a_thin_plate_keeps_both_sides() -> None:
     """A disc of radius 0.7, three cells thick, thinner than the band in which distances are averaged."""
     half = 1.5 * CELL

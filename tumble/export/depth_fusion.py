@@ -22,6 +22,9 @@ TRUNCATION = 4
 FREE_FRACTION = 0.15
 """Fraction of the views that must show free space at a point before the negative distances of all other views are
 ignored: otherwise views from one side thicken thin walls on the other."""
+MIN_FREE_FRACTION = 0.05
+"""Fraction of the views, and at least two, that must show free space at a point far from the surface for it to be
+outside. Fewer look in through holes that are left where no frame shows the object, and see an inner surface."""
 CAMERA_DISTANCE = 6.0
 """Distance of the cameras from the centre [object radius]."""
 HALF_SIDE = 1.08
@@ -48,7 +51,7 @@ def signed_distances(
     """Values at the corners of a grid of `cells`^3 over [-HALF_SIDE, HALF_SIDE]^3, from depth maps of `views` cameras.
 
     Near the surface a value is the weighted mean of the distances to the planes given by the views' depths and normals.
-    Elsewhere, points in the free space of two views or more are outside, all others inside.
+    Elsewhere, points in the free space of enough views (`MIN_FREE_FRACTION`) are outside, all others inside.
 
     Args:
         gamma: Sharpness of the opacity [1 / object radius].
@@ -158,7 +161,7 @@ def _fuse(
         outer_weights.index_add_(0, index, weight * (distance > 0))
     free = n_free > FREE_FRACTION * len(maps)
     total, weights = torch.where(free, outer, total), torch.where(free, outer_weights, weights)
-    far = torch.where(n_free >= 2, float(TRUNCATION), -float(TRUNCATION))
+    far = torch.where(n_free >= max(2, MIN_FREE_FRACTION * len(maps)), float(TRUNCATION), -float(TRUNCATION))
     return torch.where(weights > 0.1, total / weights.clamp(min=0.1), far)
 
 
