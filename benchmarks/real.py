@@ -140,7 +140,7 @@ def measure(name: str, path: Path, run: Path) -> Row:
         "result": rating[1],
         "sentence": rating[2],
         "frames": f"{len(poses)} of {len(files.read_json(capture)['frames']) if capture.exists() else len(poses)}",
-        "degrees": float(named[1]) if named else None,
+        "degrees": float(named[1]) if named else "",
         "seconds": round(sum(record.get("seconds", 0) for record in records if record.get("event") == "done")),
     }
 
