@@ -21,6 +21,7 @@ import torch
 import tumble
 from benchmarks.kernels import machine
 from benchmarks.poses import line, pose_scores
+from tumble.bench import current_code
 from tumble.io import files
 from tumble.preprocess import FootageOptions, Survey, survey_footage
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Trajectory
@@ -43,6 +44,7 @@ SCORES = {
     "claimed_degrees": "estimated [deg]",
     "verdict": "rating",
     "pose_seconds": "poses [s]",
+    "code": "code",
 }
 """Column titles by the key of a row."""
 
@@ -88,6 +90,7 @@ def measure(path: Path, until: str, draw: Path | None) -> Row:
     started = time.perf_counter()
     survey = survey_footage(path / "film.mp4", options)
     row: Row = {"name": path.name, **mask_scores(survey, path), "survey_seconds": round(time.perf_counter() - started)}
+    row["code"] = current_code()["commit"]
     if draw:
         draw.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(draw / f"{path.name}.png"), contact_sheet(survey, path)[..., ::-1])

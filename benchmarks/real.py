@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.kernels import machine
 from benchmarks.poses import line
+from tumble.bench import current_code
 from tumble.datasets import reader_for, save_capture
 from tumble.io import files, video
 from tumble.scene import BACKGROUND, OBJECT, Camera, Capture, Trajectory, Truth
@@ -71,6 +72,7 @@ TITLES = {
     "asset_to_scan": "asset to scan, median [% of diameter]",
     "scan_to_asset": "scan to asset, median",
     "seconds": "time of the stages [s]",
+    "code": "code",
 }
 """Column titles by the key of a row."""
 CAMERAS = "cameras_sphere.npz"
@@ -115,9 +117,8 @@ def report(rows: list[Row]) -> str:
     sentences = "\n".join(f"- {row['name']}: {row['sentence']}" for row in rows)
     return (
         f"# Films of real objects\n\n`{COMMAND} [--scan NAME=GLB...]`. Rotation errors and distances are against scans "
-        "of the objects (see the docstring of the script).\n\n"
-        + "\n".join(lines)
-        + f"\n\nWhat the program said:\n\n{sentences}\n\nInputs:\n\n{about}\n"
+        "of the objects (see the docstring of the script). Times are on one thread of a 2-core x86_64 CPU that other "
+        "work shared.\n\n" + "\n".join(lines) + f"\n\nWhat the program said:\n\n{sentences}\n\nInputs:\n\n{about}\n"
     )
 
 
@@ -126,8 +127,9 @@ def measure(name: str, path: Path, run: Path) -> Row:
     source = static_capture(path, run.parent / f"{name}-capture") if (path / CAMERAS).exists() else path
     command = [sys.executable, "-m", "tumble", "run", str(source), *INPUTS[name].options.split(), "-o", str(run)]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
+    code = current_code()["commit"]
     if done.returncode:
-        return {"name": name, "result": "NO-GO", "sentence": done.stderr.strip().splitlines()[-1]}
+        return {"name": name, "result": "NO-GO", "sentence": done.stderr.strip().splitlines()[-1], "code": code}
     capture = run / "capture" / "transforms.json"
     poses = files.read_json(run / "poses.json")
     page = (run / "report.html").read_text()
@@ -141,6 +143,7 @@ def measure(name: str, path: Path, run: Path) -> Row:
         "sentence": rating[2],
         "frames": f"{len(poses)} of {len(files.read_json(capture)['frames']) if capture.exists() else len(poses)}",
         "degrees": float(named[1]) if named else "",
+        "code": code,
         "seconds": round(sum(record.get("seconds", 0) for record in records if record.get("event") == "done")),
     }
 
@@ -151,15 +154,17 @@ def static_capture(path: Path, out: Path) -> Path:
     The cameras may be those of larger photographs: the factor is the whole number that brings the principal point
     nearest to the centre.
     """
+    if out.exists():
+        return out
     cameras = np.load(path / CAMERAS)
     images, masks = (sorted((path / name).iterdir()) for name in ("image", "mask"))
+    original = files.image_size(images[0])[1]
     pixels = np.stack([shrunk(files.read_image(each)) for each in images])
     inside = np.stack([shrunk(files.read_image(each)[..., 0]) for each in masks]) > 127
     _, height, width, _ = pixels.shape
     lenses, T_obj_gl = [], []
     for i in range(len(images)):
         K, R, x, *_ = cv2.decomposeProjectionMatrix((cameras[f"world_mat_{i}"] @ cameras[f"scale_mat_{i}"])[:3])
-        original = files.image_size(images[i])[1]
         scale = WIDTH / (original * round(float(K[0, 2] / K[2, 2] / (original / 2))))
         lenses.append((np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) / K[2, 2] + [0, 0, 0.5, 0.5]) * scale)
         matrix = np.eye(4)
@@ -174,8 +179,7 @@ def static_capture(path: Path, out: Path) -> Path:
         "object",
         trajectory,
     )
-    if not out.exists():
-        save_capture(out, capture)
+    save_capture(out, capture)
     return out
 
 
