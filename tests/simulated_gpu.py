@@ -20,9 +20,12 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
+import tumble
 from tumble import backends
 from tumble.backends import cuda
 
+PACKAGE = f"{Path(tumble.__file__).parent}{os.sep}"
+"""Folder of the package; a checkout may be called `tumble`, too, with the tests in it."""
 DEVICE = torch.device("meta")
 """The simulated device."""
 WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_consecutive", "unique_dim"}
@@ -108,7 +111,7 @@ class SimulatedGpu(TorchDispatchMode):
 def _caller() -> str:
     """File and function of the package that called torch."""
     frame: Any = sys._getframe(1)
-    while frame is not None and f"{os.sep}tumble{os.sep}" not in frame.f_code.co_filename:
+    while frame is not None and not frame.f_code.co_filename.startswith(PACKAGE):
         frame = frame.f_back
     return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} {frame.f_code.co_name}" if frame else "a test"
 
