@@ -92,6 +92,18 @@ def test_highlights_make_the_estimate_more_certain_and_darker_objects_more_so() 
     assert none.deviation.mean() > some.deviation.mean() > dark.deviation.mean()
 
 
+def test_a_light_object_under_a_directional_light_stays_light() -> None:
+    """Typical lightness would darken it by half; the scale of stage 3 counts the more, the more shading varies."""
+    rng, white = torch.Generator().manual_seed(0), torch.full((4000, 3), 0.5)
+    sunny, cloudy = (
+        ShadedPixels(white, shade.expand(-1, 3), 1e-4 * shade.expand(-1, 3))
+        for shade in (torch.rand(4000, 1, generator=rng), 0.9 + 0.2 * torch.rand(4000, 1, generator=rng))
+    )
+    kept, darkened = (float(absolute_colour.estimate(x, 0.024).log_factor.mean()) for x in (sunny, cloudy))
+    assert -0.15 < kept < 0
+    assert darkened < -0.4
+
+
 def test_of_an_object_that_no_frame_shows_nothing_is_changed() -> None:
     empty = torch.zeros(0, 3)
     found = absolute_colour.estimate(ShadedPixels(empty, empty, empty), DIELECTRIC)

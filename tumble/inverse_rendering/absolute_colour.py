@@ -6,8 +6,8 @@ A factor exp(g) on the albedo, with exp(-g) on the light, changes no picture of 
 logarithm, one value per channel) is the maximum a posteriori estimate from independent cues with Gaussian errors:
 
 - *neutral light*: a camera's white balance makes the light neutral that falls on the visible surface, on average;
-- *highlights*: with F0 = 0.04 the specular lobe gives the light's absolute radiance, more reliably the darker the
-  diffuse lobe is;
+- *highlights*: the specular lobe, whose scale is known, has set the scale of stage 3, more reliably the stronger the
+  lobe and the more directional the light;
 - *white paint*: the brightest parts of most objects with print are neutral (white-patch assumption);
 - *lightness*: objects have a typical mean reflectance, and no paint reflects more than nine tenths;
 - *known white*: the user names a pixel that shows a neutral colour.
@@ -34,15 +34,12 @@ DIRECTIONS = 256
 """Number of directions over which light is integrated."""
 NEUTRAL_SD = 0.15
 """Standard deviation of the light's colour from neutral after a camera's white balance [log radiance]."""
-HIGHLIGHT_BIAS = -0.08
-"""Mean error of the highlights' brightness: logarithm of the specular scale that fits frames best under the true light
-(docs/method.md)."""
 SHADING_ERROR = 0.1
-"""Relative error of the diffuse lobe that may look like a specular lobe: what the error of a highlight scales with."""
+"""Relative error of the diffuse lobe that may look like a specular lobe: what the error of a highlight's colour scales
+with."""
 HIGHLIGHT_SD = 0.1
-"""Standard deviation of the highlights' brightness, the same in all channels, under diffuse light of contrast 1; it is
-inversely proportional to this contrast (standard deviation over mean), since a flat light hardly separates the lobes
-[log radiance]."""
+"""Standard deviation of the brightness of stage 3 under diffuse light of contrast 1; it is inversely proportional to
+this contrast (standard deviation over mean), since a flat light hardly separates the lobes [log radiance]."""
 WHITE_QUANTILE = 0.99
 """Quantile of the albedo per channel that counts as the object's brightest paint."""
 WHITE_SD = 0.2
@@ -136,10 +133,10 @@ def estimate(pixels: ShadedPixels, f0: float, known_white: Float[Tensor, "3"] | 
     ratio = (albedo * pixels.diffuse).mean(0) / highlights.clamp_min(1e-6)
     contrast = pixels.diffuse.mean(-1).std() / pixels.diffuse.mean()
     grey = HIGHLIGHT_SD / contrast.clamp_min(0.01)
-    of_highlights = torch.linalg.inv((SHADING_ERROR * ratio).square().diag() + grey**2 * ones)
+    hue = colour @ (SHADING_ERROR * ratio).square().reciprocal().diag() @ colour
     fixed = [
         (colour / NEUTRAL_SD**2, light),
-        (of_highlights, torch.full_like(light, math.log(DIELECTRIC / f0) + HIGHLIGHT_BIAS)),
+        (hue + ones / (3 * grey) ** 2, torch.zeros_like(light)),
         (ones / (3 * MEAN_ALBEDO_SD) ** 2, (math.log(MEAN_ALBEDO) - lightness).expand(3)),
     ]
     if known_white is not None:
