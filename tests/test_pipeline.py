@@ -401,12 +401,12 @@ def test_an_exported_glb_is_scored_like_its_run(
     glb = actions.export_run(out, None, "web", None) / "asset.glb"
     scores = actions.evaluate_glb(out, glb, capture)["regions"]["shared"]
     assert {"albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "silhouette.iou"} <= set(scores)
-    shifted = tmp_path / "shifted"
-    shutil.copytree(capture, shifted)
-    document = files.read_json(shifted / folder.TRANSFORMS)
-    files.write_json(shifted / folder.TRANSFORMS, document | {"cx": document["cx"] + 2})
-    with pytest.raises(BadFile, match="shifted: has a camera with an uncentred principal point"):
-        actions.evaluate_glb(out, glb, shifted)
+    stretched = tmp_path / "stretched"
+    shutil.copytree(capture, stretched)
+    document = files.read_json(stretched / folder.TRANSFORMS)
+    files.write_json(stretched / folder.TRANSFORMS, document | {"fl_y": document["fl_x"] + 1})
+    with pytest.raises(BadFile, match="stretched: has pixels that are not square"):
+        actions.evaluate_glb(out, glb, stretched)
 
 
 @pytest.mark.parametrize(

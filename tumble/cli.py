@@ -333,7 +333,10 @@ def evaluate(
         glb: Exported asset.glb of the run, to be scored beside it, path traced by Mitsuba; its report is in OUT/glb.
     """
     from tumble.actions import GLB_SCORES, evaluate_folder, evaluate_glb, score_folder
+    from tumble.io import BadFile
 
+    if glb is not None and not glb.is_file():
+        raise BadFile(glb, "is missing", "make it by `tumble export`")
     folder, of_glb = out or score_folder(prediction), None
     report = evaluate_folder(prediction, capture, out, overwrite=overwrite, device=device)
     if glb is not None:

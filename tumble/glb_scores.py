@@ -14,8 +14,8 @@ from tumble.synthetic import glb_images, glb_maps, read_glb
 
 SAMPLES = 64
 """Samples per pixel of relit images."""
-MAX_ASYMMETRY = 1e-3
-"""Maximum distance of the principal point from the centre, and difference of the focal lengths [pixels]."""
+MAX_STRETCH = 1e-3
+"""Maximum difference of the focal lengths in x and y [pixels]."""
 
 
 @torch.no_grad()
@@ -30,17 +30,18 @@ def score_glb(glb: Path, asset: Asset, known: CaptureWithTruth, aligned: tuple[A
         aligned: Result of `align_views`.
 
     Raises:
-        BadFile: The file or its `export.json` is missing or broken, or the capture has no evaluation views or a camera
-            that is not symmetric.
+        BadFile: The file or its `export.json` is missing or broken, or the capture has no evaluation views or
+            pixels that are not square.
         ModuleNotFoundError: The extra `synth` is not installed.
     """
     (alignment, words), truth, camera = aligned, known.truth, known.capture.camera
     if alignment is None or truth.trajectory is None or truth.albedo is None:
         raise BadFile(known.path, "has no evaluation views in which a GLB could be scored")
-    fx, fy, cx, cy = camera.fx_fy_cx_cy.tolist()
-    if abs(fx - fy) + abs(cx - camera.width / 2) + abs(cy - camera.height / 2) > MAX_ASYMMETRY:
-        rule = "has a camera with an uncentred principal point or with pixels that are not square"
-        raise BadFile(known.path, rule, "leave out --glb: GLBs are rendered with centred cameras only")
+    fx, fy = camera.fx_fy_cx_cy[:2].tolist()
+    if abs(fx - fy) > MAX_STRETCH:
+        raise BadFile(
+            known.path, "has pixels that are not square", "leave out --glb: Mitsuba's camera has square pixels"
+        )
     model = read_glb(glb, float(files.read_json(glb.parent / EXPORT_FILE, dict[str, Any])["metres_per_object_radius"]))
     poses = alignment.to_prediction(truth.trajectory).T_cam_obj
     views = [poses[i] for i in range(len(truth))]

@@ -66,3 +66,14 @@ def test_maps_and_images_of_an_exported_glb(glb: Path) -> None:
     albedo = maps.albedo[0, 20, 17, 0]
     assert bright - dim == pytest.approx(0.5 * albedo, rel=0.05)
     assert 0 < bright - albedo < 0.06
+
+
+def test_the_principal_point_may_be_off_the_centre(glb: Path) -> None:
+    """As in a capture that is cut out of larger frames: the square is 5 pixels further right and 8 further up."""
+    from tumble.synthetic import glb_maps, read_glb
+
+    pose = SE3(SO3.exp(torch.tensor([math.pi, 0.0, 0.0])).wxyz, torch.tensor([0.0, 0.0, 4.0]))
+    maps = glb_maps(read_glb(glb, RADIUS), [pose], Camera(torch.tensor([40.0, 40.0, 25.0, 12.0]), 40, 40))
+    expected = np.zeros((40, 40), bool)
+    expected[7:17, 20:30] = True
+    assert (maps.mask[0] == expected).all()

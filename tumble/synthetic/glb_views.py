@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 
 from tumble.maths import SE3
 from tumble.scene import Camera, Environment
@@ -90,10 +91,6 @@ def _continued(values: Float[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"]
     """The map with pixels near the mask set to their nearest pixel in it."""
     if not mask.any():
         return values
-    distance, label = cv2.distanceTransformWithLabels(
-        (~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    label = np.asarray(label, np.int64)
-    source = np.zeros((label.max() + 1, values.shape[2]), values.dtype)
-    source[label[mask]] = values[mask]
-    return np.where((distance <= REACH)[..., None], source[label], values)
+    found: Any = distance_transform_edt(~mask, return_indices=True)
+    distance, nearest = found
+    return np.where((distance <= REACH)[..., None], values[tuple(nearest)], values)

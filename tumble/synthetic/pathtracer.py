@@ -422,8 +422,7 @@ def _envmap(light: Environment) -> Float[np.ndarray, "rows columns 3"]:
 def _sensor(T_cam_obj: SE3, camera: Camera) -> Any:
     mi = mitsuba()
     fx, fy, cx, cy = camera.fx_fy_cx_cy.tolist()
-    centered = abs(cx - camera.width / 2) + abs(cy - camera.height / 2) + abs(fx - fy) < 1e-3
-    assert centered, "synthetic captures need a camera with square pixels and a centred principal point"
+    assert abs(fx - fy) < 1e-3, "Mitsuba's perspective camera has square pixels"
     # Mitsuba's camera looks along +z like OpenCV's, but with x to the left and y up.
     T_obj_cam = T_cam_obj.inverse().matrix().double().numpy() @ np.diag([-1.0, -1.0, 1.0, 1.0])
     film = {
@@ -438,6 +437,8 @@ def _sensor(T_cam_obj: SE3, camera: Camera) -> Any:
             "type": "perspective",
             "fov_axis": "x",
             "fov": float(np.degrees(camera.fov_x)),
+            "principal_point_offset_x": 0.5 - cx / camera.width,
+            "principal_point_offset_y": 0.5 - cy / camera.height,
             "near_clip": 1e-2,
             "to_world": mi.ScalarTransform4f(T_obj_cam),
             "film": film,
