@@ -199,8 +199,8 @@ def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
     """
     if hidden:
         return [*map(Step, (AverageRotations(), JoinSegments(), *map(AdjustAll, cfg.relocalized_scales)))]
-    keep, relocalization = KeepBest(cfg.global_scales[-1]), [Relocalize(RELOCALIZATION_SCALE)]
-    relocalization += map(AdjustAll, cfg.relocalized_scales)
+    keep = KeepBest(cfg.global_scales[-1])
+    relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
     steps: list[Step] = []
     for attempt, sizes in enumerate((cfg.window_sizes, *(fallback.window_sizes for fallback in cfg.fallbacks))):
         phases = [AverageRotations(), *map(AdjustWindows, sizes), *map(AdjustAll, cfg.global_scales)]
