@@ -239,7 +239,10 @@ def angle_between(a: SO3, b: SO3) -> Float[Tensor, "*b"]:
 
 
 def mean_rotation(rotations: SO3, weights: Float[Tensor, " n"] | None = None) -> SO3:
-    """Chordal mean of a batch `[n]`: the rotation with the least (weighted) sum of squared matrix differences."""
+    """Chordal mean of a batch `[n]`: the rotation with the least (weighted) sum of squared matrix differences.
+
+    Without weights a batch `[n *b]` gives the means `[*b]`.
+    """
     matrices = rotations.matrix()
     U, _, Vh = torch.linalg.svd((matrices if weights is None else weights[:, None, None] * matrices).mean(0))
     return SO3.from_matrix(_proper(U, Vh))
@@ -308,10 +311,10 @@ def _quaternion_product(p: Tensor, q: Tensor) -> Tensor:
     return torch.stack(product, -1)
 
 
-def _proper(U: Tensor, Vh: Tensor) -> Float[Tensor, "3 3"]:
+def _proper(U: Tensor, Vh: Tensor) -> Float[Tensor, "*b 3 3"]:
     """U Vh as a rotation: the last singular direction is negated where U Vh would be a reflection."""
-    sign = torch.linalg.det(U @ Vh).sign()
-    return torch.cat([U[:, :2], U[:, 2:] * sign], -1) @ Vh
+    sign = torch.linalg.det(U @ Vh).sign()[..., None, None]
+    return torch.cat([U[..., :2], U[..., 2:] * sign], -1) @ Vh
 
 
 def _broadcast(wxyz: Tensor, xyz: Tensor) -> SE3:

@@ -1,5 +1,6 @@
 """Stage 1 by structure from motion, on a tumbling ellipsoid with noisy and partly wrong matches."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +10,10 @@ import torch
 from tests.lopsided import Tumble, truth, tumbling
 from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
+from tumble.maths import SO3
 from tumble.poses.result import PoseResult
 from tumble.poses.sfm import stage
+from tumble.poses.sfm.adjustment import deviation
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
 
@@ -106,6 +109,27 @@ def test_a_capture_that_has_not_converged_is_attempted_again_and_the_best_result
     cfg = replace(cfg, converged_loss=float("inf"))
     state.step = stage.schedule(cfg).index(stage.Step(stage.AverageRotations(), 1))
     assert stage.step(cfg, inputs, state) == {}
+
+
+def test_an_attempt_is_mended_before_it_is_compared_unless_it_has_converged(scene: Tumble) -> None:
+    """A frame turned by 20 degrees costs more than the others and is relocalized; a good capture is left alone."""
+    cfg = replace(QUICK, fallbacks=(), relocalizations=1, relocalized_scales=(0.5,), converged_loss=0.0)
+    steps = stage.schedule(cfg)
+    mending = [k for k, now in enumerate(steps) if now.mends]
+    assert [type(steps[k].phase) for k in mending] == [stage.Relocalize, stage.AdjustAll, stage.KeepBest]
+    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
+    for state.step in range(mending[0] - 1):
+        stage.step(cfg, inputs, state)
+    R = state.params.R.clone()
+    R[10] = SO3.exp(torch.tensor([0.35, 0.0, 0.0], dtype=torch.float64)).matrix() @ R[10]
+    state.params = replace(state.params, R=R)
+    converged = replace(cfg, converged_loss=float("inf"))
+    for state.step in range(mending[0] - 1, mending[-1] + 1):
+        assert state.step not in mending or stage.step(converged, inputs, state) == {}
+        stage.step(cfg, inputs, state)
+    true_R = truth(scene).T_cam_obj.rotation.matrix().double()
+    assert float(deviation(state.params.R, true_R)[10]) < math.radians(3)
 
 
 def test_no_object_is_an_error(scene: Tumble) -> None:

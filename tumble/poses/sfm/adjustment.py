@@ -1,5 +1,6 @@
 """Rounds of bundle adjustment, of windows of frames or of all, with frontier points found anew in every round."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -7,11 +8,18 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from tumble.maths import SO3, angle_between, mean_rotation
 from tumble.poses.sfm import bundle_adjustment, frontier_points
 from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
 from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres
 from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.tracks import Tracks, concatenate
+
+CONTRADICTION_COST = 3.0
+"""Cost of two neighbouring windows of which one shows the mirror image of the other's motion [logarithm of the loss].
+As a motion does not reverse its depth from one frame to the next, it is more than what wrong windows gain in loss."""
+SMALL_DEVIATION = math.radians(15)
+"""Mean angle up to which rotations of neighbouring windows differ by their noise alone [radians]."""
 
 
 @runtime_checkable
@@ -50,6 +58,41 @@ class Windows:
     def best(self) -> Float[Tensor, "g f 3 3"]:
         """The rotations with the smaller loss."""
         return self.R[torch.arange(len(self.R)), self.loss.argmin(1)]
+
+    @property
+    def consistent(self) -> Float[Tensor, "g f 3 3"]:
+        """The rotations, from one start per window, that have small losses and agree with those of their neighbours.
+
+        A short window is explained about as well by its mirror image, but windows that overlap show the same motion. So
+        the starts of all windows are chosen together: they have the least sum of log losses and contradictions.
+        """
+        loss = self.loss.clamp_min(1e-12).log()
+        cost, previous = loss[0], []
+        for k in range(1, len(loss)):
+            through = cost[:, None] + CONTRADICTION_COST * self._contradiction(k - 1, k)
+            cost, index = through.min(0)
+            cost = cost + loss[k]
+            previous.append(index)
+        chosen = [int(cost.argmin())]
+        for index in reversed(previous):
+            chosen.append(int(index[chosen[-1]]))
+        return self.R[torch.arange(len(self.R)), torch.tensor(chosen[::-1])]
+
+    def _contradiction(self, a: int, b: int) -> Float[Tensor, "2 2"]:
+        """How much every start of one window contradicts every start of a later one, 0 to 1."""
+        shift = int(self.frames[b, 0] - self.frames[a, 0])
+        common = self.frames.shape[1] - shift
+        if common < 2:
+            return torch.zeros(2, 2, dtype=self.R.dtype)
+        R_a, R_b = self.R[a, :, shift:].transpose(0, 1), self.R[b, :, :common].transpose(0, 1)
+        angle = deviation(R_a[:, :, None].expand(-1, -1, 2, -1, -1), R_b[:, None].expand(-1, 2, -1, -1, -1)).mean(0)
+        return angle / angle.max().clamp_min(SMALL_DEVIATION)
+
+
+def deviation(R_a: Float[Tensor, "f *b 3 3"], R_b: Float[Tensor, "f *b 3 3"]) -> Float[Tensor, "f *b"]:
+    """Angles between two estimates of the same rotations `R_cam_obj`, each in an object frame of its own [radians]."""
+    a, b = SO3.from_matrix(R_a), SO3.from_matrix(R_b)
+    return angle_between(b, a @ mean_rotation(a.inverse() @ b))
 
 
 def adjust_windows(

@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble import matching
-from tumble.maths import SO3, angle_between, mean_rotation
-from tumble.poses.sfm.adjustment import Settings, Windows, adjust_windows, averaged_windows
+from tumble.poses.sfm.adjustment import Settings, Windows, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.observations import Inputs, on_object, shown, silhouette_centres, tracks_of
 from tumble.poses.sfm.partial import Observed, Partial, adjusted, joined_tracks, pruned, thinned
 from tumble.poses.sfm.registration import TOLERANCE, grow, join
@@ -142,7 +141,4 @@ def _runs(windows: Windows, wanted: Bool[Tensor, " t"]) -> list[list[int]]:
 def _deviation(windows: Windows, best: Float[Tensor, "g f 3 3"], a: int, b: int) -> float:
     """Largest angle between the rotations of two windows in their common frames [radians]."""
     shift = int(windows.frames[b, 0] - windows.frames[a, 0])
-    R_a, R_b = SO3.from_matrix(best[a, shift:]), SO3.from_matrix(best[b, : best.shape[1] - shift])
-    # Each window has an object frame of its own.
-    T_a_b = mean_rotation(R_a.inverse() @ R_b)
-    return float(angle_between(R_b, R_a @ T_a_b).max())
+    return float(deviation(best[a, shift:], best[b, : best.shape[1] - shift]).max())

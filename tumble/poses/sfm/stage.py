@@ -44,7 +44,7 @@ from tumble.poses.sfm.symmetry import mirror_symmetry
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
 from tumble.scene import Trajectory
 
-VERSION = 12
+VERSION = 13
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -187,6 +187,8 @@ class Step:
     phase: Phase
     attempt: int = 0
     """Attempt that the step belongs to: 0 is the first; the others are those of `Config.fallbacks`."""
+    mends: bool = False
+    """Whether the step relocalizes frames of an attempt; it is skipped once the loss has converged."""
 
 
 def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
@@ -197,12 +199,17 @@ def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
     """
     if hidden:
         return [*map(Step, (AverageRotations(), JoinSegments(), *map(AdjustAll, cfg.relocalized_scales)))]
+    keep = KeepBest(cfg.global_scales[-1])
+    relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
     steps: list[Step] = []
     for attempt, sizes in enumerate((cfg.window_sizes, *(fallback.window_sizes for fallback in cfg.fallbacks))):
         phases = [AverageRotations(), *map(AdjustWindows, sizes), *map(AdjustAll, cfg.global_scales)]
-        steps += [Step(phase, attempt) for phase in (*phases, KeepBest(cfg.global_scales[-1]))]
+        # Only what has not converged is mended, before attempts are compared: contours rescue some but not others.
+        steps += [Step(phase, attempt) for phase in (*phases, *([keep] if attempt == 0 else []))]
+        steps += [Step(phase, attempt, mends=True) for phase in relocalization * cfg.relocalizations]
+        steps += [Step(keep, attempt, mends=True)] if attempt > 0 or cfg.relocalizations else []
     for _ in range(cfg.relocalizations):
-        steps += map(Step, (CloseLoops(), Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)))
+        steps += map(Step, (CloseLoops(), *relocalization))
     return steps
 
 
@@ -224,14 +231,13 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 @torch.no_grad()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
-    """Carry out the next step of the schedule; further attempts are skipped once the loss has converged."""
+    """Carry out the next step of the schedule; mending and further attempts are skipped once the loss has converged."""
     now = schedule(cfg, hidden=inputs.hidden)[state.step]
     cfg = _weighted(cfg, inputs)
-    if now.attempt > 0:
-        if float(state.memory["loss"]) < cfg.converged_loss:
-            return {}
-        if not isinstance(now.phase, KeepBest):
-            cfg = replace(cfg, frontier_weight=cfg.fallbacks[now.attempt - 1].frontier_weight)
+    if (now.attempt > 0 or now.mends) and float(state.memory["loss"]) < cfg.converged_loss:
+        return {}
+    if now.attempt > 0 and not isinstance(now.phase, KeepBest):
+        cfg = replace(cfg, frontier_weight=cfg.fallbacks[now.attempt - 1].frontier_weight)
     state.params, scalars = _run_phase(now.phase, cfg, with_focal_length(inputs, state.params.log_focal), state)
     return scalars
 
@@ -286,9 +292,9 @@ def _average_rotations(cfg: Config, inputs: Inputs, state: State) -> PhaseResult
 
 
 def _adjust_windows(cfg: Config, inputs: Inputs, state: State, size: int) -> PhaseResult:
-    """Adjust overlapping windows, each also from its mirror image, and average the rotations within them."""
+    """Adjust overlapping windows, each also from its mirror image, and average the consistent rotations within them."""
     windows = adjust_windows(cfg, inputs, state.params.R, state.rng, size=size, stride=max(1, size // 4))
-    R = averaged_windows(windows.frames, windows.best, n_frames=len(inputs.capture))
+    R = averaged_windows(windows.frames, windows.consistent, n_frames=len(inputs.capture))
     return replace(state.params, R=R), {"loss": windows.loss.amin(1).mean()}
 
 
