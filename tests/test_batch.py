@@ -57,7 +57,10 @@ def measured(suite: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_row_has_all_scores_and_what_they_depend_on(measured: Path) -> None:
     row = next(row for row in rows.read_rows(measured) if "error" not in row)
     assert row["labels"] | {"object": "pot", "light": "room", "poses": "given", "seed": 0} == row["labels"]
-    assert row["code"] == code.current_code()
+    now = code.current_code()
+    assert row["code"] == {name: now[name] for name in ("version", "commit")} | {
+        "fingerprint": now["fingerprint_given"]
+    }
     assert len(row["recipe"]) == len(row["capture"]) == 64
     assert "CPU" in row["machine"]
     assert row["seconds"]["run"] > 0 < row["seconds"]["score"]
@@ -110,15 +113,19 @@ def test_rows_of_other_code_are_stale_in_the_report(
     assert "<title>Two rows of a pot - tumble</title>" in page
     document, markdown = measured / "pot.json", measured / "pot.md"
     assert "1 failed, 0 stale" in markdown.read_text("utf-8")
-    other = {**code.current_code(), "fingerprint": "0" * 16}
+    before, now = markdown.read_text("utf-8"), code.current_code()
+    other = {**now, "fingerprint": "0" * 16}
     monkeypatch.setattr(code, "current_code", lambda: other)
-    before = markdown.read_text("utf-8")
+    batch.report_suite(suite, measured)
+    # Other code of stage 1 leaves the row with given poses as it is.
+    assert "1 failed, 1 stale" in markdown.read_text("utf-8")
+    other["fingerprint_given"] = "1" * 16
     batch.report_suite(suite, measured)
     assert "1 failed, 2 stale" in markdown.read_text("utf-8")
     assert "## Means" not in markdown.read_text("utf-8")
     stale = json.loads(document.read_text("utf-8"))
     assert len(stale["rows"]) == 2
-    document.write_text(json.dumps({**stale, "code": stale["rows"][0]["code"]}))
+    document.write_text(json.dumps({**stale, "code": now}))
     batch.report_suite(str(document), measured)
     assert markdown.read_text("utf-8") == before
 

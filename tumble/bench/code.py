@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import torch
 
@@ -33,6 +33,8 @@ DECIDING = (
     "recipes.py",
 )
 """Rooms and files of the package that decide the scores of a row."""
+STAGE_1 = ("matching", "poses")
+"""Those of them that run only where poses are estimated."""
 SOURCES = (".py", ".cpp", ".h")
 """Extensions of source files."""
 
@@ -46,12 +48,20 @@ class Code(TypedDict):
     """Git commit, with "+" if files were changed since; None outside of a repository."""
     fingerprint: str
     """Hash of the sources that decide the scores, without comments and docstrings."""
+    fingerprint_given: NotRequired[str]
+    """The same without the sources of stage 1, for rows with given poses. A row has only its own fingerprint."""
 
 
 @cache
 def current_code() -> Code:
     """The code of this process."""
-    return {"version": __version__, "commit": _commit(), "fingerprint": source_fingerprint(DECIDING)[:16]}
+    given = tuple(part for part in DECIDING if part not in STAGE_1)
+    return {
+        "version": __version__,
+        "commit": _commit(),
+        "fingerprint": source_fingerprint(DECIDING)[:16],
+        "fingerprint_given": source_fingerprint(given)[:16],
+    }
 
 
 @cache
