@@ -55,7 +55,7 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
         count: Maximum number of pairs.
         gap: Pairs are more than this number of frames apart.
     """
-    cells = visual_hull.carve(_padded(capture), trajectory, resolution=HULL_RESOLUTION)
+    cells = visual_hull.carve(padded(capture), trajectory, resolution=HULL_RESOLUTION)
     if not bool((cells > 0.5).any()):
         return []
     normals = visual_hull.outward_gradient(cells)
@@ -79,7 +79,7 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
     return [match for match in matches if len(match) >= MIN_MATCHES]
 
 
-def _padded(capture: Capture) -> Capture:
+def padded(capture: Capture) -> Capture:
     """Masks of twice the size with background around them, because carving keeps cells that no frame sees."""
     top, left = (side // 2 for side in capture.masks.shape[1:])
     masks = pad(capture.masks, (left, left, top, top), value=BACKGROUND)

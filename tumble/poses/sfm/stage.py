@@ -22,7 +22,7 @@ from torch import Tensor
 from tumble.engine import State
 from tumble.maths import SE3, SO3, angle_between, mean_rotation
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import relative_pose, segments
+from tumble.poses.sfm import relative_pose, segments, symmetry
 from tumble.poses.sfm.adjustment import adjust_round, adjust_windows, averaged_windows
 from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.finalize import Solution, pose_result
@@ -40,11 +40,10 @@ from tumble.poses.sfm.relocalization import (
     robust_cost,
 )
 from tumble.poses.sfm.rotation_averaging import average_rotations
-from tumble.poses.sfm.symmetry import mirror_symmetry
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
 from tumble.scene import Trajectory
 
-VERSION = 13
+VERSION = 14
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -160,6 +159,11 @@ class KeepBest:
 
 
 @dataclass(frozen=True)
+class AlignTexture:
+    """Turn frames of a body of revolution about its axis where their texture contradicts the poses (`symmetry`)."""
+
+
+@dataclass(frozen=True)
 class CloseLoops:
     """Match frames that are far apart in time and see the same side, if the object is a body of revolution."""
 
@@ -177,7 +181,7 @@ class JoinSegments:
     """Pose the frames of an object that is hidden in part (`segments`); the other frames are lost."""
 
 
-Phase = AverageRotations | AdjustWindows | AdjustAll | KeepBest | CloseLoops | Relocalize | JoinSegments
+Phase = AverageRotations | AdjustWindows | AdjustAll | KeepBest | AlignTexture | CloseLoops | Relocalize | JoinSegments
 
 
 @dataclass(frozen=True)
@@ -208,6 +212,7 @@ def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
         steps += [Step(phase, attempt) for phase in (*phases, *([keep] if attempt == 0 else []))]
         steps += [Step(phase, attempt, mends=True) for phase in relocalization * cfg.relocalizations]
         steps += [Step(keep, attempt, mends=True)] if attempt > 0 or cfg.relocalizations else []
+    steps.append(Step(AlignTexture()))
     for _ in range(cfg.relocalizations):
         steps += map(Step, (CloseLoops(), *relocalization))
     return steps
@@ -224,6 +229,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     log_focal = torch.zeros((), dtype=torch.float64)
     best = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
     best["posed"] = torch.ones(len(R), dtype=torch.bool)
+    best["steady"] = torch.ones(len(inputs.tracks), dtype=torch.bool)
     return State(
         0, Poses(R, t, log_focal), None, rng, best | {f"loop_{name}": x for name, x in vars(NO_TRACKS).items()}
     )
@@ -257,6 +263,8 @@ def _run_phase(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "Phas
             return adjust_all(cfg, inputs, state, scale)
         case KeepBest(scale):
             return _keep_best(cfg, inputs, state, scale)
+        case AlignTexture():
+            return _align_texture(inputs, state)
         case CloseLoops():
             return _close_loops(inputs, state)
         case Relocalize(scale):
@@ -341,10 +349,43 @@ def _posed(state: State) -> Bool[Tensor, " t"]:
 
 def _all_tracks(inputs: Inputs, state: State) -> Tracks:
     """Feature tracks and loop closures; for an object that is hidden in part the tracks that matches have joined."""
+    tracks = _steady_tracks(inputs, state)
     if not len(state.memory.get("loop_point", ())):
-        return inputs.tracks
+        return tracks
     stored = Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv")))
-    return stored if inputs.hidden else concatenate(inputs.tracks, stored)
+    return stored if inputs.hidden else concatenate(tracks, stored)
+
+
+def _steady_tracks(inputs: Inputs, state: State) -> Tracks:
+    """Feature tracks without the observations that have slipped from their surface point (`AlignTexture`)."""
+    steady = state.memory.get("steady")
+    return inputs.tracks if steady is None or bool(steady.all()) else inputs.tracks.select(steady)
+
+
+def _in_unit_sphere(inputs: Inputs, poses: Poses) -> Trajectory:
+    """Poses in a unit in which the object lies in the unit sphere."""
+    R, t = poses.R.float(), poses.t.float() / (BOUNDING_RADIUS_FACTOR * inputs.radius)
+    return Trajectory(SE3.from_rotation(SO3.from_matrix(R), t), inputs.capture.light)
+
+
+def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
+    """Correct the rotations of a body of revolution about its axis where texture contradicts them."""
+    found = _spin(inputs, state.params)
+    if found is None or not found.is_better:
+        return state.params, {}
+    trajectory = found.surface.turned(_in_unit_sphere(inputs, state.params), found.angle)
+    state.memory["steady"] = symmetry.steady_observations(inputs.capture, trajectory, found.surface, inputs.tracks)
+    T_cam_obj = trajectory.T_cam_obj
+    t = T_cam_obj.xyz.double() * (BOUNDING_RADIUS_FACTOR * inputs.radius)
+    return replace(state.params, R=T_cam_obj.rotation.matrix().double(), t=t), {"turned": found.angle.abs().median()}
+
+
+def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
+    """Rotations about the axis that the texture of a body of revolution shows, relative to the poses."""
+    silhouettes = symmetry.mirror_symmetry(inputs.capture.masks)
+    if not silhouettes.is_revolution or silhouettes.is_sphere:
+        return None
+    return symmetry.estimate_spin(inputs.capture, _in_unit_sphere(inputs, poses))
 
 
 def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
@@ -358,10 +399,9 @@ def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float) -> Phase
 
 def _close_loops(inputs: Inputs, state: State) -> PhaseResult:
     """Add loop closures of a body of revolution, whose contours do not determine the rotation about its axis."""
-    if not mirror_symmetry(inputs.capture.masks).is_revolution:
+    if not symmetry.mirror_symmetry(inputs.capture.masks).is_revolution:
         return state.params, {}
-    R, t = state.params.R.float(), state.params.t.float() / (BOUNDING_RADIUS_FACTOR * inputs.radius)
-    trajectory = Trajectory(SE3.from_rotation(SO3.from_matrix(R), t), inputs.capture.light)
+    trajectory = _in_unit_sphere(inputs, state.params)
     matches = loop_closures(inputs.capture, trajectory, inputs.matcher, count=MAX_LOOP_PAIRS, gap=LOOP_DISTANCE)
     for name, x in vars(concatenate(NO_TRACKS, *(two_frame_tracks(match) for match in matches))).items():
         state.memory[f"loop_{name}"] = x
@@ -427,9 +467,14 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     """The result: poses in the object's unit and frame, surface points, and the quality of the poses."""
     disagreement, posed = _rotation_disagreement(_weighted(cfg, inputs), inputs, state), _posed(state)
     inputs = with_focal_length(inputs, state.params.log_focal)
+    found = None if inputs.hidden else _spin(inputs, state.params)
+    if found is not None and found.is_better:
+        # Matches and contours agree, but matches are wrong about the spin, which contours do not show.
+        disagreement = torch.maximum(disagreement, found.angle.abs().double())
     solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None)
+    tracks = _steady_tracks(inputs, state)
     contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])
-    return pose_result(inputs.capture, inputs.tracks.select(posed[inputs.tracks.frame]), contours, solution)
+    return pose_result(inputs.capture, tracks.select(posed[tracks.frame]), contours, solution)
 
 
 def _rotation_disagreement(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:

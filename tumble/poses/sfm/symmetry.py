@@ -1,19 +1,30 @@
-"""Rotational symmetry of an object, detected from the mirror symmetry of its silhouettes.
+"""Bodies of revolution: their detection, and their rotation about the axis (spin) from texture unwrapped on a cylinder.
 
 From every viewpoint, the silhouette of a body of revolution is mirror symmetric about the image of its axis; that of a
 sphere is mirror symmetric about every line through its centre. Rotations about such an axis do not change the
 silhouettes, so that they are observable from texture alone.
+
+Most matches on a body with little texture are wrong about the spin in the same way: shading and highlights keep their
+place in the image while the surface turns, so optical flow reports too little motion wherever these have more contrast
+than the texture. The silhouettes of a body of revolution however determine its surface. Every frame is sampled on that
+surface, over the angle about the axis and the position along it: a spin shifts such a map along the angle. The maps of
+all pairs of frames are compared for all shifts by their normalised cross-correlation, after the mean over nearby angles
+is subtracted. This removes smooth shading, and weighs texture by its contrast instead of its area. A spin that shading
+explains as well, because it keeps the object still before the camera, is not used.
 """
 
 import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import avg_pool1d, grid_sample, normalize, pad
 
-from tumble.scene import OBJECT, UNKNOWN
+from tumble.maths import SO3
+from tumble.poses.sfm import loop_closure
+from tumble.poses.sfm.tracks import Tracks
+from tumble.scene import OBJECT, UNKNOWN, Capture, Trajectory, visual_hull
 
 GRID = 64
 """Resolution at which silhouettes are compared with their mirror images."""
@@ -23,6 +34,40 @@ FINE_LINES = 9
 """Number of mirror lines of the fine search about the best coarse one, half a degree apart."""
 MIN_OVERLAP = 0.95
 """Minimum intersection over union, median over frames, for silhouettes to count as mirror symmetric."""
+ANGLES = 180
+"""Cells of a map over the angle about the axis."""
+HEIGHTS = 32
+"""Cells of a map along the axis."""
+HULL_RESOLUTION = 64
+"""Cells of the visual hull's grid along each side."""
+PROFILE_MARGIN = 0.01
+"""Fraction of the hull's cells at either end of the axis that the surface leaves out."""
+MEAN_WINDOW = 17
+"""Width of the window whose mean is subtracted [cells of the angle]; shading changes little within it."""
+MIN_COSINE = 0.15
+"""Minimum cosine between normal and line of sight for a cell to be visible."""
+MAX_STEP = math.radians(30)
+"""Largest error of the spin between consecutive frames that is searched for [radians]; repeating patterns, such as six
+equal panels, match again at larger shifts."""
+REFINED_STEP = math.radians(10)
+"""Largest change of a frame's spin when all frames are compared with all [radians]."""
+NEAR = 8
+"""Distance in time up to which frames are compared at first [frames]."""
+SWEEPS = 4
+"""Number of times that the spin of every frame is chosen anew, given all others."""
+MIN_CONTRAST = 0.1
+"""Energy of the texture that two maps have in common, relative to the median frame's, at which a correlation counts
+half: where only untextured parts overlap, noise correlates."""
+STEP_PENALTY = 0.006
+"""Penalty on a change of the given spin between consecutive frames, which decides where a frame shows no texture
+[mean correlation / degree]."""
+MIN_CORRELATION = 0.3
+"""Minimum mean correlation of frames near in time, with the spin found, for the texture to show it; shading and noise
+alone reach 0.27."""
+CONTRADICTION = 0.8
+"""Ratio of the correlation for another spin to that for the spin found below which texture contradicts that one."""
+MAX_SLIP = 1.5
+"""Largest distance of a track's observations from one surface point [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -115,3 +160,198 @@ def _centred(mask: UInt8[Tensor, "h w"]) -> Float[Tensor, "2 g g"]:
     layers = torch.stack([inside.float(), (mask == UNKNOWN).float()])[None]
     resampled = grid_sample(layers, (2 * grid / size - 1)[None], align_corners=False)[0]
     return torch.stack([resampled[0], 1 - resampled[1]])
+
+
+# Spin -----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SurfaceOfRevolution:
+    """A surface of revolution, object frame."""
+
+    centre: Float[Tensor, "3"]
+    """A point on the axis."""
+    axes: Float[Tensor, "3 3"]
+    """Unit vectors of a right-handed frame, of which the last is the axis."""
+    height: Float[Tensor, " z"]
+    """Positions along the axis, relative to the centre, equally spaced."""
+    radius: Float[Tensor, " z"]
+    """Distance of the surface from the axis there."""
+
+    def cells(self) -> tuple[Float[Tensor, "a z 3"], Float[Tensor, "a z 3"]]:
+        """Points of the surface over angle and position along the axis, and the outward unit normals there."""
+        angle = torch.arange(ANGLES) * (2 * math.pi / ANGLES)
+        outward = angle.cos()[:, None] * self.axes[0] + angle.sin()[:, None] * self.axes[1]
+        slope = torch.gradient(self.radius, spacing=(self.height,))[0]
+        x = self.centre + outward[:, None] * self.radius[:, None] + self.height[:, None] * self.axes[2]
+        return x, normalize(outward[:, None] - slope[:, None] * self.axes[2], dim=-1)
+
+    def turned(self, trajectory: Trajectory, angle: Float[Tensor, " t"]) -> Trajectory:
+        """Poses whose object is first turned about the axis by these angles [radians]."""
+        turn = SO3.exp(angle[:, None] * self.axes[2])
+        T = trajectory.T_cam_obj
+        xyz = T.xyz + T.rotation @ (self.centre - turn @ self.centre)
+        return Trajectory(type(T).from_rotation(T.rotation @ turn, xyz), trajectory.light)
+
+
+@dataclass(frozen=True)
+class Spin:
+    """Spin of every frame that the texture shows, relative to given poses."""
+
+    surface: SurfaceOfRevolution
+    angle: Float[Tensor, " t"]
+    """By what the object is turned about the axis, before the given pose, to agree with the other frames [radians]; its
+    median is 0."""
+    given_correlation: float
+    """Mean correlation of the maps of frames at most `NEAR` apart in time, at the given poses."""
+    correlation: float
+    """The same after the turn."""
+    static_correlation: float
+    """The same if the object is turned so that it does not spin before the camera, as shading does not."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether texture, not shading, contradicts the given poses."""
+        others = max(self.given_correlation, self.static_correlation)
+        return self.correlation > MIN_CORRELATION and others < CONTRADICTION * self.correlation
+
+
+def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
+    """Spin of a body of revolution in every frame; None if the poses and silhouettes contradict each other.
+
+    Args:
+        capture: Images and masks of all frames.
+        trajectory: Poses that are right but for the spin; the object lies in the unit sphere.
+    """
+    surface = surface_of_revolution(capture, trajectory)
+    if surface is None or len(trajectory) < 2:
+        return None
+    score = _correlations(*_unwrapped(capture, trajectory, surface))
+    shift = _best_shifts(score)
+    i, j = torch.triu_indices(len(shift), len(shift), 1)
+    i, j = i[j - i <= NEAR], j[j - i <= NEAR]
+    towards_camera = (trajectory.T_cam_obj.inverse().xyz - surface.centre) @ surface.axes.mT
+    static = (torch.atan2(towards_camera[:, 1], towards_camera[:, 0]) / (2 * math.pi) * ANGLES).round().long()
+    correlations = [float(score[i, j, (s[j] - s[i]) % ANGLES].mean()) for s in (0 * shift, shift, static)]
+    return Spin(surface, (shift - shift.median()) * (2 * math.pi / ANGLES), *correlations)
+
+
+def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOfRevolution | None:
+    """SurfaceOfRevolution of revolution with the cross sections of the visual hull; None if the hull is empty.
+
+    The axis is the principal axis of the hull whose moment of inertia differs most from the other two.
+    """
+    cells = visual_hull.carve(loop_closure.padded(capture), trajectory, resolution=HULL_RESOLUTION)
+    x = (torch.nonzero(cells > 0.5) + 0.5) / HULL_RESOLUTION * 2 - 1
+    if len(x) < HEIGHTS:
+        return None
+    centre = x.mean(0)
+    variance, directions = torch.linalg.eigh(torch.cov((x - centre).T))
+    axis = directions[:, 0 if variance[1] * variance[1] > variance[0] * variance[2] else 2]
+    across = normalize(torch.linalg.cross(axis, torch.eye(3)[axis.abs().argmin()]), dim=0)
+    position = (x - centre) @ axis
+    low, high = position.quantile(torch.tensor([PROFILE_MARGIN, 1 - PROFILE_MARGIN]))
+    thickness = (high - low) / HEIGHTS
+    layer = ((position - low) / thickness).floor().long()
+    volume = torch.bincount(layer[(layer >= 0) & (layer < HEIGHTS)], minlength=HEIGHTS) * (2 / HULL_RESOLUTION) ** 3
+    # A layer has few cells across: layers are averaged.
+    area = avg_pool1d(pad((volume / thickness)[None], (2, 2), mode="replicate"), 5, 1)[0]
+    height = low + (torch.arange(HEIGHTS) + 0.5) * thickness
+    return SurfaceOfRevolution(
+        centre, torch.stack([across, torch.linalg.cross(axis, across), axis]), height, (area / math.pi).sqrt()
+    )
+
+
+def _visible_cells(
+    capture: Capture, trajectory: Trajectory, surface: SurfaceOfRevolution
+) -> tuple[Float[Tensor, "t a z 2"], Float[Tensor, "t a z"]]:
+    """Positions of the surface's cells in all frames [pixels], and how visible they are, 0 to 1."""
+    x, normals = surface.cells()
+    camera_centre = trajectory.T_cam_obj.inverse().xyz
+    cosine = (normalize(camera_centre[:, None, None] - x, dim=-1) * normals).sum(-1)
+    uv = torch.stack(
+        [capture.camera.project(trajectory.T_cam_obj[k] @ x.reshape(-1, 3)) for k in range(len(trajectory))]
+    )
+    return uv.reshape(*cosine.shape, 2), (cosine - MIN_COSINE).clamp_min(0) / (1 - MIN_COSINE)
+
+
+def _unwrapped(
+    capture: Capture, trajectory: Trajectory, surface: SurfaceOfRevolution
+) -> tuple[Float[Tensor, "t a z"], Float[Tensor, "t a z"]]:
+    """Maps of the texture's contrast in every frame [code values], and the weights of their cells."""
+    uv, weight = _visible_cells(capture, trajectory, surface)
+    inside = (capture.masks == OBJECT).float()
+    image = torch.stack([capture.images.float().mean(-1), inside], 1)
+    size = torch.tensor([capture.camera.width, capture.camera.height])
+    grey, covered = grid_sample(image, 2 * uv / size - 1, align_corners=False).unbind(1)
+    weight = weight * (covered > 1 - 1e-3)
+    visible = (weight > 0).float()
+
+    def mean(values: Tensor) -> Tensor:
+        wrapped = pad(values.mT, (MEAN_WINDOW // 2, MEAN_WINDOW // 2), mode="circular")
+        return avg_pool1d(wrapped, MEAN_WINDOW, 1).mT
+
+    return (grey - mean(grey * visible) / mean(visible).clamp_min(1e-6)) * visible, weight
+
+
+def _correlations(contrast: Float[Tensor, "t a z"], weight: Float[Tensor, "t a z"]) -> Float[Tensor, "t t a"]:
+    """Normalised cross-correlations of all pairs of maps for all shifts of the second one [cells].
+
+    They are smaller where the maps have little texture in common.
+    """
+    product, energy, w = (torch.fft.rfft(x, dim=1) for x in (weight * contrast, weight * contrast.square(), weight))
+
+    def correlate(a: Tensor, b: Tensor) -> Float[Tensor, "t t a"]:
+        # One frame at a time, which limits memory.
+        return torch.stack([torch.fft.irfft((row.conj() * b).sum(-1), n=ANGLES, dim=1) for row in a])
+
+    common = (correlate(energy, w).clamp_min(0) * correlate(w, energy).clamp_min(0)).sqrt()
+    typical = common[:, :, 0].diagonal().median()
+    return correlate(product, product) / (common + MIN_CONTRAST * typical).clamp_min(1e-6)
+
+
+def _best_shifts(score: Float[Tensor, "t t a"]) -> Int64[Tensor, " t"]:
+    """Shift of every frame's map, so that all pairs of frames agree best [cells].
+
+    Frames are added one after the other, each compared with the ones just before it. Then all are compared with all.
+    """
+    n = len(score)
+    shift = torch.zeros(n, dtype=torch.long)
+    penalty = STEP_PENALTY * 360 / ANGLES
+
+    def choose(k: int, others: Tensor, neighbours: Tensor, middle: int, reach: float) -> int:
+        cells = round(reach / (2 * math.pi) * ANGLES)
+        options = middle + torch.arange(-cells, cells + 1)
+        total = score[others[:, None], k, (options - shift[others, None]) % ANGLES].mean(0)
+        total = total - penalty * (options - shift[neighbours, None]).abs().sum(0)
+        return int(options[total.argmax()])
+
+    for k in range(1, n):
+        before = torch.arange(max(0, k - NEAR), k)
+        shift[k] = choose(k, before, before[-1:], int(shift[k - 1]), MAX_STEP)
+    frames = torch.arange(n)
+    for _ in range(SWEEPS):
+        for k in range(n):
+            neighbours = frames[(frames - k).abs() == 1]
+            shift[k] = choose(k, frames[frames != k], neighbours, int(shift[k]), REFINED_STEP)
+    return shift
+
+
+def steady_observations(
+    capture: Capture, trajectory: Trajectory, surface: SurfaceOfRevolution, tracks: Tracks
+) -> Bool[Tensor, " o"]:
+    """Whether each observation shows the surface point that its track shows where it is seen most nearly head-on."""
+    uv, visible = _visible_cells(capture, trajectory, surface)
+    uv, visible = uv.flatten(1, 2), visible.flatten(1)
+    cell, facing = torch.zeros_like(tracks.point), torch.zeros(len(tracks))
+    for k in range(len(trajectory)):
+        mine = torch.nonzero(tracks.frame == k)[:, 0]
+        seen = torch.nonzero(visible[k])[:, 0]
+        cell[mine] = seen[torch.cdist(tracks.uv[mine].float(), uv[k, seen]).argmin(1)]
+        facing[mine] = visible[k, cell[mine]]
+    order = torch.argsort(facing, stable=True)
+    reference = torch.zeros(tracks.n, dtype=torch.long)
+    reference[tracks.point[order]] = order
+    reference = reference[tracks.point]
+    moved = uv[tracks.frame, cell[reference]] - uv[tracks.frame[reference], cell[reference]]
+    return (tracks.uv - tracks.uv[reference] - moved).norm(dim=-1) < MAX_SLIP
