@@ -94,8 +94,8 @@ class SuiteResults(TypedDict):
 
 def row_of(case: Case, code: Code, *, recipe: str) -> SuiteRow:
     """A row without scores, with the fingerprint of the code that decides them: without stage 1 if poses are given."""
-    given = code.get("fingerprint_given", "")
-    own = given if case.poses == "given" and given else code["fingerprint"]
+    whole = code["fingerprint"]
+    own = code.get("fingerprint_given", whole) if case.poses == "given" else whole
     plain: dict[str, Any] = dataclasses.asdict(dataclasses.replace(case, varied=()))
     return {
         "name": case.name,

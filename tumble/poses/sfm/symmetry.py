@@ -237,7 +237,7 @@ def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
 
 
 def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOfRevolution | None:
-    """SurfaceOfRevolution of revolution with the cross sections of the visual hull; None if the hull is empty.
+    """Surface of revolution with the cross sections of the visual hull; None if the hull is empty.
 
     The axis is the principal axis of the hull whose moment of inertia differs most from the other two.
     """
