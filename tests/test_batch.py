@@ -1,6 +1,7 @@
 """A suite from the objects to the page, with one row that fails; and a batch of captures."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -86,8 +87,8 @@ def test_a_failed_row_says_why_and_is_measured_again_only_on_demand(measured: Pa
 def test_a_method_in_a_file_is_measured_again_when_the_file_changes(suite: str, tmp_path: Path) -> None:
     own, folder = tmp_path / "own.py", tmp_path / "out"
     own.write_text("from dataclasses import replace\ndef method(recipe):\n    return replace(recipe, matcher='sift')\n")
-    (case,) = cases_of(read_suite(suite), methods=[str(own)], only=["given"])
-    assert case.name == "pot-room-handheld-original-given-own-seed0"
+    (case,) = cases_of(read_suite(suite), methods=[str(own)], only=["estimate"])
+    assert case.name == "pot-room-handheld-original-estimate-own-seed0"
     recipe = batch.recipe_of(case)
     assert (recipe.matcher, recipe.decompose) == ("sift", SMOKE.decompose)
     row = rows.row_of(case, code.current_code(), recipe=loop.fingerprint(recipe, own.read_text()))
@@ -95,6 +96,14 @@ def test_a_method_in_a_file_is_measured_again_when_the_file_changes(suite: str, 
     assert batch.missing_rows([case], folder, None) == []
     own.write_text(own.read_text() + "# a change\n")
     assert [task.case for task in batch.missing_rows([case], folder, None)] == [case]
+
+
+def test_other_settings_of_stage_1_measure_only_rows_with_estimated_poses_again(
+    measured: Path, suite: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(batch.RECIPES, "smoke", replace(SMOKE, matcher="sift", track=SMOKE.refine))
+    missing = batch.missing_rows(cases_of(read_suite(suite)), measured, None)
+    assert [task.case.poses for task in missing] == ["estimate"]
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones(suite: str, tmp_path: Path) -> None:

@@ -10,8 +10,9 @@ import torch
 
 from tests.films import scene, written
 from tests.test_interrupt import capture, whole  # noqa: F401 (fixtures)
-from tumble import cli, pipeline
+from tumble import actions, cli, pipeline
 from tumble.preprocess.options import FRAMES_AND_SIZE, FootageOptions
+from tumble.recipes import DRAFT, PAPER, QUICK_TRACK, Recipe
 from tumble.scene.environment import Environment
 
 
@@ -63,6 +64,23 @@ def test_a_film_is_converted_as_the_quality_asks(
     refused = capsys.readouterr().err
     assert "options.frames" not in refused
     assert "options.size is 256 in the folder, 800 was requested" in refused
+
+
+@pytest.mark.parametrize(
+    ("words", "track"),
+    [
+        ((), DRAFT.track),
+        (("--route", "progressive"), QUICK_TRACK),
+        (("--quality", "paper"), PAPER.track),
+        (("--quality", "paper", "--route", "progressive"), PAPER.track),
+        (("--quality", "paper", "--route", "graph"), DRAFT.track),
+    ],
+)
+def test_the_route_chooses_stage_1(words: tuple[str, ...], track: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipes: list[Recipe] = []
+    monkeypatch.setattr(actions, "run_capture", lambda *given, **more: recipes.append(given[2]))
+    assert run(monkeypatch, "run", "capture", "-o", "run", *words) == 0
+    assert [recipe.track for recipe in recipes] == [track]
 
 
 def test_a_check_selects_as_many_frames_as_the_run_that_it_is_for(

@@ -198,7 +198,10 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
 
 def _empty_row(case: Case) -> SuiteRow:
     source = Path(case.method).read_text("utf-8") if case.method.endswith(".py") else ""
-    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe_of(case), source))
+    recipe = recipe_of(case)
+    if case.poses == "given":
+        recipe = dataclasses.replace(recipe, track=None, matcher="")  # stage 1 does not run
+    return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe, source))
 
 
 def _check_devices(names: Iterable[str], workers: Workers) -> None:

@@ -73,6 +73,23 @@ class Adjustment:
     taken to be about neutral."""
 
 
+@dataclass(frozen=True)
+class Tracking:
+    """How the poses are found."""
+
+    poses: Literal["given", "estimate"] = "given"
+    """given: use the capture's poses if it has any, else estimate them. estimate: always estimate them."""
+    route: Annotated[Literal["graph", "progressive"] | None, arg(help_behavior_hint="")] = None
+    """graph: matches and silhouettes of all frames at once. progressive: the paper's, a neural field that grows frame
+    by frame; with quality paper at the paper's size, which takes days on a CPU, else a small one, which takes minutes
+    and was 31 to 39 degrees off on three objects (benchmarks/poses.md). Default: graph; progressive with quality
+    paper."""
+    matcher: str = "mixed"
+    """Finds corresponding pixels in two frames.
+    mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
+    xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install."""
+
+
 Jobs = Annotated[int, arg(metavar="N", help="Number at the same time on this machine. 0: one for every two cores.")]
 Address = Annotated[
     str,
@@ -153,13 +170,12 @@ def run(
     capture: Positional[Path],
     /,
     options: Annotated[FootageOptions, arg(name="")],
+    tracking: Annotated[Tracking, arg(name="")],
     adjustment: Annotated[Adjustment, arg(name="")],
     out: Folder,
     quality: Quality = "draft",
     frames: Frames = None,
     size: Size = None,
-    poses: Literal["given", "estimate"] = "given",
-    matcher: str = "mixed",
     pick: bool = False,
     device: Device = "cpu",
     seed: int = 0,
@@ -179,11 +195,8 @@ def run(
             full: 150,000 steps each, for a GPU. Never run.
             paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
             (docs/method.md), where it is far behind draft.
-        poses: given: use the capture's poses if it has any, else estimate them. estimate: always estimate them.
+        tracking: How the poses are found.
         adjustment: Orientation and colour of the results.
-        matcher: Finds corresponding pixels in two frames, for estimated poses.
-            mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
-            xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`; then, if you
             like, look at the masks and correct them by clicks on any frame.
         seed: Seed of all random numbers.
@@ -191,11 +204,15 @@ def run(
     from dataclasses import replace
 
     from tumble.actions import run_capture
-    from tumble.recipes import QUALITIES
+    from tumble.recipes import DRAFT, QUALITIES, progressive_poses
 
-    recipe = replace(QUALITIES[quality], matcher=matcher, seed=seed)
+    recipe = replace(QUALITIES[quality], matcher=tracking.matcher, seed=seed)
+    if tracking.route:
+        recipe = progressive_poses(recipe) if tracking.route == "progressive" else replace(recipe, track=DRAFT.track)
     options = at_quality(options, quality, frames=frames, size=size)
-    print(run_capture(capture, out, recipe, options, poses=poses, pick=pick, device=device, **vars(adjustment)))
+    print(
+        run_capture(capture, out, recipe, options, poses=tracking.poses, pick=pick, device=device, **vars(adjustment))
+    )
 
 
 def batch(
@@ -203,7 +220,7 @@ def batch(
     /,
     options: Annotated[FootageOptions, arg(name="")],
     out: Folder,
-    quality: Literal["draft", "standard", "paper"] = "draft",
+    quality: Quality = "draft",
     poses: Literal["given", "estimate"] = "given",
     jobs: Jobs = 0,
     address: Address = "",

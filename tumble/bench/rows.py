@@ -38,7 +38,7 @@ class SuiteRow(TypedDict):
     """The whole case, with all options of its capture."""
     code: Code
     recipe: str
-    """Hash of all settings of all stages, and of the Python file of the method if it is in one."""
+    """Hash of the settings of all stages that run, and of the Python file of the method if it is in one."""
     machine: str
     """Class of the machine."""
     error: NotRequired[str]
