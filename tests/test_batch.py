@@ -98,6 +98,13 @@ def test_a_method_in_a_file_is_measured_again_when_the_file_changes(suite: str, 
     assert [task.case for task in batch.missing_rows([case], folder, None)] == [case]
 
 
+def test_a_row_in_one_line_has_the_error_of_poses_only_if_they_were_estimated(measured: Path) -> None:
+    row = next(row for row in rows.read_rows(measured) if "error" not in row)
+    assert "poses 0.00" not in batch.summary_line(row)
+    row["labels"] |= {"poses": "estimate"}
+    assert ", poses 0.00 degrees, " in batch.summary_line(row)
+
+
 def test_other_settings_of_stage_1_measure_only_rows_with_estimated_poses_again(
     measured: Path, suite: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

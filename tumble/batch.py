@@ -136,6 +136,9 @@ def summary_line(row: SuiteRow) -> str:
     found = [
         f"{part} {scores[key]:.1f} dB" for part in ("albedo", "relit") if (key := f"{part}.psnr_fg_srgb") in scores
     ]
+    error = row.get("poses", {}).get("poses.rotation_median_degrees")
+    if row["labels"]["poses"] == "estimate" and error is not None:
+        found.append(f"poses {error:.2f} degrees")
     return f"{row['name']}: {', '.join(found)}, {row.get('seconds', {}).get('run', 0):.0f} s"
 
 
