@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
@@ -98,15 +98,19 @@ def candidate_rotations() -> Float[Tensor, "k 3 3"]:
     return SO3.exp(omega).matrix()
 
 
+def largest_rotation(distance: Int64[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Largest plausible rotation between frames at a distance in time [frames]; in radians."""
+    return (MAX_ROTATION_PER_FRAME * distance).clamp_min(POSE_JUMP)
+
+
 def longest_smooth_sequence(R: Float[Tensor, "t 3 3"], usable: Bool[Tensor, " t"]) -> Bool[Tensor, " t"]:
     """Mask of the longest sequence of usable frames without a pose jump, by dynamic programming.
 
-    Frames may be skipped. Two successive frames of the sequence differ by less than `POSE_JUMP`, or by less than
-    `MAX_ROTATION_PER_FRAME` times their distance in frames where that is more.
+    Frames may be skipped. Two successive frames of the sequence differ by less than `largest_rotation`.
     """
     frames = torch.nonzero(usable)[:, 0]
     angle = angle_between(SO3.from_matrix(R[frames][:, None]), SO3.from_matrix(R[frames]))
-    follows = angle < (MAX_ROTATION_PER_FRAME * (frames[:, None] - frames).abs()).clamp_min(POSE_JUMP)
+    follows = angle < largest_rotation((frames[:, None] - frames).abs())
     length, predecessor = [], []
     for k in range(len(frames)):
         candidates = [(length[i], i) for i in torch.nonzero(follows[k, :k])[:, 0].tolist()]
