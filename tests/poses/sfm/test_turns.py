@@ -112,7 +112,8 @@ def test_a_part_of_the_motion_that_is_a_quarter_turn_off_comes_back(painted: tup
     assert found is not None
     assert found.is_better
     assert error(found.turned(wrong).T_cam_obj, truth) < 2
-    assert math.degrees(float(found.doubt(wrong).median())) == pytest.approx(error(wrong.T_cam_obj, truth), abs=2)
+    # 19 of 40 frames are closer to the second part, a right angle off.
+    assert math.degrees(found.doubt) == pytest.approx(90 * 19 / 40, abs=2)
 
 
 def test_right_poses_of_a_painted_cube_are_confirmed(painted: tuple[Capture, Trajectory]) -> None:
@@ -120,7 +121,7 @@ def test_right_poses_of_a_painted_cube_are_confirmed(painted: tuple[Capture, Tra
     found = symmetry.estimate_turns(capture, truth, usable())
     assert found is not None
     assert not found.is_better
-    assert float(found.doubt(truth).max()) < 1e-6
+    assert found.doubt == 0
 
 
 @pytest.mark.parametrize("right", [True, False])
@@ -130,7 +131,7 @@ def test_a_plain_cube_is_left_alone_and_named_unsure(plain: tuple[Capture, Traje
     found = symmetry.estimate_turns(capture, poses, usable())
     assert found is not None
     assert not found.is_better
-    assert float(found.doubt(poses).median()) > MAX_USABLE_UNCERTAINTY
+    assert found.doubt > MAX_USABLE_UNCERTAINTY
 
 
 def test_an_uninterrupted_motion_is_certain(plain: tuple[Capture, Trajectory]) -> None:

@@ -7,6 +7,9 @@ frames are found anew. Necker reversal is resolved where it arises: each window 
 and the better result is kept. Frames whose contour contradicts the others are relocalized by a search over many
 rotations.
 
+What contours do not show is corrected by texture: the rotation of a body of revolution about its axis, and turns of a
+part of the motion that leave the visual hull as it is (`symmetry`).
+
 A capture that has not converged is attempted again with the settings in `Config.fallbacks`, and the best result is
 kept. A focal length that is only assumed is estimated as well whenever all frames are adjusted together.
 
@@ -523,7 +526,7 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     turns = None if inputs.hidden else _turns(inputs, state.params)
     if turns is not None:
         # Matches and contours agree on either side of a gap, but not on the turn between both sides.
-        disagreement = torch.maximum(disagreement, turns.doubt(_in_unit_sphere(inputs, state.params)).double())
+        disagreement = disagreement.clamp_min(turns.doubt)
     solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None)
     tracks = _steady_tracks(inputs, state)
     contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])

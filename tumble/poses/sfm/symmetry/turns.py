@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, normalize
 
-from tumble.maths import SO3, angle_between, linear_from_srgb, mean_rotation, spherical_harmonics
+from tumble.maths import SO3, angle_between, linear_from_srgb, spherical_harmonics
 from tumble.poses.sfm import relocalization
 from tumble.scene import OBJECT, Capture, Trajectory, visual_hull
 
@@ -51,11 +51,11 @@ MIN_COSINE = 0.15
 DARK = 0.02
 """Linear light that is added before the logarithm, so that noise in dark pixels does not count."""
 SMOOTHING = 3
-"""Width of the window over which images are averaged, because poses are not exact yet [pixels]."""
+"""Width of the window over which images of `IMAGE_SIZE` are averaged, because poses are not exact yet [pixels]."""
 MEAN_WINDOW = 21
-"""Width of the window whose mean is subtracted from the brightness [pixels at `IMAGE_SIZE`]."""
+"""Width of the window whose mean is subtracted from the brightness in images of `IMAGE_SIZE` [pixels]."""
 IMAGE_SIZE = 128
-"""Height of the images at which windows have the given widths [pixels]; in larger images they are larger."""
+"""Approximate larger side to which images are reduced [pixels]."""
 SHADING_DEGREE = 3
 """Degree of the spherical harmonics of the normal that explain shading."""
 MAX_CONTRAST = 1.5
@@ -65,9 +65,9 @@ MIN_CONTRAST = 0.2
 shading leaves on an object of one colour correlates by chance."""
 MIN_COMMON = 0.1
 """Least fraction of the surface that two maps have in common to be compared."""
-MIN_CORRELATION = 0.3
+MIN_CORRELATION = 0.4
 """Least correlation of two maps for their colours to show a turn."""
-CONTRADICTION = 0.65
+CONTRADICTION = 0.6
 """Ratio of the correlations of another turn and of the best one below which colours contradict the other."""
 SWEEPS = 3
 """Number of times that the turn of every run is chosen anew, given those of all others."""
@@ -93,6 +93,8 @@ class Turns:
     hull: SymmetricHull
     runs: Int64[Tensor, " t"]
     """Run that every frame belongs to."""
+    reference: int
+    """The longest run, with which the others are compared."""
     correlation: Float[Tensor, "r s"]
     """Correlation of every run with all others after a symmetric turn of the run; the others are turned as chosen."""
     chosen: Int64[Tensor, " r"]
@@ -110,20 +112,15 @@ class Turns:
         xyz = T.xyz + T.rotation @ (centre - turn @ centre)
         return Trajectory(type(T).from_rotation(T.rotation @ turn, xyz), trajectory.light)
 
-    def doubt(self, trajectory: Trajectory) -> Float[Tensor, " t"]:
-        """Error of the given rotations if the turn that colours exclude least were right for each run [radians].
-
-        It is 0 if colours confirm all runs. The longest run is the reference; errors are relative to the mean rotation
-        between both motions.
-        """
-        best = self.correlation.max(1)
-        other = self.correlation[:, 1:].max(1)
-        certain = _is_clear(self.correlation) & (best.indices == 0)
-        certain[torch.bincount(self.runs).argmax()] = True
-        turn = self.hull.turns[torch.where(certain, 0, other.indices + 1)[self.runs]]
-        a = trajectory.T_cam_obj.rotation.inverse()
-        b = SO3.from_matrix(turn).inverse() @ a
-        return angle_between(b, mean_rotation(b @ a.inverse()) @ a)
+    @property
+    def doubt(self) -> float:
+        """Mean error of the given rotations if for every run but the longest that turn were right which colours exclude
+        least [radians]; 0 if they confirm all runs as given."""
+        confirmed = _is_clear(self.correlation) & (self.correlation.argmax(1) == 0)
+        confirmed[self.reference] = True
+        least_excluded = self.correlation[:, 1:].argmax(1) + 1
+        angle = SO3.from_matrix(self.hull.turns[least_excluded]).angle()
+        return float(torch.where(confirmed, 0.0, angle)[self.runs].mean())
 
 
 def estimate_turns(capture: Capture, trajectory: Trajectory, usable: Bool[Tensor, " t"]) -> Turns | None:
@@ -145,7 +142,8 @@ def estimate_turns(capture: Capture, trajectory: Trajectory, usable: Bool[Tensor
     if not bool(runs.any()):
         return None
     maps, weights = _colour_maps(capture, trajectory, hull, frames, runs)
-    return Turns(hull, runs, *_choose(maps, weights, int(torch.bincount(runs[frames]).argmax())))
+    reference = int(torch.bincount(runs[frames]).argmax())
+    return Turns(hull, runs, reference, *_choose(maps, weights, reference))
 
 
 def _gaps(rotations: SO3, usable: Bool[Tensor, " t"], turns: SO3 | None) -> Bool[Tensor, " t"]:
@@ -257,15 +255,14 @@ def _colour_maps(
 
     The three components of a colour are brightness and two differences of channels.
     """
-    images = _contrast_images(capture.select(frames.tolist()))
-    T, camera = trajectory.select(frames).T_cam_obj, capture.camera
-    size, camera_centres = torch.tensor([camera.width, camera.height]), T.inverse().xyz
-    runs = runs[frames]
+    images, size = _contrast_images(capture.select(frames.tolist()))
+    T, runs = trajectory.select(frames).T_cam_obj, runs[frames]
+    camera_centres = T.inverse().xyz
 
     def seen(turn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, normals = (hull.positions - hull.centre) @ turn.mT + hull.centre, hull.normals @ turn.mT
         cosine = (normalize(camera_centres[:, None] - x, dim=-1) * normals).sum(-1)
-        uv = camera.project(T[:, None] @ x)
+        uv = capture.camera.project(T[:, None] @ x)
         sampled = grid_sample(images, 2 * uv[:, :, None] / size - 1, align_corners=False)[..., 0].movedim(1, -1)
         weight = (cosine - MIN_COSINE).clamp_min(0) / (1 - MIN_COSINE) * (sampled[..., 3] > 1 - 1e-3)
         return sampled[..., :3], weight, spherical_harmonics.basis(T.rotation[:, None] @ normals, SHADING_DEGREE)
@@ -286,21 +283,29 @@ def _colour_maps(
     return torch.stack(maps, 1), torch.stack(weights, 1)
 
 
-def _contrast_images(capture: Capture) -> Float[Tensor, "t 4 h w"]:
-    """Brightness without its local mean, two differences of channels [logarithm of linear light], and object pixels."""
-    inside = (capture.masks == OBJECT).float()[:, None]
-    light = (linear_from_srgb(capture.images.float() / 255) + DARK).log().movedim(-1, 1) * inside
-    scale = max(capture.masks.shape[1:]) / IMAGE_SIZE
+def _contrast_images(capture: Capture) -> tuple[Float[Tensor, "t 4 h w"], Float[Tensor, "2"]]:
+    """Brightness without its local mean, two differences of channels [logarithm of linear light], and object pixels.
+
+    They are reduced to about `IMAGE_SIZE`. Also returned are width and height of what they show, in pixels of
+    the capture: rows and columns that are left over are dropped.
+    """
+    factor = max(1, round(max(capture.masks.shape[1:]) / IMAGE_SIZE))
+    inside = (avg_pool2d((capture.masks == OBJECT).float()[:, None], factor) > 1 - 1e-3).float()
+    # One frame at a time, which limits memory.
+    light = torch.stack(
+        [avg_pool2d(linear_from_srgb(image.float() / 255).movedim(-1, 0), factor) for image in capture.images]
+    )
+    light = (light + DARK).log() * inside
 
     def mean(x: Tensor, width: int) -> Tensor:
-        odd = 1 + 2 * round((width * scale - 1) / 2)
-        within, counted = (avg_pool2d(each, odd, 1, odd // 2) for each in (x, inside))
+        within, counted = (avg_pool2d(each, width, 1, width // 2) for each in (x, inside))
         return within / counted.clamp_min(1e-3) * inside
 
     red, green, blue = mean(light, SMOOTHING).split(1, 1)
     brightness = (red + green + blue) / 3 - mean(light.mean(1, keepdim=True), MEAN_WINDOW)
     differences = ((red - green) / math.sqrt(2), (red + green - 2 * blue) / math.sqrt(6))
-    return torch.cat([brightness, *differences, inside], 1)
+    size = factor * torch.tensor([float(inside.shape[3]), float(inside.shape[2])])
+    return torch.cat([brightness, *differences, inside], 1), size
 
 
 def _choose(
