@@ -12,6 +12,7 @@ from tumble.maths import SE3, SO3, angle_between, mean_rotation
 from tumble.poses.result import MAX_USABLE_UNCERTAINTY
 from tumble.poses.sfm import stage, symmetry
 from tumble.poses.sfm.observations import Inputs
+from tumble.poses.sfm.relocalization import longest_smooth_sequence
 from tumble.scene import BACKGROUND, OBJECT, Camera, Capture, Trajectory
 from tumble.synthetic import trajectories
 
@@ -178,3 +179,16 @@ def test_mirror_symmetry_is_computed_once(painted: tuple[Capture, Trajectory], m
         state.step = [step.phase for step in stage.schedule(cfg)].index(phase)
         stage.step(cfg, inputs, state)
     stage.finish(cfg, inputs, state)
+
+
+def test_a_fast_motion_behind_lost_frames_is_kept_if_colours_confirm_it(painted: tuple[Capture, Trajectory]) -> None:
+    """The cube rotates by more than frames of a smooth sequence may, as far as time alone tells."""
+    capture, truth = painted
+    frames = [*range(LOST.start + 1), *range(LOST.stop, FRAMES)]
+    capture, truth = capture.select(frames), truth.select(frames)
+    seen = usable()[frames]
+    R = truth.T_cam_obj.rotation.matrix()
+    assert int(longest_smooth_sequence(R, seen).sum()) < int(seen.sum())
+    found = symmetry.estimate_turns(capture, truth, seen)
+    assert found is not None
+    assert torch.equal(longest_smooth_sequence(R, seen, found.confirmed), seen)

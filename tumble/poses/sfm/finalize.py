@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
@@ -87,6 +87,8 @@ class Solution:
     confirmed: Bool[Tensor, " t"] | None = None
     """Frames whose poses matches have confirmed, if something hides a part of the object: the others are lost. None if
     the object is in full view, where contours and silhouettes decide."""
+    parts: Int64[Tensor, " t"] | None = None
+    """Parts of the motion between which a pose jump is confirmed by colours (`longest_smooth_sequence`); None: none."""
 
 
 def pose_result(
@@ -121,7 +123,7 @@ def pose_result(
         no_contour = ~contours.reliable.any(1)
         contradicted = (gap > max_gap) | gap.isnan() | (median > MAX_RESIDUAL)
         lost = ~visible | no_contour | (contradicted & (inliers < MIN_INLIERS))
-        lost = ~relocalization.longest_smooth_sequence(R, ~lost)
+        lost = ~relocalization.longest_smooth_sequence(R, ~lost, solution.parts)
     reliable = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < INLIER_THRESHOLD).float()) >= 3
     few = len(frontier_points) < 50
     sphere = _bounding_sphere(torch.cat([frontier_points, X[reliable]]) if few else frontier_points)

@@ -250,6 +250,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     log_focal = torch.zeros((), dtype=torch.float64)
     best = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
     best["posed"] = torch.ones(len(R), dtype=torch.bool)
+    best["confirmed"] = torch.full((len(R),), -1)
     best["steady"] = torch.ones(len(inputs.tracks), dtype=torch.bool)
     return State(
         0, Poses(R, t, log_focal), None, rng, best | {f"loop_{name}": x for name, x in vars(NO_TRACKS).items()}
@@ -411,7 +412,10 @@ def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
 def _align_colours(inputs: Inputs, state: State) -> PhaseResult:
     """Correct the rotations of parts of the motion by symmetric turns of the visual hull where colours contradict."""
     found = _turns(inputs, state.params)
-    if found is None or not found.is_better:
+    if found is None:
+        return state.params, {}
+    state.memory["confirmed"] = found.confirmed
+    if not found.is_better:
         return state.params, {}
     trajectory = found.turned(_in_unit_sphere(inputs, state.params))
     return _from_unit_sphere(inputs, state.params, trajectory), {"turned": float((found.chosen > 0).sum())}
@@ -457,7 +461,7 @@ def _relocalize(inputs: Inputs, state: State, scale: float) -> PhaseResult:
     R, t = state.params.R.clone(), state.params.t.clone()
     n, poses = len(R), replace(state.params, R=R, t=t)
     initial_cost = _contour_costs(inputs, poses, scale)
-    smooth = longest_smooth_sequence(R, torch.ones(n, dtype=torch.bool))
+    smooth = longest_smooth_sequence(R, torch.ones(n, dtype=torch.bool), state.memory.get("confirmed"))
     smoothed_cost = torch.nn.functional.avg_pool1d(
         initial_cost.nan_to_num(posinf=9.0)[None], 5, 1, 2, count_include_pad=False
     )[0]
@@ -527,7 +531,10 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     if turns is not None:
         # Matches and contours agree on either side of a gap, but not on the turn between both sides.
         disagreement = disagreement.clamp_min(turns.doubt)
-    solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None)
+    parts = None if turns is None or turns.is_better else turns.confirmed
+    solution = Solution(
+        state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None, parts
+    )
     tracks = _steady_tracks(inputs, state)
     contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])
     tracks = tracks.select(posed[tracks.frame])

@@ -41,6 +41,9 @@ MIN_TURN = math.radians(55)
 frames an object rotates by less."""
 MIN_SPIN = math.radians(25)
 """Angle from which a turn by less than `MIN_TURN` shows that the hull is one of revolution [radians]."""
+MAX_ROTATION_PER_LOST_FRAME = 0.35
+"""Rotation per frame up to which a motion between frames that are not consecutive is plausible [radians]: frames are
+lost where it is fast."""
 REFINEMENT_STEPS = (0.1, 0.05, 0.025, 0.012, 0.006)
 """Steps of the refinement of a turn [radians]."""
 MAX_SURFACE_DISTANCE = 0.05
@@ -116,11 +119,19 @@ class Turns:
     def doubt(self) -> float:
         """Mean error of the given rotations if for every run but the longest that turn were right which colours exclude
         least [radians]; 0 if they confirm all runs as given."""
-        confirmed = _is_clear(self.correlation) & (self.correlation.argmax(1) == 0)
-        confirmed[self.reference] = True
         least_excluded = self.correlation[:, 1:].argmax(1) + 1
         angle = SO3.from_matrix(self.hull.turns[least_excluded]).angle()
-        return float(torch.where(confirmed, 0.0, angle)[self.runs].mean())
+        return float(torch.where(self._clear & (self.chosen == 0), 0.0, angle)[self.runs].mean())
+
+    @property
+    def confirmed(self) -> Int64[Tensor, " t"]:
+        """Run of every frame; -1 if colours do not show its turn."""
+        return torch.where(self._clear[self.runs], self.runs, -1)
+
+    @property
+    def _clear(self) -> Bool[Tensor, " r"]:
+        """Runs whose turn colours show, and the longest."""
+        return _is_clear(self.correlation) | (torch.arange(len(self.chosen)) == self.reference)
 
 
 def estimate_turns(capture: Capture, trajectory: Trajectory, usable: Bool[Tensor, " t"]) -> Turns | None:
@@ -158,7 +169,7 @@ def _gaps(rotations: SO3, usable: Bool[Tensor, " t"], turns: SO3 | None) -> Bool
     begins = torch.zeros_like(usable)
     frames = torch.nonzero(usable)[:, 0]
     i, j = frames[:-1], frames[1:]
-    largest = relocalization.largest_rotation(j - i)
+    largest = (MAX_ROTATION_PER_LOST_FRAME * (j - i)).clamp_min(relocalization.POSE_JUMP)
     step = angle_between(rotations[i], rotations[j])
     if turns is None:
         other = MIN_TURN - step
