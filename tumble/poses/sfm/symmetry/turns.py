@@ -9,7 +9,8 @@ all symmetric turns by their correlation.
 
 Shading is no sign of a turn: it depends on the direction of the normal in the camera frame, which a symmetric turn of
 the object does not change. What low-order harmonics of that direction explain is subtracted from the logarithms of the
-colours, and the mean over nearby pixels from the brightness, where highlights and shadows remain.
+colours, and the mean over nearby pixels from the brightness, where highlights and shadows remain. What a map and its
+turned copies have in common says nothing about the turn and is subtracted as well.
 """
 
 import math
@@ -68,9 +69,9 @@ MIN_CONTRAST = 0.2
 shading leaves on an object of one colour correlates by chance."""
 MIN_COMMON = 0.1
 """Least fraction of the surface that two maps have in common to be compared."""
-MIN_CORRELATION = 0.4
+MIN_CORRELATION = 0.35
 """Least correlation of two maps for their colours to show a turn."""
-CONTRADICTION = 0.6
+CONTRADICTION = 0.65
 """Ratio of the correlations of another turn and of the best one below which colours contradict the other."""
 SWEEPS = 3
 """Number of times that the turn of every run is chosen anew, given those of all others."""
@@ -264,7 +265,8 @@ def _colour_maps(
 ) -> tuple[Float[Tensor, "r s n 3"], Float[Tensor, "r s n"]]:
     """Mean colours of all runs after all turns, without shading [logarithm of linear light], and their weights.
 
-    The three components of a colour are brightness and two differences of channels.
+    What all turns have in common, such as the dark edges of a cube's faces, is subtracted as well. The three components
+    of a colour are brightness and two differences of channels.
     """
     images, size = _contrast_images(capture.select(frames.tolist()))
     T, runs = trajectory.select(frames).T_cam_obj, runs[frames]
@@ -291,7 +293,9 @@ def _colour_maps(
         summed = torch.zeros(*total.shape, 3).index_add_(0, runs, contrast)
         maps.append(summed / total.clamp_min(1e-6)[..., None])
         weights.append(total.clamp_max(1))
-    return torch.stack(maps, 1), torch.stack(weights, 1)
+    mean, weight = torch.stack(maps, 1), torch.stack(weights, 1)
+    common = (mean * weight[..., None]).sum(1) / weight.sum(1).clamp_min(1e-6)[..., None]
+    return mean - common[:, None], weight
 
 
 def _contrast_images(capture: Capture) -> tuple[Float[Tensor, "t 4 h w"], Float[Tensor, "2"]]:
