@@ -85,13 +85,15 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     """A row: matching, stage 1, its scores, and those of stage 2 if `refined`."""
     capture, truth = load(case, root)
     started = time.perf_counter()
-    matches = matching.match_pairs(matching.views_of(sfm.to_match(capture)), neighbours(len(capture)), DRAFT.matcher)
+    hidden = sfm.is_hidden(capture)
+    views = matching.views_of(sfm.shown(capture) if hidden else capture)
+    matches = matching.match_pairs(views, neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()
     if route == "graph":
-        tracked = drive(sfm, DRAFT.track, sfm.gather(capture, matches, DRAFT.matcher), seed=0)
+        tracked = drive(sfm, DRAFT.track, sfm.gather(capture, matches, DRAFT.matcher, hidden=hidden), seed=0)
     else:
         recipe = progressive_poses(DRAFT)
-        assess = partial(sfm.assess, sfm.gather(capture, matches, DRAFT.matcher))
+        assess = partial(sfm.assess, sfm.gather(capture, matches, DRAFT.matcher, hidden=hidden))
         tracked = drive(progressive, recipe.track, progressive.gather(capture, matches, assess), seed=0)
     seconds = time.perf_counter() - started
     quality = tracked.quality

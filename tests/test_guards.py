@@ -55,6 +55,7 @@ MAY_IMPORT = {
 """Rooms that each room may import, besides itself; the files beside them may import all."""
 INNER_ROOMS = {
     "poses.sfm": "poses.progressive",
+    "poses.sfm.symmetry": "poses.progressive",
     "poses.progressive": "poses.sfm",
     "preprocess.hands": "preprocess",
 }
@@ -85,8 +86,8 @@ MODULES = {module(path): path for path in SOURCES}
 def room(name: str) -> str:
     """The room of a module, or the inner room; "" for a file that stands beside the rooms."""
     parts = name.split(".")[1:]
-    inner = ".".join(parts[:2])
-    return inner if inner in INNER_ROOMS else parts[0] if parts and parts[0] in MAY_IMPORT else ""
+    inner = next((each for n in (3, 2) if (each := ".".join(parts[:n])) in INNER_ROOMS), "")
+    return inner or (parts[0] if parts and parts[0] in MAY_IMPORT else "")
 
 
 def imports(path: Path) -> Iterator[tuple[str, str]]:

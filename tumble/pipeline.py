@@ -264,12 +264,13 @@ def _track(
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
-    views = matching.views_of(sfm.to_match(capture))
+    hidden = sfm.is_hidden(capture)
+    views = matching.views_of(sfm.shown(capture) if hidden else capture)
     matches = matching.match_pairs(views, near, recipe.matcher, device=device, cache=cache)
     route = stage_of(recipe.track)
     try:
         with progress.task("observations in all frames"):
-            inputs: Any = sfm.gather(capture, matches, recipe.matcher)
+            inputs: Any = sfm.gather(capture, matches, recipe.matcher, hidden=hidden)
             if route is progressive:
                 inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv3d, grid_sample, max_pool2d, normalize
+from torch.nn.functional import conv3d, grid_sample, max_pool2d, normalize, pad
 
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.scene.trajectory import Trajectory
@@ -69,6 +69,14 @@ def carve(
         protrudes = _protruding(x_obj[left], _sure_fraction(capture, trajectory, x_obj[left], hidden), 2 / resolution)
         smallest[-1, left[protrudes]] = 0
     return smallest[-1].reshape(resolution, resolution, resolution)
+
+
+def padded(capture: Capture) -> Capture:
+    """Masks of twice the size with background around them, because `carve` keeps cells that no frame sees."""
+    top, left = (side // 2 for side in capture.masks.shape[1:])
+    masks = pad(capture.masks, (left, left, top, top), value=BACKGROUND)
+    camera = capture.camera.cropped(-top, -left, *masks.shape[1:])
+    return Capture(masks[..., None].expand(-1, -1, -1, 3), masks, camera, capture.names, capture.light)
 
 
 def _wide_unknown(capture: Capture) -> Bool[Tensor, "t h w"]:

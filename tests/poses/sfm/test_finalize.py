@@ -12,6 +12,7 @@ from tumble.maths.se3 import SE3, SO3
 from tumble.poses.result import Observability, PoseResult
 from tumble.poses.sfm import finalize, frontier_points
 from tumble.poses.sfm.finalize import Solution
+from tumble.poses.sfm.symmetry import mirror_symmetry
 from tumble.poses.sfm.tracks import Tracks, chain_matches
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.synthetic import trajectories
@@ -29,7 +30,13 @@ def result() -> PoseResult:
     R = scene.T_cam_obj.rotation.matrix().clone()
     R[12] = SO3.exp(torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64)).matrix() @ R[12]
     solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE, torch.zeros(24))
-    return finalize.pose_result(scene.capture, tracks, frontier_points.convex_contours(scene.capture), solution)
+    return finalize.pose_result(
+        scene.capture,
+        tracks,
+        frontier_points.convex_contours(scene.capture),
+        mirror_symmetry(scene.capture.masks),
+        solution,
+    )
 
 
 def test_the_object_fills_the_unit_sphere(result: PoseResult) -> None:
@@ -126,7 +133,11 @@ def test_frames_beyond_a_pose_jump_are_lost() -> None:
     R[:2] = R[:2] @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE, torch.zeros(24))
     quality = finalize.pose_result(
-        scene.capture, tracks, frontier_points.convex_contours(scene.capture), solution
+        scene.capture,
+        tracks,
+        frontier_points.convex_contours(scene.capture),
+        mirror_symmetry(scene.capture.masks),
+        solution,
     ).quality
     assert torch.nonzero(quality.lost)[:, 0].tolist() == [0, 1]
     assert quality.rating == "warn"
@@ -155,7 +166,9 @@ def test_rotation_about_an_axis_that_holds_all_texture_is_unobservable(monkeypat
     capture, tracks, solution = on_an_axis()
     sharp = 10 * torch.eye(2, dtype=torch.float64).expand(len(tracks), 2, 2)
     monkeypatch.setattr(finalize.texture_information, "information", lambda capture, tracks: sharp)
-    quality = finalize.pose_result(capture, tracks, frontier_points.convex_contours(capture), solution).quality
+    quality = finalize.pose_result(
+        capture, tracks, frontier_points.convex_contours(capture), mirror_symmetry(capture.masks), solution
+    ).quality
     observability = quality.observability
     assert observability.axis_unobservable
     assert not observability.several_axes_unobservable
@@ -170,7 +183,9 @@ def test_rotation_about_an_axis_that_holds_all_texture_is_unobservable(monkeypat
 def test_no_rotation_of_an_untextured_sphere_is_observable() -> None:
     """Uniform grey images and round contours, whatever the matches are."""
     capture, tracks, solution = on_an_axis()
-    quality = finalize.pose_result(capture, tracks, frontier_points.convex_contours(capture), solution).quality
+    quality = finalize.pose_result(
+        capture, tracks, frontier_points.convex_contours(capture), mirror_symmetry(capture.masks), solution
+    ).quality
     assert quality.observability.several_axes_unobservable
     assert quality.rating == "bad"
     assert quality.sentence.startswith("Rotation is not observable")

@@ -10,7 +10,7 @@ from tumble.evaluation import metrics
 from tumble.maths import SE3, SO3
 from tumble.poses.sfm import segments, stage
 from tumble.poses.sfm.adjustment import Windows
-from tumble.poses.sfm.observations import is_hidden, on_object, to_match
+from tumble.poses.sfm.observations import is_hidden, on_object, shown
 from tumble.poses.sfm.partial import Partial
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match, Trajectory
 
@@ -48,7 +48,7 @@ def scene() -> Tumble:
 @pytest.fixture(scope="module")
 def inputs(scene: Tumble) -> stage.Inputs:
     near = [(t - k, t) for k in (1, 2, 4) for t in range(k, N)]
-    return stage.gather(hidden(scene), matched(scene, hidden(scene), near), "mixed")
+    return stage.gather(hidden(scene), matched(scene, hidden(scene), near), "mixed", hidden=True)
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +97,9 @@ def test_only_a_wide_unknown_region_hides_the_object(scene: Tumble) -> None:
 
 
 def test_what_hides_the_object_is_matched_as_well(scene: Tumble) -> None:
-    capture = to_match(hidden(scene))
+    capture = shown(hidden(scene))
     assert torch.equal(capture.masks == OBJECT, scene.capture.masks == OBJECT)
     assert not (capture.masks == UNKNOWN).any()
-    assert to_match(scene.capture) is scene.capture
 
 
 def test_a_correspondence_needs_one_end_on_the_object(scene: Tumble) -> None:

@@ -2,10 +2,10 @@
 
 Relative poses of pairs of frames, rotation averaging, bundle adjustment of feature tracks and frontier points of
 silhouettes, loop closure and relocalization; `stage` runs them in order. An object that hands hide in part is posed by
-`segments` instead, from parts of the capture that are certain.
+`segments` instead, from parts of the capture that are certain. `symmetry` has what concerns symmetric objects.
 """
 
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.stage import Config, assess, gather, to_match
+from tumble.poses.sfm.stage import Config, assess, gather, is_hidden, shown
 
-__all__ = ["Config", "gather", "assess", "stage", "to_match"]
+__all__ = ["Config", "assess", "gather", "is_hidden", "shown", "stage"]

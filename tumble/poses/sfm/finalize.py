@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
 from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult
-from tumble.poses.sfm import bundle_adjustment, relocalization, symmetry, texture_information
+from tumble.poses.sfm import bundle_adjustment, relocalization, texture_information
 from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
 from tumble.poses.sfm.relocalization import ContourConstraints
 from tumble.poses.sfm.symmetry import MirrorSymmetry
@@ -87,10 +87,22 @@ class Solution:
     confirmed: Bool[Tensor, " t"] | None = None
     """Frames whose poses matches have confirmed, if something hides a part of the object: the others are lost. None if
     the object is in full view, where contours and silhouettes decide."""
+    parts: Int64[Tensor, " t"] | None = None
+    """Parts of the motion between which a pose jump is confirmed by colours (`longest_smooth_sequence`); None: none."""
 
 
-def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: Solution) -> PoseResult:
-    """Result of stage 1 for estimated poses: lost frames, poses in the object's frame and unit, points and quality."""
+def pose_result(
+    capture: Capture, tracks: Tracks, contours: Contours, mirror_symmetry: MirrorSymmetry, solution: Solution
+) -> PoseResult:
+    """Result of stage 1 for estimated poses: lost frames, poses in the object's frame and unit, points and quality.
+
+    Args:
+        capture: Images and masks of all frames.
+        tracks: Feature tracks.
+        contours: Convex contours of all silhouettes.
+        mirror_symmetry: Mirror symmetry of all silhouettes.
+        solution: The estimated poses.
+    """
     R, t, camera = solution.R, solution.t, capture.camera
     radius = torch.full((len(R),), solution.radius, dtype=torch.float64)
     X = bundle_adjustment.triangulate(tracks, R, t, camera, radius)
@@ -111,7 +123,7 @@ def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: 
         no_contour = ~contours.reliable.any(1)
         contradicted = (gap > max_gap) | gap.isnan() | (median > MAX_RESIDUAL)
         lost = ~visible | no_contour | (contradicted & (inliers < MIN_INLIERS))
-        lost = ~relocalization.longest_smooth_sequence(R, ~lost)
+        lost = ~relocalization.longest_smooth_sequence(R, ~lost, solution.parts)
     reliable = torch.zeros(tracks.n).index_add_(0, tracks.point, (residual < INLIER_THRESHOLD).float()) >= 3
     few = len(frontier_points) < 50
     sphere = _bounding_sphere(torch.cat([frontier_points, X[reliable]]) if few else frontier_points)
@@ -125,7 +137,9 @@ def pose_result(capture: Capture, tracks: Tracks, contours: Contours, solution: 
     trajectory = _trajectory(T, capture)
     points = ((X[reliable] - centre) / scale) @ R_first.mT
     colours = _point_colours(capture, tracks, residual, reliable)
-    observability = _observability(capture, contours, solution, problem, scene, residual < INLIER_THRESHOLD)
+    observability, textured = _observability(capture, contours, solution, problem, scene, residual < INLIER_THRESHOLD)
+    if not textured:
+        observability = _observability_from_symmetry(observability, mirror_symmetry)
     disagreement = solution.rotation_disagreement.float()
     rotation_range = angle_between(T.rotation[:, None], T.rotation).max().float()
     quality = PoseQuality(
@@ -344,11 +358,12 @@ def _observability(
     problem: bundle_adjustment.Problem,
     scene: bundle_adjustment.BundleState,
     inlier: Tensor,
-) -> Observability:
+) -> tuple[Observability, bool]:
     """Standard deviations of a frame's rotation, from the Fisher information of texture and contours.
 
     The points are held fixed, the translation is eliminated, and the information is averaged over frames, normalised by
-    its trace. An untextured body of revolution is recognised by the mirror symmetry of its silhouettes instead.
+    its trace. Also returned is whether the object has texture, without which a body of revolution is recognised by the
+    mirror symmetry of its silhouettes instead.
     """
     R, t, camera, n = solution.R, solution.t, capture.camera, len(solution.R)
     texture = texture_information.information(capture, problem.tracks) * inlier[:, None, None]
@@ -376,8 +391,7 @@ def _observability(
     estimate = Observability(axes[:, 0].float(), eigenvalues.clamp_min(1 / torch.pi**2).rsqrt().float())
     smaller, larger = torch.linalg.eigvalsh(texture).T
     # Rounding leaves a small eigenvalue along an edge.
-    untextured = bool((smaller > 1e-6 * larger).double().mean() < MIN_TEXTURED_FRACTION)
-    return _observability_from_symmetry(estimate, symmetry.mirror_symmetry(capture.masks)) if untextured else estimate
+    return estimate, not bool((smaller > 1e-6 * larger).double().mean() < MIN_TEXTURED_FRACTION)
 
 
 def _observability_from_symmetry(estimate: Observability, mirror_symmetry: MirrorSymmetry) -> Observability:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize, pad
+from torch.nn.functional import grid_sample, normalize
 
 from tumble import matching
 from tumble.maths import SE3
@@ -55,7 +55,7 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
         count: Maximum number of pairs.
         gap: Pairs are more than this number of frames apart.
     """
-    cells = visual_hull.carve(padded(capture), trajectory, resolution=HULL_RESOLUTION)
+    cells = visual_hull.carve(visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION)
     if not bool((cells > 0.5).any()):
         return []
     normals = visual_hull.outward_gradient(cells)
@@ -77,14 +77,6 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
         uv = capture.camera.project(trajectory.T_cam_obj[j] @ pixels.x_obj)
         matches.append(_match_warped(capture, matcher, i, j, pixels, uv, cosine > MIN_COSINE))
     return [match for match in matches if len(match) >= MIN_MATCHES]
-
-
-def padded(capture: Capture) -> Capture:
-    """Masks of twice the size with background around them, because carving keeps cells that no frame sees."""
-    top, left = (side // 2 for side in capture.masks.shape[1:])
-    masks = pad(capture.masks, (left, left, top, top), value=BACKGROUND)
-    camera = capture.camera.cropped(-top, -left, *masks.shape[1:])
-    return Capture(masks[..., None].expand(-1, -1, -1, 3), masks, camera, capture.names, capture.light)
 
 
 def _cosine(

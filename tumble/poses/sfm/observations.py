@@ -17,6 +17,7 @@ from torch import Tensor
 from tumble.poses.sfm import frontier_points, relative_pose
 from tumble.poses.sfm.frontier_points import Contours
 from tumble.poses.sfm.relative_pose import Silhouettes
+from tumble.poses.sfm.symmetry import MirrorSymmetry, mirror_symmetry
 from tumble.poses.sfm.tracks import Tracks, chain_matches
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match
 
@@ -48,6 +49,8 @@ class Inputs:
     """Approximate radius of the object [mean distance]."""
     matcher: str
     """Name of the matcher for loop closure: a file of `matching`."""
+    mirror_symmetry: MirrorSymmetry
+    """Mirror symmetry of all silhouettes, by which a body of revolution is recognised."""
     all_matches: Sequence[Match] = field(default=(), repr=False)
     """If the object is hidden in part: matches of everything that is not background, a hand for example, as well."""
 
@@ -57,17 +60,17 @@ class Inputs:
         return bool(self.all_matches)
 
 
-def gather(capture: Capture, matches: Sequence[Match], matcher: str) -> Inputs:
+def gather(capture: Capture, matches: Sequence[Match], matcher: str, *, hidden: bool = False) -> Inputs:
     """Extract silhouettes, contours and tracks from a capture and the matches between its frames.
 
     Args:
-        matches: Matches between the frames of `to_match(capture)`.
+        matches: Matches between the frames of the capture; of `shown(capture)` if the object is hidden in part.
         matcher: Name of the matcher for loop closure.
+        hidden: Whether something hides a part of the object (`is_hidden`).
 
     Raises:
         ValueError: No frame shows the object.
     """
-    hidden = is_hidden(capture)
     capture = replace(capture, masks=frontier_points.fill_boundary_bands(capture.masks))
     silhouettes = relative_pose.silhouettes(capture)
     if not bool(silhouettes.visible.any()):
@@ -79,7 +82,8 @@ def gather(capture: Capture, matches: Sequence[Match], matcher: str) -> Inputs:
     contours = replace(contours, reliable=contours.reliable & ~failed[:, None])
     silhouettes = relative_pose.replace_failed(silhouettes, failed)
     radius = RADIUS_MARGIN * float(silhouettes.radius[silhouettes.visible].median())
-    return Inputs(capture, sure, silhouettes, contours, tracks, radius, matcher, matches if hidden else ())
+    mirror = mirror_symmetry(capture.masks)
+    return Inputs(capture, sure, silhouettes, contours, tracks, radius, matcher, mirror, matches if hidden else ())
 
 
 def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Capture) -> Tracks:
@@ -106,11 +110,6 @@ def shown(capture: Capture) -> Capture:
     """The capture with everything that is not background in its masks: the object and what hides it."""
     masks = torch.where(capture.masks == BACKGROUND, capture.masks, torch.full_like(capture.masks, OBJECT))
     return replace(capture, masks=masks)
-
-
-def to_match(capture: Capture) -> Capture:
-    """The capture whose frames are matched: with what hides the object, if something does."""
-    return shown(capture) if is_hidden(capture) else capture
 
 
 def on_object(match: Match, masks: UInt8[Tensor, "t h w"]) -> Match:

@@ -122,9 +122,8 @@ def _triangulated(observed: Observed, part: Partial, tracks: Tracks) -> tuple[Te
     radius = inputs.silhouettes.radius[list(part.frames)]
     X = bundle_adjustment.triangulate(tracks, part.R, part.t, camera, radius)
     x = torch.einsum("oij,oj->oi", part.R[tracks.frame], X[tracks.point]) + part.t[tracks.frame]
-    focal, principal = camera.fx_fy_cx_cy.double().split(2)
-    uv = x[:, :2] / x[:, 2:].clamp_min(bundle_adjustment.MIN_DEPTH) * focal + principal
-    return X, (uv - tracks.uv).norm(dim=-1) < MAX_POINT_ERROR
+    in_front = torch.cat([x[:, :2], x[:, 2:].clamp_min(bundle_adjustment.MIN_DEPTH)], 1)
+    return X, (camera.project(in_front) - tracks.uv).norm(dim=-1) < MAX_POINT_ERROR
 
 
 def pruned(observed: Observed, part: Partial, tolerance: float) -> Partial:

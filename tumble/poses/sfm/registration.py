@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 
 from tumble.maths import SO3, angle_between
+from tumble.poses.sfm import bundle_adjustment
 from tumble.poses.sfm.partial import Observed, Partial, adjusted, contour_cost, pruned, surface_points
 
 TOLERANCE = 3.0
@@ -148,8 +149,8 @@ def _errors(
 ) -> Float[np.ndarray, " c"]:
     """Reprojection errors [pixels]."""
     x = X @ solution[0].T + solution[1]
-    focal, principal = observed.keypoints.camera.fx_fy_cx_cy.double().numpy().reshape(2, 2)
-    return np.linalg.norm(x[:, :2] / x[:, 2:].clip(0.05) * focal + principal - uv, axis=1)
+    x[:, 2] = x[:, 2].clip(bundle_adjustment.MIN_DEPTH)
+    return np.linalg.norm(observed.keypoints.camera.project(torch.from_numpy(x)).numpy() - uv, axis=1)
 
 
 def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
@@ -98,15 +98,26 @@ def candidate_rotations() -> Float[Tensor, "k 3 3"]:
     return SO3.exp(omega).matrix()
 
 
-def longest_smooth_sequence(R: Float[Tensor, "t 3 3"], usable: Bool[Tensor, " t"]) -> Bool[Tensor, " t"]:
+def longest_smooth_sequence(
+    R: Float[Tensor, "t 3 3"], usable: Bool[Tensor, " t"], confirmed: Int64[Tensor, " t"] | None = None
+) -> Bool[Tensor, " t"]:
     """Mask of the longest sequence of usable frames without a pose jump, by dynamic programming.
 
     Frames may be skipped. Two successive frames of the sequence differ by less than `POSE_JUMP`, or by less than
     `MAX_ROTATION_PER_FRAME` times their distance in frames where that is more.
+
+    Args:
+        R: `R_cam_obj` of all frames.
+        usable: Frames that the sequence may consist of.
+        confirmed: Part of the motion that every frame belongs to, negative if colours do not confirm how the part is
+            joined to the others; between parts that they confirm there may be a pose jump. None: one part.
     """
     frames = torch.nonzero(usable)[:, 0]
     angle = angle_between(SO3.from_matrix(R[frames][:, None]), SO3.from_matrix(R[frames]))
     follows = angle < (MAX_ROTATION_PER_FRAME * (frames[:, None] - frames).abs()).clamp_min(POSE_JUMP)
+    if confirmed is not None:
+        part = confirmed[frames]
+        follows |= (part[:, None] != part) & (part[:, None] >= 0) & (part >= 0)
     length, predecessor = [], []
     for k in range(len(frames)):
         candidates = [(length[i], i) for i in torch.nonzero(follows[k, :k])[:, 0].tolist()]

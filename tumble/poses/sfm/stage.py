@@ -7,6 +7,9 @@ frames are found anew. Necker reversal is resolved where it arises: each window 
 and the better result is kept. Frames whose contour contradicts the others are relocalized by a search over many
 rotations.
 
+What contours do not show is corrected by texture: the rotation of a body of revolution about its axis, and turns of a
+part of the motion that leave the visual hull as it is (`symmetry`).
+
 A capture that has not converged is attempted again with the settings in `Config.fallbacks`, and the best result is
 kept. A focal length that is only assumed is estimated as well whenever all frames are adjusted together.
 
@@ -29,7 +32,8 @@ from tumble.poses.sfm.finalize import Solution, pose_result
 from tumble.poses.sfm.loop_closure import loop_closures
 from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres, with_focal_length
 from tumble.poses.sfm.observations import gather as gather
-from tumble.poses.sfm.observations import to_match as to_match
+from tumble.poses.sfm.observations import is_hidden as is_hidden
+from tumble.poses.sfm.observations import shown as shown
 from tumble.poses.sfm.relocalization import (
     MIN_GAPS,
     POSE_JUMP,
@@ -43,7 +47,7 @@ from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
 from tumble.scene import Trajectory
 
-VERSION = 14
+VERSION = 15
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -60,6 +64,8 @@ MAX_LOOP_PAIRS = 60
 """Maximum number of frame pairs for loop closure."""
 LOOP_DISTANCE = 12
 """Pairs for loop closure are more than this far apart in time [frames]."""
+MAX_COST_RATIO = 4.0
+"""Robust cost of a frame's tangency gaps above which its pose does not show a gap of the motion [median]."""
 BOUNDING_RADIUS_FACTOR = 1.3
 """Radius of a sphere about the origin that safely contains the object, over the object's approximate radius."""
 RELOCALIZATION_SCALE = 0.7
@@ -164,6 +170,11 @@ class AlignTexture:
 
 
 @dataclass(frozen=True)
+class AlignColours:
+    """Turn a part of the motion by a rotation that silhouettes do not show, where colours say so (`symmetry.turns`)."""
+
+
+@dataclass(frozen=True)
 class CloseLoops:
     """Match frames that are far apart in time and see the same side, if the object is a body of revolution."""
 
@@ -181,7 +192,17 @@ class JoinSegments:
     """Pose the frames of an object that is hidden in part (`segments`); the other frames are lost."""
 
 
-Phase = AverageRotations | AdjustWindows | AdjustAll | KeepBest | AlignTexture | CloseLoops | Relocalize | JoinSegments
+Phase = (
+    AverageRotations
+    | AdjustWindows
+    | AdjustAll
+    | KeepBest
+    | AlignTexture
+    | AlignColours
+    | CloseLoops
+    | Relocalize
+    | JoinSegments
+)
 
 
 @dataclass(frozen=True)
@@ -209,12 +230,12 @@ def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
     for attempt, sizes in enumerate((cfg.window_sizes, *(fallback.window_sizes for fallback in cfg.fallbacks))):
         phases = [AverageRotations(), *map(AdjustWindows, sizes), *map(AdjustAll, cfg.global_scales)]
         # Only what has not converged is mended, before attempts are compared: contours rescue some but not others.
+        # The loss of the first attempt decides whether any more steps follow.
         steps += [Step(phase, attempt) for phase in (*phases, *([keep] if attempt == 0 else []))]
-        steps += [Step(phase, attempt, mends=True) for phase in relocalization * cfg.relocalizations]
-        steps += [Step(keep, attempt, mends=True)] if attempt > 0 or cfg.relocalizations else []
+        steps += [Step(phase, attempt, mends=True) for phase in (*relocalization * cfg.relocalizations, keep)]
     steps.append(Step(AlignTexture()))
     for _ in range(cfg.relocalizations):
-        steps += map(Step, (CloseLoops(), *relocalization))
+        steps += map(Step, (AlignColours(), CloseLoops(), *relocalization))
     return steps
 
 
@@ -229,6 +250,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     log_focal = torch.zeros((), dtype=torch.float64)
     best = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
     best["posed"] = torch.ones(len(R), dtype=torch.bool)
+    best["confirmed"] = torch.full((len(R),), -1)
     best["steady"] = torch.ones(len(inputs.tracks), dtype=torch.bool)
     return State(
         0, Poses(R, t, log_focal), None, rng, best | {f"loop_{name}": x for name, x in vars(NO_TRACKS).items()}
@@ -265,6 +287,8 @@ def _run_phase(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "Phas
             return _keep_best(cfg, inputs, state, scale)
         case AlignTexture():
             return _align_texture(inputs, state)
+        case AlignColours():
+            return _align_colours(inputs, state)
         case CloseLoops():
             return _close_loops(inputs, state)
         case Relocalize(scale):
@@ -368,6 +392,13 @@ def _in_unit_sphere(inputs: Inputs, poses: Poses) -> Trajectory:
     return Trajectory(SE3.from_rotation(SO3.from_matrix(R), t), inputs.capture.light)
 
 
+def _from_unit_sphere(inputs: Inputs, poses: Poses, trajectory: Trajectory) -> Poses:
+    """Poses in the unit of this stage, of which others are those of `_in_unit_sphere`."""
+    T_cam_obj = trajectory.T_cam_obj
+    t = T_cam_obj.xyz.double() * (BOUNDING_RADIUS_FACTOR * inputs.radius)
+    return replace(poses, R=T_cam_obj.rotation.matrix().double(), t=t)
+
+
 def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
     """Correct the rotations of a body of revolution about its axis where texture contradicts them."""
     found = _spin(inputs, state.params)
@@ -375,14 +406,31 @@ def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
         return state.params, {}
     trajectory = found.surface.turned(_in_unit_sphere(inputs, state.params), found.angle)
     state.memory["steady"] = symmetry.steady_observations(inputs.capture, trajectory, found.surface, inputs.tracks)
-    T_cam_obj = trajectory.T_cam_obj
-    t = T_cam_obj.xyz.double() * (BOUNDING_RADIUS_FACTOR * inputs.radius)
-    return replace(state.params, R=T_cam_obj.rotation.matrix().double(), t=t), {"turned": found.angle.abs().median()}
+    return _from_unit_sphere(inputs, state.params, trajectory), {"turned": found.angle.abs().median()}
+
+
+def _align_colours(inputs: Inputs, state: State) -> PhaseResult:
+    """Correct the rotations of parts of the motion by symmetric turns of the visual hull where colours contradict."""
+    found = _turns(inputs, state.params)
+    if found is None:
+        return state.params, {}
+    state.memory["confirmed"] = found.confirmed
+    if not found.is_better:
+        return state.params, {}
+    trajectory = found.turned(_in_unit_sphere(inputs, state.params))
+    return _from_unit_sphere(inputs, state.params, trajectory), {"turned": float((found.chosen > 0).sum())}
+
+
+def _turns(inputs: Inputs, poses: Poses) -> symmetry.Turns | None:
+    """Symmetric turns of parts of the motion that colours show."""
+    cost = _contour_costs(inputs, poses, RELOCALIZATION_SCALE)
+    usable = cost <= max(MAX_COST_RATIO * float(cost.median()), TOLERATED_COST)
+    return symmetry.estimate_turns(inputs.capture, _in_unit_sphere(inputs, poses), usable & ~cost.isinf())
 
 
 def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
     """Rotations about the axis that the texture of a body of revolution shows, relative to the poses."""
-    silhouettes = symmetry.mirror_symmetry(inputs.capture.masks)
+    silhouettes = inputs.mirror_symmetry
     if not silhouettes.is_revolution or silhouettes.is_sphere:
         return None
     return symmetry.estimate_spin(inputs.capture, _in_unit_sphere(inputs, poses))
@@ -399,7 +447,7 @@ def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float) -> Phase
 
 def _close_loops(inputs: Inputs, state: State) -> PhaseResult:
     """Add loop closures of a body of revolution, whose contours do not determine the rotation about its axis."""
-    if not symmetry.mirror_symmetry(inputs.capture.masks).is_revolution:
+    if not inputs.mirror_symmetry.is_revolution:
         return state.params, {}
     trajectory = _in_unit_sphere(inputs, state.params)
     matches = loop_closures(inputs.capture, trajectory, inputs.matcher, count=MAX_LOOP_PAIRS, gap=LOOP_DISTANCE)
@@ -411,20 +459,9 @@ def _close_loops(inputs: Inputs, state: State) -> PhaseResult:
 def _relocalize(inputs: Inputs, state: State, scale: float) -> PhaseResult:
     """Relocalize frames whose contour contradicts those of the others, in order of distance from consistent frames."""
     R, t = state.params.R.clone(), state.params.t.clone()
-    n, camera = len(R), inputs.capture.camera
-
-    def constraints(k: int, reliable: Tensor) -> ContourConstraints:
-        others = torch.nonzero(reliable & (torch.arange(n) != k))[:, 0]
-        others = others[:: max(1, len(others) // 32)]
-        return ContourConstraints(
-            (R[others], t[others]), inputs.contours[torch.tensor([k])], inputs.contours[others], camera, inputs.radius
-        )
-
-    all_frames = torch.ones(n, dtype=torch.bool)
-    initial_cost = torch.stack(
-        [robust_cost(constraints(k, all_frames).gaps(R[k : k + 1], t[k : k + 1]), scale)[0] for k in range(n)]
-    )
-    smooth = longest_smooth_sequence(R, all_frames)
+    n, poses = len(R), replace(state.params, R=R, t=t)
+    initial_cost = _contour_costs(inputs, poses, scale)
+    smooth = longest_smooth_sequence(R, torch.ones(n, dtype=torch.bool), state.memory.get("confirmed"))
     smoothed_cost = torch.nn.functional.avg_pool1d(
         initial_cost.nan_to_num(posinf=9.0)[None], 5, 1, 2, count_include_pad=False
     )[0]
@@ -440,18 +477,37 @@ def _relocalize(inputs: Inputs, state: State, scale: float) -> PhaseResult:
         near = [i for i in (k, k - 1, k + 1) if 0 <= i < n]
         R_try = torch.cat([R[k : k + 1], *(rotations @ R[i] for i in near)])
         t_try = torch.cat([t[k : k + 1], (centres[k] * t[near, 2].mean()).expand(len(R_try) - 1, 3)])
-        current_cost = robust_cost(constraints(k, reliable).gaps(R_try[:1], t_try[:1]), scale)[0]
+        current_cost = robust_cost(_constraints(inputs, poses, k, reliable).gaps(R_try[:1], t_try[:1]), scale)[0]
         neighbour = k - 1 if k > seed else k + 1
         if reliable[neighbour]:
             near_neighbour = angle_between(SO3.from_matrix(R_try), SO3.from_matrix(R[neighbour])) < POSE_JUMP
             current_cost = current_cost if near_neighbour[0] else torch.full_like(current_cost, torch.inf)
             R_try, t_try = R_try[near_neighbour], t_try[near_neighbour]
-        (R_new, t_new), new_cost = relocalize(constraints(k, reliable), R_try, t_try, scale=scale)
+        (R_new, t_new), new_cost = relocalize(_constraints(inputs, poses, k, reliable), R_try, t_try, scale=scale)
         if new_cost < 0.9 * current_cost:
             R[k], t[k] = R_new, t_new
             n_relocalized += 1
         reliable[k] = new_cost <= max_cost
     return replace(state.params, R=R, t=t), {"relocated": float(n_relocalized)}
+
+
+def _constraints(inputs: Inputs, poses: Poses, k: int, reliable: Bool[Tensor, " t"]) -> ContourConstraints:
+    """Constraints on the pose of frame k by the contours of about 32 reliable frames."""
+    others = torch.nonzero(reliable & (torch.arange(len(reliable)) != k))[:, 0]
+    others = others[:: max(1, len(others) // 32)]
+    contour, reference = inputs.contours[torch.tensor([k])], inputs.contours[others]
+    return ContourConstraints(
+        (poses.R[others], poses.t[others]), contour, reference, inputs.capture.camera, inputs.radius
+    )
+
+
+def _contour_costs(inputs: Inputs, poses: Poses, scale: float) -> Float[Tensor, " t"]:
+    """Robust cost of every frame's tangency gaps with all others; infinite where too few are valid."""
+    every = torch.ones(len(poses.R), dtype=torch.bool)
+    gaps = [
+        _constraints(inputs, poses, k, every).gaps(poses.R[k : k + 1], poses.t[k : k + 1]) for k in range(len(every))
+    ]
+    return torch.cat([robust_cost(each, scale) for each in gaps])
 
 
 def assess(inputs: Inputs, trajectory: Trajectory) -> PoseResult:
@@ -471,10 +527,18 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     if found is not None and found.is_better:
         # Matches and contours agree, but matches are wrong about the spin, which contours do not show.
         disagreement = torch.maximum(disagreement, found.angle.abs().double())
-    solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None)
+    turns = None if inputs.hidden else _turns(inputs, state.params)
+    if turns is not None:
+        # Matches and contours agree on either side of a gap, but not on the turn between both sides.
+        disagreement = disagreement.clamp_min(turns.doubt)
+    parts = None if turns is None or turns.is_better else turns.confirmed
+    solution = Solution(
+        state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None, parts
+    )
     tracks = _steady_tracks(inputs, state)
     contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])
-    return pose_result(inputs.capture, tracks.select(posed[tracks.frame]), contours, solution)
+    tracks = tracks.select(posed[tracks.frame])
+    return pose_result(inputs.capture, tracks, contours, inputs.mirror_symmetry, solution)
 
 
 def _rotation_disagreement(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:

@@ -1,0 +1,19 @@
+"""Symmetries of the object, and the rotations that silhouettes therefore do not show.
+
+The silhouettes of a body of revolution (`mirror`) hide its rotation about the axis (`spin`), those of a box or a prism
+hide the turns that leave the visual hull as it is (`turns`). Texture and colours show both.
+"""
+
+from tumble.poses.sfm.symmetry.mirror import MirrorSymmetry, mirror_symmetry
+from tumble.poses.sfm.symmetry.spin import Spin, estimate_spin, steady_observations
+from tumble.poses.sfm.symmetry.turns import Turns, estimate_turns
+
+__all__ = [
+    "MirrorSymmetry",
+    "Spin",
+    "Turns",
+    "estimate_spin",
+    "estimate_turns",
+    "mirror_symmetry",
+    "steady_observations",
+]
