@@ -38,12 +38,20 @@ def intersect(T_cam_obj: SE3) -> tuple[Tensor, Tensor, Tensor]:
     return x, axis * x.sign(), enter.values < leave
 
 
-def film(painted: bool) -> tuple[Capture, Trajectory]:
-    """A cube that a hand tumbles, with tiles of random colours or of one colour."""
+def film(painted: bool, alike: float = 0.0) -> tuple[Capture, Trajectory]:
+    """A cube that a hand tumbles, with tiles of random colours or of one colour.
+
+    Args:
+        alike: How much of the difference between the tiles and those after a half turn about y is taken away.
+    """
     rng = torch.Generator().manual_seed(0)
     T = trajectories.handheld(FRAMES, DISTANCE, seed=0)
     T = SE3(T.wxyz.float(), T.xyz.float())
     colours = 0.1 + 0.8 * torch.rand(6, TILES, TILES, 3, generator=rng) if painted else torch.tensor([0.3, 0.5, 0.7])
+    if alike:
+        # Faces are -x, x, -y, y, -z, z; the tiles of an axis are counted along the next axis and the one after it.
+        opposite = torch.cat([colours[:2].flip(0, 2), colours[2:4].flip(1, 2), colours[4:].flip(0, 1)])
+        colours = colours + alike * (opposite - colours) / 2
     images, masks = [], []
     for i in range(FRAMES):
         x, normal, hit = intersect(T[i])
@@ -115,6 +123,20 @@ def test_a_part_of_the_motion_that_is_a_quarter_turn_off_comes_back(painted: tup
     assert error(found.turned(wrong).T_cam_obj, truth) < 2
     # 19 of 40 frames are closer to the second part, a right angle off.
     assert math.degrees(found.doubt) == pytest.approx(90 * 19 / 40, abs=2)
+
+
+def test_the_better_of_two_similar_turns_replaces_poses_that_colours_contradict_and_doubt_remains() -> None:
+    capture, truth = film(painted=True, alike=0.75)
+    found = symmetry.estimate_turns(capture, turned(truth), usable())
+    assert found is not None
+    assert found.is_better
+    right = found.turned(turned(truth))
+    assert error(right.T_cam_obj, truth) < 2
+    again = symmetry.estimate_turns(capture, right, usable())
+    assert again is not None
+    assert not again.is_better
+    # 19 of 40 frames are closer to the second part, which could be half a turn off.
+    assert math.degrees(again.doubt) == pytest.approx(180 * 19 / 40, abs=2)
 
 
 def test_right_poses_of_a_painted_cube_are_confirmed(painted: tuple[Capture, Trajectory]) -> None:

@@ -102,7 +102,7 @@ class Turns:
     correlation: Float[Tensor, "r s"]
     """Correlation of every run with all others after a symmetric turn of the run; the others are turned as chosen."""
     chosen: Int64[Tensor, " r"]
-    """Index of the turn chosen for every run: 0, as given, unless colours contradict that."""
+    """Index of the turn chosen for every run: 0, as given, unless colours show another and contradict the given one."""
 
     @property
     def is_better(self) -> bool:
@@ -343,7 +343,10 @@ def _choose(
             correlation[k] = _correlation(mean, w.sum(0).clamp_max(1), maps[k], weights[k])
             if k != reference:
                 clear[k] = _is_clear(correlation[k])
-                chosen[k] = int(correlation[k].argmax()) if clear[k] else 0
+                best = float(correlation[k].max())
+                # Where two turns are about as good but the given one contradicts the colours, the best is less wrong.
+                wrong = best > MIN_CORRELATION and float(correlation[k, 0]) < CONTRADICTION * best
+                chosen[k] = int(correlation[k].argmax()) if wrong else 0
     return correlation, chosen
 
 
