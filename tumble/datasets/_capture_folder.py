@@ -1,7 +1,8 @@
 """Writer of capture folders (docs/format.md): the entries of transforms.json, and whole captures.
 
-A frame `0007.png` has its image in `images/`, with its background in `full_images/`, its mask in `masks/`, and its ground
-truth in `truth/albedo/0007.exr`, ..., `truth/relit/<light>/0007.png`. `transforms.json` is written last, so a folder without it is an incomplete capture.
+A frame `0007.png` has its image in `images/`, with its background in `full_images/`, its mask in `masks/`, and its
+ground truth in `truth/albedo/0007.exr`, ..., `truth/relit/<light>/0007.png`. `transforms.json` is written last, so a
+folder without it is an incomplete capture.
 """
 
 from collections.abc import Iterable

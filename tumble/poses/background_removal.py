@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from tumble.maths import SE3
@@ -35,9 +34,9 @@ MAX_SHIFT = 0.06
 SURROUNDINGS = 0.18
 """Distance within which a pixel's colour is looked for in the background of the same frame [object size]."""
 MIN_DIFFERENCE = 15.0
-"""Difference from all expected colours of the object in a channel, above which a pixel does not show it [code values]."""
+"""Difference in a channel from all expected colours above which a pixel does not show the object [code values]."""
 MAX_DIFFERENCE = 10.0
-"""Difference in each channel up to which two colours count as equal [code values]."""
+"""Difference from a colour of the background in each channel up to which a pixel shows it [code values]."""
 MAX_GAP = 0.1
 """Distance up to which a region adjoins what is outside, as a band of unknown pixels may lie between [object size]."""
 MIN_AREA = 0.006
@@ -151,6 +150,8 @@ def _background(
         expected: Colours of the object.
         size: Square root of the object's area [pixels].
     """
+    from scipy.spatial import KDTree
+
     inside, outside = labels == OBJECT, labels == BACKGROUND
     distance = cv2.distanceTransform((~outside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
