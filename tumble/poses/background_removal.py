@@ -132,7 +132,7 @@ def _surface(camera: Camera, cells: Float[Tensor, "n 3"]) -> _Surface:
     inside = ((painted >= 0) & (painted < (camera.width, camera.height))).all(1)
     nearest = np.full((camera.height, camera.width), -1)
     nearest[painted[inside, 1], painted[inside, 0]] = np.repeat(order, len(offsets))[inside]
-    visible = ((column_row >= 0) & (column_row < (camera.width, camera.height))).all(1)
+    visible = np.asarray(((column_row >= 0) & (column_row < (camera.width, camera.height))).all(1))
     column, row = column_row[visible].T
     visible[visible] = depth[visible] - depth[nearest[row, column]] < MAX_DEPTH_DIFFERENCE * SPACING
     return _Surface(column_row, visible, nearest)
@@ -171,4 +171,4 @@ def _background(
     adjoins = np.bincount(ids[distance <= MAX_GAP * size], minlength=count) > 0
     chosen = adjoins & (area >= MIN_AREA * size**2)
     chosen[0] = False
-    return chosen[ids]
+    return chosen[np.asarray(ids, np.int64)]
