@@ -12,6 +12,7 @@ import torch
 
 from tests.lopsided import Tumble, truth, tumbling
 from tests.poses.sfm.test_stage import QUICK, matches
+from tests.poses.test_background_removal import PRINT, film, result
 from tests.scene.test_visual_hull import silhouettes
 from tumble import actions, matching, pipeline, recipes
 from tumble.datasets import _capture_folder, folder
@@ -24,7 +25,7 @@ from tumble.io import files, tree, video
 from tumble.io.files import BadFile
 from tumble.rendering import gbuffer
 from tumble.scene.asset import Asset
-from tumble.scene.capture import OBJECT, UNKNOWN, Capture, Truth, truth_without_views
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, content_key, truth_without_views
 from tumble.scene.environment import Environment
 
 RECIPE = dataclasses.replace(recipes.SMOKE, seed=3)
@@ -316,6 +317,21 @@ def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Pat
     # Pictures with a model have names, not numbers.
     files.write_json(tmp_path / "capture" / "ingest.json", {"frames": [{"name": "0000.png", "source": "a.jpg"}]})
     assert actions.source_names(tmp_path, known) == tuple(kept)
+
+
+def test_background_in_the_masks_of_a_held_object_is_removed_after_stage_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only with photos of the background, which captures of films without hands lack; then the masks need a new key."""
+    held, objects, T_cam_obj = film(PRINT)
+    wall = (held.masks == OBJECT) & ~objects
+    monkeypatch.setattr(pipeline, "_track", lambda *_: (result(held.camera, T_cam_obj), "key"))
+    opened = runs.Run(None, RECIPE, None)
+    _, cut, key = pipeline._poses_of(opened, held, Path("film"), "content", "cpu")
+    assert (cut.masks[wall] == BACKGROUND).float().mean() > 0.7
+    assert key == ""
+    without = dataclasses.replace(held, full_images=None)
+    _, same, key = pipeline._poses_of(opened, without, Path("film"), "content", "cpu")
+    assert content_key(same) == content_key(without)
+    assert key == "key"
 
 
 def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

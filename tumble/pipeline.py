@@ -16,7 +16,7 @@ from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import absolute_colour, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
-from tumble.poses import PoseResult, mask_refinement, neighbours
+from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
 from tumble.preprocess import (
@@ -240,7 +240,10 @@ def stage_of(cfg: Any) -> Any:
 def _poses_of(
     opened: run.Run, capture: Capture, where: Path, content: str, device: torch.device | str
 ) -> tuple[PoseResult, Capture, str]:
-    """Stage 1, repeated with trimmed masks while that explains more: poses, capture with these masks, key."""
+    """Stage 1, repeated with trimmed masks while that explains more: poses, capture with the final masks, and its key.
+
+    The key is empty if background was removed from the masks after the last round.
+    """
     if len(capture) < MIN_FRAMES:
         rule = f"has {len(capture)} frames, too few to estimate the motion"
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
@@ -254,7 +257,8 @@ def _poses_of(
             break
         tracked, capture, key = new, trimmed, new_key
     _check_quality(opened, capture, where, tracked)
-    return tracked, capture, key
+    cut = background_removal.remove_background(capture, tracked)
+    return tracked, cut, key if torch.equal(cut.masks, capture.masks) else ""
 
 
 def _track(

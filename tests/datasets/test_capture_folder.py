@@ -96,6 +96,28 @@ def test_a_capture_is_loaded_as_it_was_saved(written: Path) -> None:
     torch.testing.assert_close(loaded_truth.lights["sun"].radiance, truth.lights["sun"].radiance, atol=1 / 128, rtol=0)
 
 
+def test_full_images_are_loaded_as_they_were_saved(tmp_path: Path) -> None:
+    capture = example_capture()[0]
+    assert folder_of(capture, tmp_path / "without").full_images is None
+    full = torch.randint(256, capture.images.shape, dtype=torch.uint8)
+    loaded = folder_of(replace(capture, full_images=full), tmp_path / "with")
+    assert loaded.full_images is not None
+    assert torch.equal(loaded.full_images, full)
+    assert torch.equal(loaded.select([2, 0]).full_images, full[[2, 0]])
+    files.write_png(tmp_path / "with" / "full_images" / "b.png", np.zeros((6, 8, 1), np.uint8))
+    with pytest.raises(BadFile, match=r"full_images/b\.png: has 1 channels instead of 3"):
+        folder.load(tmp_path / "with")
+    files.write_png(tmp_path / "with" / "full_images" / "b.png", np.zeros((5, 8, 3), np.uint8))
+    with pytest.raises(BadFile, match=r"full_images/b\.png: has 8 x 5 pixels"):
+        folder.load(tmp_path / "with")
+
+
+def folder_of(capture: Capture, path: Path) -> Capture:
+    """The capture, saved and loaded."""
+    _capture_folder.save_capture(path, capture)
+    return folder.load(path)
+
+
 def test_a_capture_loads_when_its_truth_is_deleted(written: Path) -> None:
     capture = folder.load(written)
     for path in sorted((written / "truth").rglob("*"), reverse=True):

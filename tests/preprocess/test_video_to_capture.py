@@ -1,12 +1,15 @@
 """Conversion of footage to a capture folder: images, masks and camera are those of the synthetic video."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from tests.films import HEIGHT, WIDTH, scene, written
+from tests.preprocess.test_held_object import landmarks
 from tumble.datasets import folder
 from tumble.io import files, video
 from tumble.io.files import BadFile
@@ -59,6 +62,21 @@ def test_images_masks_and_principal_point_are_consistent(made: tuple[Path, Path]
         assert 1.5 * difference(0, 0) < min(difference(1, 0), difference(-1, 0), difference(0, 1), difference(0, -1))
         assert (image[mask == BACKGROUND] == 0).all()
         assert overlap(inside, truth & (mask != UNKNOWN)) > 0.75
+
+
+def test_only_frames_of_a_held_object_are_kept_with_their_background(made: tuple[Path, Path], tmp_path: Path) -> None:
+    assert folder.load(made[1]).full_images is None
+    assert not (made[1] / "full_images").exists()
+    options = FootageOptions(box=scene().box(), focal=300.0)
+    survey = survey_footage(made[0], options)
+    held = replace(survey, hands=[[landmarks(i)] for i in range(len(survey.images))])
+    kept = video_to_capture.select_frames(held, options)
+    video_to_capture._write(held, kept, video_to_capture.crop_window(held, kept), tmp_path / "held", options)
+    capture = folder.load(tmp_path / "held")
+    assert capture.full_images is not None
+    background = capture.masks == BACKGROUND
+    assert torch.equal(capture.full_images[~background], capture.images[~background])
+    assert capture.full_images[background].float().mean() > 20
 
 
 def test_the_window_contains_the_whole_path_of_the_object(made: tuple[Path, Path]) -> None:

@@ -1,7 +1,8 @@
 """Writer of capture folders (docs/format.md): the entries of transforms.json, and whole captures.
 
-A frame `0007.png` has its image in `images/`, its mask in `masks/`, and its ground truth in `truth/albedo/0007.exr`,
-..., `truth/relit/<light>/0007.png`. `transforms.json` is written last, so a folder without it is an incomplete capture.
+A frame `0007.png` has its image in `images/`, with its background in `full_images/`, its mask in `masks/`, and its
+ground truth in `truth/albedo/0007.exr`, ..., `truth/relit/<light>/0007.png`. `transforms.json` is written last, so a
+folder without it is an incomplete capture.
 """
 
 from collections.abc import Iterable
@@ -38,15 +39,17 @@ def capture_document(
 
 
 def training_frame(
-    name: str, matrix: list[list[float]] | None, light_turn: list[list[float]] | None = None
+    name: str, matrix: list[list[float]] | None, light_turn: list[list[float]] | None = None, *, full: bool = False
 ) -> dict[str, Any]:
     """Entry of a training frame.
 
     Args:
         matrix: Camera to object with OpenGL camera axes; None if unknown.
         light_turn: Rotation of the light in this frame; None if the light does not turn by itself.
+        full: Whether the photo with its background is in full_images/.
     """
     entry: dict[str, Any] = {"file_path": f"images/{name}", "mask_path": f"masks/{name}", "split": "train"}
+    entry |= {"full_image_path": f"full_images/{name}"} if full else {}
     entry |= {} if light_turn is None else {"light_turn": light_turn}
     return entry if matrix is None else entry | {"transform_matrix": matrix}
 
@@ -70,10 +73,13 @@ def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, se
         raise BadFile(path, "exists already", "choose a new folder")
     for name, image, mask in zip(capture.names, capture.images, capture.masks, strict=True):
         _save_image_and_mask(path, name, image, mask)
+    full = capture.full_images is not None
+    for name, image in zip(capture.names, () if capture.full_images is None else capture.full_images, strict=full):
+        files.write_png(path / "full_images" / name, image.cpu().numpy())
     matrices = [None] * len(capture) if capture.trajectory is None else capture.trajectory.camera_to_object().tolist()
     turns = None if capture.trajectory is None else capture.trajectory.light_turns
     frames = [
-        training_frame(name, matrix, None if turns is None else turns[i].tolist())
+        training_frame(name, matrix, None if turns is None else turns[i].tolist(), full=full)
         for i, (name, matrix) in enumerate(zip(capture.names, matrices, strict=True))
     ]
     if truth is not None:

@@ -46,6 +46,7 @@ class FrameRecord(Intrinsics, frozen=True, kw_only=True):
 
     file_path: Name
     mask_path: Name = ""
+    full_image_path: Name = ""
     transform_matrix: Matrix | None = None
     light_turn: Rotation | None = None
     split: Literal["train", "eval"] = "train"

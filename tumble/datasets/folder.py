@@ -86,7 +86,8 @@ def load(path: Path | str) -> Capture:
     names = tuple(frame.name for frame in frames)
     focal_assumed = folder.document.focal_source == "guess"
     light, poses = folder.document.light, _poses(folder, frames)
-    return Capture(images, masks, lenses.common.camera, names, light, poses, focal_assumed)
+    full_images = _read_full_images(folder, frames, lenses) if all(frame.full_image_path for frame in frames) else None
+    return Capture(images, masks, lenses.common.camera, names, light, poses, focal_assumed, full_images)
 
 
 def load_truth(path: Path | str) -> Truth | None:
@@ -198,6 +199,20 @@ def _read_image_and_mask(
             "every frame must show the object: remove the frame, or correct its mask",
         )
     return image, mask
+
+
+def _read_full_images(folder: _Folder, frames: Sequence[FrameRecord], lenses: _Lenses) -> UInt8[Tensor, "t h w 3"]:
+    """The photos with their background."""
+    shape = len(frames), lenses.common.height, lenses.common.width, 3
+    limits.require_bytes(folder.path, 2 * math.prod(shape), f"{len(frames)} frames", limits.MAX_CAPTURE_BYTES)
+    images = np.empty(shape, np.uint8)
+    for i, (frame, lens) in enumerate(zip(frames, lenses.frames, strict=True)):
+        path = files.path_inside(folder.root, frame.full_image_path)
+        pixels = _require_size(files.read_image(path), path, lens)
+        if pixels.shape[2] != 3:
+            raise BadFile(path, f"has {pixels.shape[2]} channels instead of 3 (full_image_path)")
+        images[i], _ = resample(pixels, np.full(pixels.shape[:2], OBJECT, np.uint8), lens, lenses.common)
+    return torch.from_numpy(images)
 
 
 def _require_size(pixels: np.ndarray, path: Path, lens: FrameLens | Camera) -> np.ndarray:

@@ -2,11 +2,20 @@
 
 Two independent methods give the same kind of result, a `PoseResult`: `sfm` estimates all poses at once from matches
 and silhouettes (structure from motion); `progressive` tracks the object frame by frame with a neural field, as in the
-paper. `mask_refinement` trims masks to the shape that the poses give, for another round.
+paper. `mask_refinement` trims masks to the shape that the poses give, for another round; `background_removal` removes
+from the masks what differs from the object as other frames show it.
 """
 
-from tumble.poses import mask_refinement, progressive, sfm
+from tumble.poses import background_removal, mask_refinement, progressive, sfm
 from tumble.poses.frame_pairs import neighbours
 from tumble.poses.result import PoseQuality, PoseResult
 
-__all__ = ["PoseQuality", "PoseResult", "mask_refinement", "neighbours", "progressive", "sfm"]
+__all__ = [
+    "PoseQuality",
+    "PoseResult",
+    "background_removal",
+    "mask_refinement",
+    "neighbours",
+    "progressive",
+    "sfm",
+]

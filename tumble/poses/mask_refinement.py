@@ -65,7 +65,7 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
     """
     kept = torch.nonzero(~result.quality.lost)[:, 0].tolist()
     camera, T_cam_obj = result.camera, result.trajectory.T_cam_obj
-    cells = _hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
+    cells = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
     masks = capture.masks.clone()
     for k in kept:
         silhouette = _silhouette(camera, T_cam_obj[k] @ cells)
@@ -85,7 +85,7 @@ def explains_more(new: PoseResult, old: PoseResult) -> bool:
     return ranks[0] > ranks[1]
 
 
-def _hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[Tensor, "n 3"]:
+def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[Tensor, "n 3"]:
     """Centres of the cells at which few frames show background, object frame."""
     ticks = ((torch.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1) * EXTENT
     cells = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
@@ -97,6 +97,8 @@ def _hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[
         column, row = uv.clamp(min=torch.zeros_like(size), max=size - 1).unbind(-1)
         background += inside & (capture.masks[k][row, column] == BACKGROUND)
         seen += inside
+        left = background <= MAX_BACKGROUND_FRACTION * len(frames)  # the others have lost the vote already
+        cells, background, seen = cells[left], background[left], seen[left]
     return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen)]
 
 

@@ -184,7 +184,11 @@ def _write(
             continue
         files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), image))
         files.write_png(out / "masks" / name, mask[..., None])
-        entries.append(training_frame(name, None))
+        # Masks of a held object may contain background; stage 1 recognises it by what is around the object.
+        held = any(survey.hands)
+        if held:
+            files.write_png(out / "full_images" / name, image)
+        entries.append(training_frame(name, None, full=held))
         records.append(_frame_record(survey, i, name))
     document = capture_document(camera, "camera", entries, setting=None, with_light=False)
     write_preview(survey, out / PREVIEW, kept)

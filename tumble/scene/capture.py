@@ -68,11 +68,14 @@ class Capture:
     """Known object poses, one per frame; None if the poses are unknown."""
     focal_assumed: bool = False
     """Whether the focal length is only assumed; pose estimation then refines it."""
+    full_images: UInt8[Tensor, "t h w 3"] | None = None
+    """The photos with their background, sRGB code values; None if they were not kept."""
 
     def __post_init__(self) -> None:
         t, h, w, _ = self.images.shape
         assert self.masks.shape == (t, h, w), "there must be one mask per image, of the same size"
         assert (self.camera.height, self.camera.width) == (h, w), "camera and images must have the same size"
+        assert self.full_images is None or self.full_images.shape == self.images.shape, "images must have one size"
         assert len(set(self.names)) == len(self.names) == t, "there must be one name per frame, all different"
         assert self.trajectory is None or len(self.trajectory) == t, "there must be one pose per frame"
         assert self.trajectory is None or self.trajectory.light == self.light, "light must match the trajectory's"
@@ -85,7 +88,8 @@ class Capture:
         names = tuple(self.names[i] for i in frames)
         trajectory = self.trajectory.select(frames) if self.trajectory else None
         images, masks = self.images[frames], self.masks[frames]
-        return replace(self, images=images, masks=masks, names=names, trajectory=trajectory)
+        full_images = None if self.full_images is None else self.full_images[frames]
+        return replace(self, images=images, masks=masks, names=names, trajectory=trajectory, full_images=full_images)
 
 
 @dataclass(frozen=True)

@@ -346,9 +346,7 @@ def _hull_overlap(
 
 def _select_frames(capture: Capture, frames: Sequence[int]) -> Capture:
     """Some frames of a capture, without poses."""
-    index = torch.as_tensor(frames)
-    names = tuple(capture.names[k] for k in frames)
-    return replace(capture, images=capture.images[index], masks=capture.masks[index], names=names, trajectory=None)
+    return replace(capture, trajectory=None).select(list(frames))
 
 
 def _observability(
