@@ -33,7 +33,7 @@ from tumble.export import EXPORT_FILE, PresetName, write_asset
 from tumble.glb_scores import score_glb
 from tumble.io import BadFile, files, load_plugin, outputs, progress, tree, video
 from tumble.maths import SE3, to_srgb8
-from tumble.poses import background_removal, mask_refinement
+from tumble.poses import background_removal
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
@@ -465,8 +465,7 @@ def _capture_of_run(out: Path, asset: Asset, names: list[str]) -> Capture | None
         text = f"{path} is gone: the base colour is baked from the Gaussians, not solved from the photographs"
         warnings.warn(text, stacklevel=3)
         return None
-    tracked, capture = mask_refinement.stored_result(out, pipeline.read_capture(path))
-    capture = background_removal.remove_background(capture, tracked) if tracked else capture
+    _, capture = background_removal.stored_result(out, pipeline.read_capture(path))
     return frames_of_run(capture, asset, names, path)
 
 

@@ -73,13 +73,13 @@ def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, se
         raise BadFile(path, "exists already", "choose a new folder")
     for name, image, mask in zip(capture.names, capture.images, capture.masks, strict=True):
         _save_image_and_mask(path, name, image, mask)
-    full = capture.full_images is not None
-    for name, image in zip(capture.names, () if capture.full_images is None else capture.full_images, strict=full):
-        files.write_png(path / "full_images" / name, image.cpu().numpy())
+    if capture.full_images is not None:
+        for name, image in zip(capture.names, capture.full_images, strict=True):
+            files.write_png(path / "full_images" / name, image.cpu().numpy())
     matrices = [None] * len(capture) if capture.trajectory is None else capture.trajectory.camera_to_object().tolist()
     turns = None if capture.trajectory is None else capture.trajectory.light_turns
     frames = [
-        training_frame(name, matrix, None if turns is None else turns[i].tolist(), full=full)
+        training_frame(name, matrix, None if turns is None else turns[i].tolist(), full=capture.full_images is not None)
         for i, (name, matrix) in enumerate(zip(capture.names, matrices, strict=True))
     ]
     if truth is not None:

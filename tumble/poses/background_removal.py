@@ -8,6 +8,7 @@ the object's own colours are unexpected, too, and a wall may have the object's c
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from torch import Tensor
 
 from tumble.maths import SE3
+from tumble.poses import mask_refinement
 from tumble.poses.mask_refinement import EXTENT, RESOLUTION, hull_by_vote
 from tumble.poses.result import PoseResult
 from tumble.scene import BACKGROUND, OBJECT, Camera, Capture
@@ -74,6 +76,12 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
         wrong = torch.from_numpy(_background(photos[i], labels[i], expected[i], size))
         masks[k][wrong], images[k][wrong] = BACKGROUND, 0
     return replace(capture, masks=masks, images=images, full_images=None)
+
+
+def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Capture]:
+    """The poses of a run, None if there are none, and its capture with the masks that stages 2 and 3 have seen."""
+    tracked, trimmed = mask_refinement.stored_result(out, capture)
+    return tracked, remove_background(trimmed, tracked) if tracked else trimmed
 
 
 def _expected_colours(

@@ -30,7 +30,7 @@ from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
 from tumble.io import BadFile, files, progress, tree
 from tumble.maths import fibonacci_sphere
-from tumble.poses import PoseQuality, background_removal, mask_refinement
+from tumble.poses import PoseQuality, background_removal
 from tumble.preprocess import read_provenance
 from tumble.report import coverage, figures, health_card, preset_lights, svg, training_views, worst_frames
 from tumble.report.training_views import RenderedFrame
@@ -95,8 +95,7 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
     full_capture = reader_for(path).load(path)
-    tracked, refined = mask_refinement.stored_result(out, full_capture)
-    refined = background_removal.remove_background(refined, tracked) if tracked else refined
+    tracked, refined = background_removal.stored_result(out, full_capture)
     made = read_provenance(path) if path.is_dir() else None
     hand_coloured = {frame.name: frame.hand_coloured for frame in made.frames} if made else {}
     run_capture = frames_of_run(refined, asset, run.frame_names(out, len(asset.trajectory)), path)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths import SE3
+from tumble.maths import SE3, SO3
 
 Light = Literal["camera", "object"]
 """Frame in which the light is static."""
@@ -72,6 +72,10 @@ class Trajectory:
     def camera_positions(self) -> Float[Tensor, "t 3"]:
         """Camera centres, object frame [object radius]."""
         return self.T_cam_obj.inverse().xyz
+
+    def turned(self, turn: SO3, centre: Float[Tensor, "3"]) -> "Trajectory":
+        """Poses whose object is first turned about a point of the object frame; one turn per pose, or one for all."""
+        return replace(self, T_cam_obj=self.T_cam_obj @ SE3.from_rotation(turn, centre - turn @ centre))
 
     def __len__(self) -> int:
         return self.T_cam_obj.xyz.shape[0]

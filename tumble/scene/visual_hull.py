@@ -79,6 +79,13 @@ def padded(capture: Capture) -> Capture:
     return Capture(masks[..., None].expand(-1, -1, -1, 3), masks, camera, capture.names, capture.light)
 
 
+def view_cosine(
+    camera_centre: Float[Tensor, "*k 3"], x: Float[Tensor, "*n 3"], normals: Float[Tensor, "*n 3"]
+) -> Float[Tensor, "*b"]:
+    """Cosine between the normals of points and their lines of sight to a camera; batch axes are broadcast."""
+    return (normalize(camera_centre - x, dim=-1) * normals).sum(-1)
+
+
 def _wide_unknown(capture: Capture) -> Bool[Tensor, "t h w"]:
     """Unknown pixels except those of narrow bands (morphological opening)."""
     known = (capture.masks != UNKNOWN).float()[:, None]

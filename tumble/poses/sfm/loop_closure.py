@@ -65,7 +65,7 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
         count=count,
         gap=gap,
     )
-    camera_centres = trajectory.T_cam_obj.inverse().xyz
+    camera_centres = trajectory.camera_positions
     hull_pixels = {
         i: _hull_pixels(cells, normals, capture.masks[i] == OBJECT, trajectory.T_cam_obj[i], capture.camera)
         for i in {i for i, _ in pairs}
@@ -73,17 +73,12 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
     matches = []
     for i, j in pairs:
         pixels = hull_pixels[i]
-        cosine = torch.minimum(*(_cosine(camera_centres[k], pixels.x_obj, pixels.normals) for k in (i, j)))
+        cosine = torch.minimum(
+            *(visual_hull.view_cosine(camera_centres[k], pixels.x_obj, pixels.normals) for k in (i, j))
+        )
         uv = capture.camera.project(trajectory.T_cam_obj[j] @ pixels.x_obj)
         matches.append(_match_warped(capture, matcher, i, j, pixels, uv, cosine > MIN_COSINE))
     return [match for match in matches if len(match) >= MIN_MATCHES]
-
-
-def _cosine(
-    camera_centre: Float[Tensor, "3"], x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> Float[Tensor, " n"]:
-    """Cosine between the normals of points and their lines of sight to a camera."""
-    return (normalize(camera_centre - x, dim=-1) * normals).sum(-1)
 
 
 def _covisible_pairs(surface: visual_hull.OrientedPoints, trajectory: Trajectory, *, count: int, gap: int) -> Pairs:
@@ -92,8 +87,7 @@ def _covisible_pairs(surface: visual_hull.OrientedPoints, trajectory: Trajectory
     The covisibility of two frames is a mean over the surface points. Each point counts by how far the cosine between
     its normal and its line of sight exceeds `MIN_COSINE` in both frames.
     """
-    camera_centres = trajectory.T_cam_obj.inverse().xyz
-    cosines = torch.stack([_cosine(centre, surface.positions, surface.normals) for centre in camera_centres])
+    cosines = visual_hull.view_cosine(trajectory.camera_positions[:, None], surface.positions, surface.normals)
     excess = cosines.sub(MIN_COSINE).clamp_min(0)
     score = torch.stack([torch.minimum(row, excess).mean(-1) for row in excess])
     return best_pairs(score, count=count, gap=gap, min_score=MIN_COVISIBILITY, spread=1)

@@ -161,14 +161,17 @@ def forearm_parts(
     start = axes[:, 3] + axes[:, :3] @ middle
     curve = forearm_curve(start, axes[:, 2], elbow, metre).numpy()
     length = np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
-    fine = np.linspace(0, length[-1], 60)
+    # The same number of rings at every length: the path tracer moves vertices, it does not add any.
+    cuff, overlap = CUFF * metre, (CUFF + 0.03) * metre
+    fine = np.concatenate(
+        [np.linspace(0, cuff, 13)[:-1], np.linspace(cuff, overlap, 3)[:-1], np.linspace(overlap, length[-1], 46)]
+    )
+    bare, covered = slice(15), slice(12, None)
     curve = np.stack([np.interp(fine, length, curve[:, i]) for i in range(3)], -1)
     share = (fine / (0.24 * metre)).clip(0, 1)[:, None] ** 0.7
     # The bare forearm grows out of the hand's mesh, so that the end of the mesh lies inside.
     emerging = 0.78 + 0.3 * (fine / ((INSIDE + WRIST_END) * metre)).clip(0, 1)[:, None]
     radii = (1 - share) * half * emerging + share * ELBOW_RADIUS * metre
-    bare = fine <= (CUFF + 0.03) * metre
-    covered = fine >= CUFF * metre
     colour = np.asarray(CLOTHS[np.random.default_rng(seed).integers(len(CLOTHS))])
     cloth = pattern(np.stack([0.75 * colour, 1.2 * colour]), (40, 40), seed)
     skin = pattern(np.stack([0.88 * skin_colour(tone), 1.1 * skin_colour(tone)]), (6, 3), 3)

@@ -82,10 +82,7 @@ class SurfaceOfRevolution:
 
     def turned(self, trajectory: Trajectory, angle: Float[Tensor, " t"]) -> Trajectory:
         """Poses whose object is first turned about the axis by these angles [radians]."""
-        turn = SO3.exp(angle[:, None] * self.axes[2])
-        T = trajectory.T_cam_obj
-        xyz = T.xyz + T.rotation @ (self.centre - turn @ self.centre)
-        return Trajectory(type(T).from_rotation(T.rotation @ turn, xyz), trajectory.light)
+        return trajectory.turned(SO3.exp(angle[:, None] * self.axes[2]), self.centre)
 
 
 @dataclass(frozen=True)
@@ -161,8 +158,7 @@ def _visible_cells(
 ) -> tuple[Float[Tensor, "t a z 2"], Float[Tensor, "t a z"]]:
     """Positions of the surface's cells in all frames [pixels], and how visible they are, 0 to 1."""
     x, normals = surface.cells()
-    camera_centre = trajectory.T_cam_obj.inverse().xyz
-    cosine = (normalize(camera_centre[:, None, None] - x, dim=-1) * normals).sum(-1)
+    cosine = visual_hull.view_cosine(trajectory.camera_positions[:, None, None], x, normals)
     uv = torch.stack(
         [capture.camera.project(trajectory.T_cam_obj[k] @ x.reshape(-1, 3)) for k in range(len(trajectory))]
     )

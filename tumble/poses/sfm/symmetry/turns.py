@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, normalize
+from torch.nn.functional import avg_pool2d, grid_sample
 
 from tumble.maths import SO3, angle_between, linear_from_srgb, spherical_harmonics
 from tumble.poses.sfm import relocalization
@@ -111,10 +111,7 @@ class Turns:
 
     def turned(self, trajectory: Trajectory) -> Trajectory:
         """Poses whose object is first turned about the hull's centre, by the turn chosen for the frame's run."""
-        T, centre = trajectory.T_cam_obj, self.hull.centre
-        turn = SO3.from_matrix(self.hull.turns[self.chosen[self.runs]])
-        xyz = T.xyz + T.rotation @ (centre - turn @ centre)
-        return Trajectory(type(T).from_rotation(T.rotation @ turn, xyz), trajectory.light)
+        return trajectory.turned(SO3.from_matrix(self.hull.turns[self.chosen[self.runs]]), self.hull.centre)
 
     @property
     def doubt(self) -> float:
@@ -269,12 +266,12 @@ def _colour_maps(
     of a colour are brightness and two differences of channels.
     """
     images, size = _contrast_images(capture.select(frames.tolist()))
-    T, runs = trajectory.select(frames).T_cam_obj, runs[frames]
-    camera_centres = T.inverse().xyz
+    trajectory, runs = trajectory.select(frames), runs[frames]
+    T, camera_centres = trajectory.T_cam_obj, trajectory.camera_positions
 
     def seen(turn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, normals = (hull.positions - hull.centre) @ turn.mT + hull.centre, hull.normals @ turn.mT
-        cosine = (normalize(camera_centres[:, None] - x, dim=-1) * normals).sum(-1)
+        cosine = visual_hull.view_cosine(camera_centres[:, None], x, normals)
         uv = capture.camera.project(T[:, None] @ x)
         sampled = grid_sample(images, 2 * uv[:, :, None] / size - 1, align_corners=False)[..., 0].movedim(1, -1)
         weight = (cosine - MIN_COSINE).clamp_min(0) / (1 - MIN_COSINE) * (sampled[..., 3] > 1 - 1e-3)
