@@ -24,7 +24,7 @@ ENTRY_POINTS = (
 """Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (
     *("pthread_create", "pthread_mutex_init", "pthread_mutex_lock", "pthread_mutex_unlock"),
-    *("pthread_cond_init", "pthread_cond_wait", "pthread_cond_broadcast", "getpid"),
+    *("pthread_cond_init", "pthread_cond_wait", "pthread_cond_broadcast", "getpid", "sched_yield"),
 )
 """System functions that `native/parallel.h` calls on POSIX systems; on others it uses one thread."""
 

@@ -2,7 +2,8 @@
 // bit-for-bit reproducible for a fixed number of shares.
 //
 // OpenMP is not used because some compilers lack it, and because its idle threads spin, which blocks cores of a busy
-// machine. Threads of this pool spin for microseconds, then sleep.
+// machine. Threads of this pool spin for microseconds, then yield to other processes for about a millisecond, longer than
+// most pauses between the phases of a training step, then sleep: waking up would take about as long as a phase.
 #pragma once
 #include "simd.h"
 
@@ -21,8 +22,9 @@ FROM_SYSTEM(pthread_cond_init, void*, const void*)
 FROM_SYSTEM(pthread_cond_wait, void*, void*)
 FROM_SYSTEM(pthread_cond_broadcast, void*)
 FROM_SYSTEM(getpid)
+FROM_SYSTEM(sched_yield)
 
-enum { MAX_WORKERS = 255, SPINS = 2000 };
+enum { MAX_WORKERS = 255, SPINS = 2000, YIELDS = 2000 };
 
 struct Pool {
     // Larger than the mutexes and condition variables of all systems.
@@ -45,6 +47,13 @@ INLINE void pause_briefly() {
 #endif
 }
 
+// Waits for about a millisecond at most, as long as a condition holds.
+template <class F>
+INLINE void spin_while(F holds) {
+    for (int i = 0; i < SPINS && holds(); i++) pause_briefly();
+    for (int i = 0; i < YIELDS && holds(); i++) sched_yield();
+}
+
 INLINE void run_shares(int first) {
     for (int share = first; share < pool.shares; share += pool.n_workers + 1) pool.phase(pool.context, share);
 }
@@ -52,7 +61,7 @@ INLINE void run_shares(int first) {
 static void* work(void* argument) {
     Pool::Start start = *(Pool::Start*)argument;
     for (int seen = start.generation;; seen++) {
-        for (int i = 0; i < SPINS && peek(&pool.generation) == seen; i++) pause_briefly();
+        spin_while([=] { return peek(&pool.generation) == seen; });
         if (peek(&pool.generation) == seen) {
             pthread_mutex_lock(pool.mutex);
             while (peek(&pool.generation) == seen) pthread_cond_wait(pool.wake, pool.mutex);
@@ -92,7 +101,7 @@ static void run_phase(int shares, void (*phase)(void*, int), void* context) {
     pthread_cond_broadcast(pool.wake);
     pthread_mutex_unlock(pool.mutex);
     run_shares(0);
-    for (int i = 0; i < SPINS && peek(&pool.left); i++) pause_briefly();
+    spin_while([] { return peek(&pool.left) != 0; });
     pthread_mutex_lock(pool.mutex);
     while (peek(&pool.left)) pthread_cond_wait(pool.done, pool.mutex);
     pthread_mutex_unlock(pool.mutex);
