@@ -14,8 +14,10 @@ from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose, densify, refine
 from tumble.inverse_rendering.refine import Params, Points
 from tumble.inverse_rendering.sh_lighting import SHLight
+from tumble.maths.directions import fibonacci_sphere
 from tumble.maths.images import srgb_from_linear
 from tumble.maths.se3 import SE3, SO3, angle_between
+from tumble.maths.spherical_harmonics import basis as basis_of_harmonics
 from tumble.recipes import SMOKE
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
@@ -120,3 +122,18 @@ def test_the_weight_of_the_gamma_term_is_the_stated_one() -> None:
     cfg = replace(SMOKE.refine, weights=replace(SMOKE.refine.weights, gamma=5.0))
     terms = refine._terms(cfg, params, view, capture, 0, true[0], 1.0)
     assert float(terms["gamma"]) == pytest.approx(5 * (2 * math.acosh(math.sqrt(2)) / 0.02 - 30), rel=1e-5)
+
+
+def test_static_radiance_becomes_the_albedo_under_a_uniform_light() -> None:
+    """Radiance 0.5 + 0.3 n.d in view direction d: its cosine-weighted mean over the front, where n.d < 0, is 0.3."""
+    points, true, capture = textured_sphere()
+    d_obj = fibonacci_sphere(64)
+    basis = basis_of_harmonics(d_obj, 3)
+    wanted = 0.5 + 0.3 * points.gaussians.means @ d_obj.T
+    sh = torch.linalg.lstsq(basis, wanted.T).solution.T[..., None].expand(-1, -1, 3)
+    points = replace(points, gaussians=replace(points.gaussians, sh=sh[:, :1]), sh_rest=sh[:, 1:])
+    params = Params(points, GAMMA, SHLight.constant(0.4, points.albedo_logits), torch.zeros(4, 6))
+    inputs = refine.Inputs(capture, Trajectory(true, "camera"))
+    refined = refine.finish(refine.Config(colour="sh"), inputs, State(0, params, None, torch.Generator()))
+    seen = refined.albedo * refined.light.diffuse(points.gaussians.means)
+    torch.testing.assert_close(seen, torch.full_like(seen, 0.3), atol=0.01, rtol=0)

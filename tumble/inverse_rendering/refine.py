@@ -20,7 +20,7 @@ from tumble.inverse_rendering.photometric_alignment import align_pose
 from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.io import tree
-from tumble.maths import SE3, fibonacci_sphere
+from tumble.maths import SE3, fibonacci_sphere, spherical_harmonics
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
     Camera,
@@ -36,7 +36,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 11
+VERSION = 12
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3
@@ -446,15 +446,33 @@ def _residuals(
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
-    """Geometry, albedo and light; the static radiance is the unshadowed diffuse one, averaged over all frames."""
+    """Geometry, albedo and light; the static radiance is the unshadowed diffuse one, averaged over all frames.
+
+    If the radiance was static, the albedo is its mean over the directions in which the Gaussians are seen, and the
+    light uniform: the albedo's logits were not trained.
+    """
     params = state.params
     every = slice(None)
     T_cam_obj = pose_network.correction(params.poses, params.pose_network, every) @ inputs.trajectory.T_cam_obj
     trajectory = replace(inputs.trajectory, T_cam_obj=T_cam_obj)
-    gaussians, albedo = _with_radiance(params.points), torch.sigmoid(params.points.albedo_logits)
-    if cfg.colour == "light":
+    gaussians, albedo, light = _with_radiance(params.points), torch.sigmoid(params.points.albedo_logits), params.light
+    if cfg.colour == "sh":
+        albedo = _seen_radiance(gaussians)
+        light = SHLight.constant(1.0, albedo)
+    else:
         mean = torch.zeros_like(albedo)
         for R_env_obj in trajectory.R_env_obj:
-            mean += albedo * params.light.diffuse(gaussians.normals @ R_env_obj.T) / len(trajectory)
+            mean += albedo * light.diffuse(gaussians.normals @ R_env_obj.T) / len(trajectory)
         gaussians = replace(gaussians, sh=constant_sh(mean))
-    return Refined(gaussians, params.gamma, albedo, params.light, trajectory, tree.detach(params.pose_network))
+    return Refined(gaussians, params.gamma, albedo, light, trajectory, tree.detach(params.pose_network))
+
+
+def _seen_radiance(gaussians: Gaussians) -> Float[Tensor, "n 3"]:
+    """Mean radiance of every Gaussian over the view directions towards its front, weighted by their cosine.
+
+    Harmonics have arbitrary values in all other directions, since back faces are culled.
+    """
+    d_obj = fibonacci_sphere(256).to(gaussians.means)
+    cosine = (-gaussians.normals @ d_obj.T).clamp_min(0)
+    weights = cosine / cosine.sum(-1, keepdim=True) @ spherical_harmonics.basis(d_obj, 3)
+    return (weights[..., None] * gaussians.sh).sum(1).clamp_min(0)
