@@ -14,7 +14,7 @@ import torch
 from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
-from tumble.inverse_rendering import absolute_colour, decompose, refine
+from tumble.inverse_rendering import absolute_colour, albedo_solve, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
 from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours
 from tumble.poses.progressive import stage as progressive
@@ -207,6 +207,9 @@ def _reconstruct(
     inputs = decompose.Inputs(capture, refined)
     asset, _ = run.stage(opened, run.DECOMPOSE, stage_of(recipe.decompose), recipe.decompose, inputs, [key])
     asset = _in_absolute_colour(opened, asset, inputs.capture, white)
+    if isinstance(recipe.decompose, decompose.Config) and recipe.decompose.solve_albedo:
+        with progress.task("solving the albedo"):
+            asset = albedo_solve.solved(asset, inputs.capture)
     return tree.to(asset, "cpu"), capture.names
 
 

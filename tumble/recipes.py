@@ -119,6 +119,7 @@ STANDARD = replace(
         warmup=1_000,
         doublings=3,
         fit_specular=True,
+        solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=0.005, material=0.02, mask=MASK),
         rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.03, light=0.03, specular_scale=0.03),
     ),
@@ -151,6 +152,7 @@ DRAFT = replace(
         directions=256,
         doublings=1,
         fit_specular=True,
+        solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK),
         rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.05, light=0.05, specular_scale=0.1),
     ),
@@ -257,7 +259,8 @@ def recap(lights: int, recipe: Recipe) -> Recipe:
     As in ReCap opacity is a free parameter and there are no shadows and no indirect light.
     """
     recipe = no_sdf(static_colour(recipe))
-    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False, fit_specular=False)
+    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False)
+    base = replace(base, fit_specular=False, solve_albedo=False)
     # The light of a block is trained in few of the steps.
     rates = replace(_faster(base.rates, light=4.0), poses=0.0)
     return replace(recipe, decompose=inverse_rendering.separate_lights.Config(replace(base, rates=rates), lights))
@@ -294,13 +297,25 @@ def _static_method(recipe: Recipe, *, rows: int, **changes: Any) -> Recipe:
     """What SVG-IR and IRGS have in common; their light has `rows` rows from the start."""
     recipe = no_sdf(static_colour(recipe))
     stage = _decompose_of(recipe)
-    common = {"bounce": "average", "lobes": "sum", "sets": 8, "doublings": 0, "fit_specular": False}
+    common = {
+        "bounce": "average",
+        "lobes": "sum",
+        "sets": 8,
+        "doublings": 0,
+        "fit_specular": False,
+        "solve_albedo": False,
+    }
     # Differences of neighbouring texels shrink with their distance; this keeps the same smoothness per solid angle.
     weights = replace(stage.weights, light=stage.weights.light * (rows / stage.rows) ** 2, specular=0.0)
     rates = replace(_faster(stage.rates, light=2.0), specular_scale=0.0)
     # As long as the warm-up lasts, geometry does not change.
     changes |= {"rows": rows, "warmup": stage.steps, "weights": weights, "rates": rates}
     return _replace_decompose(recipe, **common, **changes)
+
+
+def no_albedo_solve(recipe: Recipe) -> Recipe:
+    """Ablation: the albedo of stage 3 is not solved again in absolute colour."""
+    return _replace_decompose(recipe, solve_albedo=False)
 
 
 def no_specular_fit(recipe: Recipe) -> Recipe:
@@ -391,6 +406,7 @@ ABLATIONS: dict[str, Callable[[Recipe], Recipe]] = {
     "no-sdf": no_sdf,
     "full-light": full_light,
     "mean-colour": mean_colour,
+    "no-albedo-solve": no_albedo_solve,
     "no-specular-fit": no_specular_fit,
 }
 """Ablations and baselines by name."""

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tumble.export import lit_frames, photo_texture
+from tumble.export import photo_texture
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels
-from tumble.export.lit_frames import LitFrame
+from tumble.rendering import lit_frames
+from tumble.rendering.lit_frames import LitFrame
 from tumble.maths.se3 import SE3, SO3
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from tumble import __version__
-from tumble.export import atlas, bake, confidence, gltf, lit_frames, mesh, photo_texture, ply
+from tumble.export import atlas, bake, confidence, gltf, mesh, photo_texture, ply
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses

@@ -23,7 +23,7 @@ from torch.nn.functional import max_pool2d
 
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels, pad
-from tumble.export.lit_frames import LitFrame
+from tumble.rendering.lit_frames import LitFrame
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.scene import Camera
 

@@ -154,6 +154,8 @@ class Config:
     the light of the frame."""
     corners: bool = True
     """Whether the material varies between the corners of a Gaussian."""
+    solve_albedo: bool = False
+    """Whether the albedo is solved from the photographs in the end, in absolute colour (`albedo_solve.solved`)."""
     pose_model: Literal["tangents", "network"] = "tangents"
     """Corrections of the poses, as in stage 2. network: that of stage 2 goes on, or a new one if it had none."""
     weights: Weights = field(default_factory=Weights)

@@ -10,8 +10,8 @@ import torch
 from tests.export.test_bake import RADIUS, painted
 from tests.surfaces import sphere
 from tumble.export import asset as export
-from tumble.export import lit_frames
 from tumble.export.asset import Preset
+from tumble.rendering import lit_frames
 from tumble.scene.asset import Asset
 from tumble.scene.capture import OBJECT, Capture
 from tumble.scene.environment import Environment

@@ -12,17 +12,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb
-from tumble.rendering import (
-    Bounce,
-    build_tracer,
-    prefilter,
-    render_gbuffer,
-    split_lobes,
-    surface,
-    surface_points,
-    transfer,
-    visibility,
-)
+from tumble.rendering.gbuffer import render_gbuffer
+from tumble.rendering.prefiltered_light import prefilter
+from tumble.rendering.shading import Bounce, split_lobes, surface
+from tumble.rendering.trace import build_tracer, surface_points, transfer, visibility
 from tumble.scene import OBJECT, Asset, Camera, Capture
 
 MAX_FRAMES = 72
