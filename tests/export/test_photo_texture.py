@@ -10,9 +10,9 @@ import torch
 from tumble.export import photo_texture
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels
+from tumble.maths.se3 import SE3, SO3
 from tumble.rendering import lit_frames
 from tumble.rendering.lit_frames import LitFrame
-from tumble.maths.se3 import SE3, SO3
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 

@@ -14,6 +14,7 @@ from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
 from tumble.io import files, progress
+from tumble.rendering import lit_frames
 from tumble.scene import Asset, Capture
 
 

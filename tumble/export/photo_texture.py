@@ -23,8 +23,8 @@ from torch.nn.functional import max_pool2d
 
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels, pad
-from tumble.rendering.lit_frames import LitFrame
 from tumble.maths import linear_from_srgb, to_srgb8
+from tumble.rendering.lit_frames import LitFrame
 from tumble.scene import Camera
 
 TEXELS_PER_PIXEL = 2.0
