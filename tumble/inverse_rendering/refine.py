@@ -444,6 +444,7 @@ def _residuals(
     return (torch.cat([colour, coverage], -1) * truth.valid).flatten()
 
 
+@threads_for_kernels()
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Refined:
     """Geometry, albedo and light; the static radiance is the unshadowed diffuse one, averaged over all frames.
