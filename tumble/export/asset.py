@@ -28,9 +28,9 @@ class Preset:
     """Side of the textures [texels]."""
     cells: int
     """Cells per side of the signed distance grid; a multiple of 4."""
-    views: int = 64
+    views: int = 48
     """Number of depth maps that are fused; the textures use three quarters as many views."""
-    pixels: int = 768
+    pixels: int = 512
     """Side of the rendered maps [pixels]."""
 
 
