@@ -25,12 +25,11 @@ Frames: OpenCV camera with pixel centres at +0.5, object radius 1, linear radian
 import importlib
 import pkgutil
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
-from typing import TypeVar, cast
+from typing import cast
 
 import torch
 
@@ -77,7 +76,6 @@ __all__ = [
     "VISIBLE",
     "choose",
     "load",
-    "map_in_threads",
     "names",
     "origin_of_kernels",
     "relight_kernel",
@@ -134,9 +132,6 @@ UNKNOWN = 128
 """Mask value of pixels that `image_terms` ignores."""
 
 
-T = TypeVar("T")
-R = TypeVar("R")
-
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
@@ -159,25 +154,6 @@ def threads_for_kernels() -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _threads.reset(token)
-
-
-def map_in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Results of a function for all items, in their order, from as many threads as `threads`.
-
-    For many large operations of torch or NumPy: one thread for each item keeps more cores busy than all threads for
-    each operation. In the function, torch's operations and the kernels use one thread.
-    """
-    before, differentiate = torch.get_num_threads(), torch.is_grad_enabled()
-
-    def start() -> None:
-        torch.set_num_threads(1)
-        torch.set_grad_enabled(differentiate)  # by default it is on in every new thread
-
-    try:
-        with ThreadPoolExecutor(threads(), initializer=start) as pool:
-            yield from pool.map(function, items)
-    finally:
-        torch.set_num_threads(before)  # threads that start later would otherwise inherit that of the last one
 
 
 def usable_device(name: str) -> torch.device:

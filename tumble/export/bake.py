@@ -5,7 +5,6 @@ rendered images do. A *texel* is a pixel of the texture that a face covers; its 
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +14,6 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from tumble.backends import map_in_threads
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.depth_fusion import surrounding_cameras
 from tumble.maths import SE3, srgb_from_linear
@@ -28,7 +26,7 @@ DEPTH_TOLERANCE = 0.03
 """Maximum depth difference to the rendered surface at which a texel counts as visible [object radius]."""
 SUBTEXEL_BITS = 4
 """Fractional bits of the vertex positions when triangles are rasterized into the texture."""
-CHUNK = 1 << 17
+CHUNK = 1 << 18
 """Number of texels processed at once: limits memory, without effect on the result."""
 CHANNELS = 7
 """Number of baked channels: albedo (3), roughness (1), normal (3)."""
@@ -163,21 +161,19 @@ def _averaged_maps(asset: Asset, texels: Texels, views: int, pixels: int) -> Flo
     # Matrix products take a fraction of the time of sums over three columns.
     along_normal, squared = (points * normals) @ like.new_ones(3), points.square() @ like.new_ones(3)
     total, weights = points.new_zeros(len(points), CHANNELS), points.new_zeros(len(points), 1)
-
-    def add(stacked: Tensor, T_cam_obj: SE3, start: int) -> None:
-        chunk, centre = slice(start, start + CHUNK), T_cam_obj.inverse().xyz
-        distance = (centre.square().sum() + squared[chunk] - 2 * (points[chunk] @ centre)).sqrt()
-        cosine = (normals[chunk] @ centre - along_normal[chunk]) / distance
-        facing = torch.where(cosine > MIN_COSINE)[0]
-        values, visible = _sampled_maps(stacked, T_cam_obj @ points[chunk].index_select(0, facing), camera)
-        # The fourth power favours frontal views, which resolve the most detail.
-        weight = visible * cosine.index_select(0, facing)[:, None] ** 4
-        total[chunk].index_add_(0, facing, weight * values)
-        weights[chunk].index_add_(0, facing, weight)
-
     for i in range(views):
         stacked = _stacked_maps(render_gbuffer(asset, poses[i], camera))
-        list(map_in_threads(partial(add, stacked, poses[i]), range(0, len(points), CHUNK)))
+        centre = poses[i].inverse().xyz
+        for start in range(0, len(points), CHUNK):
+            chunk = slice(start, start + CHUNK)
+            distance = (centre.square().sum() + squared[chunk] - 2 * (points[chunk] @ centre)).sqrt()
+            cosine = (normals[chunk] @ centre - along_normal[chunk]) / distance
+            facing = torch.where(cosine > MIN_COSINE)[0]
+            values, visible = _sampled_maps(stacked, poses[i] @ points[chunk].index_select(0, facing), camera)
+            # The fourth power favours frontal views, which resolve the most detail.
+            weight = visible * cosine.index_select(0, facing)[:, None] ** 4
+            total[chunk].index_add_(0, facing, weight * values)
+            weights[chunk].index_add_(0, facing, weight)
     values = total / weights.clamp(min=1e-6)
     hidden = weights[:, 0] < 1e-3
     values[hidden] = _nearest_material(asset, points[hidden], normals[hidden])

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int, Int8, Int32
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.backends import map_in_threads
 from tumble.maths import SE3, SO3, fibonacci_sphere, local_frame
 from tumble.rendering import Buffers, rasterize
 from tumble.scene import Camera, Gaussians
@@ -30,7 +29,7 @@ CAMERA_DISTANCE = 6.0
 """Distance of the cameras from the centre [object radius]."""
 HALF_SIDE = 1.08
 """Half the side of the grid, and radius of the sphere that the cameras' images cover [object radius]."""
-CHUNK = 1 << 17
+CHUNK = 1 << 18
 """Number of points fused at once: limits memory, without effect on the result."""
 
 
@@ -76,10 +75,7 @@ def signed_distances(
     coarse = torch.cartesian_prod(*[torch.arange(2, cells + 1, 4, device=means.device)] * 3)
 
     def fused(index: Int[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        def of_rows(rows: Int[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-            return _fuse(rows * cell - HALF_SIDE, maps, poses, camera, cell)
-
-        return torch.cat(list(map_in_threads(of_rows, index.split(CHUNK))))
+        return torch.cat([_fuse(rows * cell - HALF_SIDE, maps, poses, camera, cell) for rows in index.split(CHUNK)])
 
     blocks = fused(coarse).sign().reshape((cells // 4,) * 3) * TRUNCATION
     values = torch.full((cells + 1,) * 3, float(TRUNCATION), device=means.device)
