@@ -1,9 +1,9 @@
 """Albedo texture solved from the photographs: per texel a robust linear least-squares problem.
 
 A pixel of a photograph shows the mean albedo of the texels that project into it, times its diffuse light, plus its
-highlight (`LitFrame`). The albedo of all texels is the least-squares solution of these equations over all pixels of all
-frames, with a Huber loss, regularised towards the texture baked from the Gaussians. Texels that no photograph shows
-keep the baked value.
+highlight (`lit_frames.LitFrame`). The albedo of all texels is the least-squares solution of these equations over all
+pixels of all frames, with a Huber loss, regularised towards the texture baked from the Gaussians. Texels that no
+photograph shows keep the baked value.
 
 The solution is found by a few simultaneous iterations (SART, Andersen and Kak 1984), which recover coarse detail first
 and would reach the noise last. Two corrections keep photographs and texture registered: the surface is moved along its
@@ -24,7 +24,7 @@ from torch.nn.functional import max_pool2d
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels, pad
 from tumble.maths import linear_from_srgb, to_srgb8
-from tumble.rendering.lit_frames import LitFrame
+from tumble.rendering import lit_frames
 from tumble.scene import Camera
 
 TEXELS_PER_PIXEL = 2.0
@@ -76,7 +76,7 @@ class _Equations:
 
 
 def solved_base_color(
-    base_color: UInt8[np.ndarray, "r r 3"], mesh: UnwrappedMesh, frames: Sequence[LitFrame]
+    base_color: UInt8[np.ndarray, "r r 3"], mesh: UnwrappedMesh, frames: Sequence[lit_frames.LitFrame]
 ) -> UInt8[np.ndarray, "r r 3"]:
     """The sRGB base colour solved from photographs, started from and regularised towards `base_color`."""
     resolution = len(base_color)
@@ -93,7 +93,7 @@ def solved_base_color(
 
 
 def aligned_surface(
-    mesh: UnwrappedMesh, base_color: UInt8[np.ndarray, "r r 3"], frames: Sequence[LitFrame]
+    mesh: UnwrappedMesh, base_color: UInt8[np.ndarray, "r r 3"], frames: Sequence[lit_frames.LitFrame]
 ) -> UnwrappedMesh:
     """The mesh moved along its normals by the distance at which the photographs agree best on its texture.
 
@@ -132,7 +132,11 @@ def solved_side(camera: Camera) -> int:
 
 
 def solve(
-    baked: Float[np.ndarray, "t 3"], texels: Texels, frames: Sequence[LitFrame], *, iterations: int = ITERATIONS
+    baked: Float[np.ndarray, "t 3"],
+    texels: Texels,
+    frames: Sequence[lit_frames.LitFrame],
+    *,
+    iterations: int = ITERATIONS,
 ) -> tuple[Float[np.ndarray, "t 3"], float]:
     """Linear albedo of all texels, and the mean Huber loss of the frames before the last iteration.
 
@@ -164,7 +168,7 @@ def _loss(equations: _Equations, albedo: Float[np.ndarray, "t 3"]) -> float:
     return float(np.average(np.where(size < 1, 0.5 * size**2, size - 0.5), weights=equations.weight[:, 0]))
 
 
-def _equations(texels: Texels, frame: LitFrame) -> _Equations:
+def _equations(texels: Texels, frame: lit_frames.LitFrame) -> _Equations:
     """Equations of a frame's usable pixels, over the texels that face the camera and that no other texel hides."""
     camera = frame.camera
     to_camera = frame.T_cam_obj.inverse().xyz - texels.points

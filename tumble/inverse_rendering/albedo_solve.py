@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.rendering import rasterize, surface, threads_for_kernels
-from tumble.rendering.lit_frames import LitFrame, lit_frames
+from tumble.rendering import lit_frames, rasterize, surface, threads_for_kernels
 from tumble.scene import TEMPERATURE, Asset, Capture
 
 HUBER = 0.03
@@ -38,7 +37,7 @@ def solved(asset: Asset, capture: Capture) -> Asset:
     """
     albedo = asset.material.albedo.detach()
     missing, weight = torch.zeros_like(albedo), torch.full_like(albedo, REGULARISATION)
-    for frame in lit_frames(asset, capture):
+    for frame in lit_frames.lit_frames(asset, capture):
         residuals, weights = _projected_back(asset, albedo, frame)
         missing, weight = missing + residuals, weight + weights
     logits = TEMPERATURE * torch.logit((albedo + missing / weight).clamp(*RANGE))
@@ -46,7 +45,7 @@ def solved(asset: Asset, capture: Capture) -> Asset:
 
 
 def _projected_back(
-    asset: Asset, albedo: Float[Tensor, "n 4 3"], frame: LitFrame
+    asset: Asset, albedo: Float[Tensor, "n 4 3"], frame: lit_frames.LitFrame
 ) -> tuple[Float[Tensor, "n 4 3"], Float[Tensor, "n 4 3"]]:
     """A frame's weighted residuals and weights, summed for every corner over the pixels that it contributes to."""
     corners = albedo.clone().requires_grad_()

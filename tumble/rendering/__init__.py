@@ -4,7 +4,7 @@ It calls the rendering kernels of `backends`, and contains no losses and no trai
 """
 
 from tumble.backends import threads_for_kernels, usable_device
-from tumble.rendering import relight
+from tumble.rendering import lit_frames, relight
 from tumble.rendering.gbuffer import antialiased_gbuffer, corner_features, rasterize_material, render_gbuffer
 from tumble.rendering.prefiltered_light import Prefiltered, prefilter
 from tumble.rendering.rasterizer import Buffers, rasterize
@@ -14,7 +14,6 @@ from tumble.rendering.shading import (
     Surface,
     shade,
     shade_split,
-    split_lobes,
     surface,
 )
 from tumble.rendering.trace import (
@@ -40,6 +39,7 @@ __all__ = [
     "build_tracer",
     "corner_features",
     "displacement",
+    "lit_frames",
     "prefilter",
     "rasterize",
     "rasterize_material",
@@ -47,7 +47,6 @@ __all__ = [
     "render_gbuffer",
     "shade",
     "shade_split",
-    "split_lobes",
     "surface",
     "surface_points",
     "threads_for_kernels",
