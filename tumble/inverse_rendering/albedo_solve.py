@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tumble.io import tree
 from tumble.rendering import lit_frames, rasterize, surface, threads_for_kernels
 from tumble.scene import TEMPERATURE, Asset, Capture
 
@@ -35,7 +36,8 @@ def solved(asset: Asset, capture: Capture) -> Asset:
         asset: The result of stage 3 in absolute colour.
         capture: The asset's training frames, in the order of its trajectory.
     """
-    albedo = asset.material.albedo.detach()
+    asset = tree.detach(asset)
+    albedo = asset.material.albedo
     missing, weight = torch.zeros_like(albedo), torch.full_like(albedo, REGULARISATION)
     for frame in lit_frames.lit_frames(asset, capture):
         residuals, weights = _projected_back(asset, albedo, frame)
