@@ -16,7 +16,7 @@ from tumble.io import tree
 from tumble.rendering import lit_frames, rasterize, surface, threads_for_kernels
 from tumble.scene import TEMPERATURE, Asset, Capture
 
-HUBER = 0.03
+HUBER = 0.01
 """Residual from which its weight falls off: highlights and shadows that the light does not explain [linear]."""
 REGULARISATION = 1e-3
 """Weight of the previous albedo, relative to a pixel that shows this corner alone, frontal, under radiance 1."""
