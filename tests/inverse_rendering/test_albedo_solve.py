@@ -9,6 +9,7 @@ from tests.export.test_bake import RADIUS, painted
 from tests.rendering.test_lit_frames import capture
 from tests.surfaces import sphere
 from tumble.inverse_rendering import albedo_solve
+from tumble.maths import to_srgb8
 from tumble.rendering import render_gbuffer
 from tumble.rendering.lit_frames import LitFrame, lit_frames
 from tumble.scene.asset import Asset
@@ -48,10 +49,8 @@ def test_what_highlights_explain_is_no_albedo(asset: Asset) -> None:
     """A photograph whose blue is as bright as the highlights alone shows paint without any blue."""
     photos = capture(asset, 188)
     bright = [frame.specular[frame.usable][..., 2].mean() for frame in lit_frames(asset, photos) if frame.usable.any()]
-    value = sum(bright) / len(bright)
-    code_value = round(255 * (1.055 * float(value) ** (1 / 2.4) - 0.055))
     images = photos.images.clone()
-    images[..., 2] = code_value
+    images[..., 2] = to_srgb8(torch.tensor(sum(bright) / len(bright)))
     solved = albedo_solve.solved(asset, replace(photos, images=images)).material.albedo.mean(1)
     seen = shown(asset, list(lit_frames(asset, photos)))
     assert solved[seen, 2].median() < 0.01

@@ -166,7 +166,7 @@ def forearm_parts(
     fine = np.concatenate(
         [np.linspace(0, cuff, 13)[:-1], np.linspace(cuff, overlap, 3)[:-1], np.linspace(overlap, length[-1], 46)]
     )
-    bare, covered = slice(15), slice(12, None)
+    bare, covered = fine <= overlap, fine >= cuff
     curve = np.stack([np.interp(fine, length, curve[:, i]) for i in range(3)], -1)
     share = (fine / (0.24 * metre)).clip(0, 1)[:, None] ** 0.7
     # The bare forearm grows out of the hand's mesh, so that the end of the mesh lies inside.
