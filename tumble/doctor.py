@@ -67,8 +67,8 @@ def _renderer() -> DoctorFinding:
     llvm = find_llvm()
     if llvm is not None:
         return DoctorFinding("tumble synth", f"Mitsuba on LLVM {llvm[1]} ({llvm[0]})")
-    fixes = {"Darwin": "brew install llvm", "Windows": "install LLVM 17 or newer from llvm.org"}
-    fix = fixes.get(platform.system(), f"apt install libllvm19 (or any other libLLVM >= {MIN_LLVM})")
+    fixes = {"Darwin": "brew install llvm", "Windows": "install LLVM 15 or newer from llvm.org"}
+    fix = fixes.get(platform.system(), f"apt install libllvm15 (or any other libLLVM >= {MIN_LLVM})")
     return DoctorFinding(
         "tumble synth", "Mitsuba in its scalar variant: correct, but several times slower than with LLVM", fix
     )

@@ -451,8 +451,8 @@ def test_the_version_of_llvm_is_read_from_its_name_without_loading_it(name: str,
 def test_old_versions_of_llvm_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(pathtracer, "LLVM_FOLDERS", (str(tmp_path),))
-    (tmp_path / "libLLVM-15.so.1").touch()
-    (tmp_path / "libLLVM-16.so").touch()
+    (tmp_path / "libLLVM-14.so.1").touch()
+    (tmp_path / "libLLVM-13.so").touch()
     assert pathtracer.find_llvm() is None
     (tmp_path / "libLLVM.so.18.1").touch()
     (tmp_path / "libLLVM-17.so").touch()

@@ -23,9 +23,9 @@ from tumble.maths import SE3, direction_from_equirect
 from tumble.scene import DIELECTRIC, Camera, Environment
 from tumble.synthetic.glb import require_glb
 
-MIN_LLVM = 17
-"""Oldest major version of libLLVM that is used: LLVM 15 and 16 abort the process on some processors while they compile
-Dr.Jit's kernels."""
+MIN_LLVM = 15
+"""Oldest major version of libLLVM that is used: that of Debian 12. The extra `synth` pins the last Mitsuba that works
+with it: on the instruction `llvm.minimum` of later versions, LLVM 15 and 16 abort the process."""
 LLVM_FOLDERS = (
     "/usr/lib/*-linux-gnu",
     "/usr/lib64",
