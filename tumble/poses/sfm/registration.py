@@ -7,7 +7,7 @@ hypotheses. They are rated by all correspondences, by the contours, and by the m
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import bundle_adjustment
+from tumble.poses.sfm.contour_joints import ContourJoint, contour_joint
 from tumble.poses.sfm.partial import Observed, Partial, adjusted, contour_cost, pruned, surface_points
 
 TOLERANCE = 3.0
@@ -194,27 +195,55 @@ def _agreeing(
     return len(np.unique(keypoint[_errors(observed, pose, observed.keypoints.uv[keypoint], X) < error]))
 
 
-def join(
-    observed: Observed, parts: Sequence[Partial], known: dict[tuple[Partial, Partial], Joint | None]
-) -> list[Partial]:
+@dataclass
+class Hypotheses:
+    """Hypotheses for pairs of parts, the larger part first: what has been computed once is not computed again."""
+
+    by_keypoints: dict[tuple[Partial, Partial], Joint | None] = field(default_factory=dict)
+    by_contours: dict[tuple[Partial, Partial], ContourJoint | None] = field(default_factory=dict)
+
+
+def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> list[Partial]:
     """Join parts, the best confirmed pair first, until no two belong together.
 
     Args:
         parts: Parts of the capture.
-        known: Hypotheses for pairs of parts, the larger part first; new ones are added.
+        known: Hypotheses of earlier calls; new ones are added.
     """
     parts = sorted(parts, key=len, reverse=True)
     while True:
         pairs = [(a, b) for k, a in enumerate(parts) for b in parts[k + 1 :]]
-        for a, b in pairs:
-            if (a, b) not in known:
-                known[a, b] = best_joint(observed, b, a)
-        accepted = [(pair, joint) for pair in pairs if (joint := known[pair]) is not None and joint.accepted]
-        if not accepted:
+        found = _best_by_keypoints(observed, pairs, known) or _best_by_contours(observed, pairs, known)
+        if found is None:
             return parts
-        (a, b), joint = max(accepted, key=lambda each: each[1].keypoints)
-        both = pruned(observed, adjusted(observed, a.merged(joint.part), JOINING_SCALES), TOLERANCE)
+        (a, b), moved = found
+        both = pruned(observed, adjusted(observed, a.merged(moved), JOINING_SCALES), TOLERANCE)
         parts = sorted([part for part in parts if part is not a and part is not b] + [both], key=len, reverse=True)
+
+
+def _best_by_keypoints(
+    observed: Observed, pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses
+) -> tuple[tuple[Partial, Partial], Partial] | None:
+    """The pair that most keypoints join, and the smaller part in the object frame of the larger."""
+    for a, b in pairs:
+        if (a, b) not in known.by_keypoints:
+            known.by_keypoints[a, b] = best_joint(observed, b, a)
+    joints = [(pair, joint) for pair in pairs if (joint := known.by_keypoints[pair]) is not None and joint.accepted]
+    pair, joint = max(joints, key=lambda each: each[1].keypoints, default=(None, None))
+    return (pair, joint.part) if pair and joint else None
+
+
+def _best_by_contours(
+    observed: Observed, pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses
+) -> tuple[tuple[Partial, Partial], Partial] | None:
+    """The same for the pair whose contours agree best, for parts that share no texture."""
+    for a, b in pairs:
+        if (a, b) not in known.by_contours:
+            known.by_contours[a, b] = contour_joint(observed, b, a)
+    joints = [(pair, joint) for pair in pairs if (joint := known.by_contours[pair]) is not None]
+    joints = [(pair, joint) for pair, joint in joints if joint.accepted(MIN_GAPS)]
+    pair, joint = min(joints, key=lambda each: each[1].cost, default=(None, None))
+    return (pair, joint.part) if pair and joint else None
 
 
 def grow(observed: Observed, part: Partial) -> Partial:

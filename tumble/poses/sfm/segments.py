@@ -22,7 +22,7 @@ from tumble import matching
 from tumble.poses.sfm.adjustment import Settings, Windows, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.observations import Inputs, on_object, shown, silhouette_centres, tracks_of
 from tumble.poses.sfm.partial import Observed, Partial, adjusted, joined_tracks, pruned, thinned
-from tumble.poses.sfm.registration import TOLERANCE, grow, join
+from tumble.poses.sfm.registration import TOLERANCE, Hypotheses, grow, join
 from tumble.poses.sfm.tracks import Tracks, gather_keypoints
 from tumble.scene import Match
 
@@ -71,7 +71,7 @@ def segmented_poses(
         R: Approximate rotations of all frames, `R_cam_obj`.
         rng: Source of random numbers.
     """
-    parts, known = [], {}
+    parts, known = [], Hypotheses()
     sure = _observed(cfg, inputs, inputs.tracks, wide)
     for tracks in (inputs.tracks, tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)):
         observed = sure if tracks is inputs.tracks else _observed(cfg, inputs, tracks, wide)

@@ -1,0 +1,71 @@
+"""Joints of two halves of a motion whose poses are known, from contours alone."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.lopsided import DISTANCE, tumbling
+from tumble.maths import SO3, angle_between
+from tumble.poses.sfm import stage
+from tumble.poses.sfm.contour_joints import contour_joint
+from tumble.poses.sfm.partial import Observed, Partial
+from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
+from tumble.scene import BACKGROUND
+
+SCENE = tumbling(28)
+R = SCENE.T_cam_obj.rotation.matrix().double()
+T = SCENE.T_cam_obj.xyz.double() / DISTANCE
+OTHER_FRAME = (
+    SO3.exp(torch.tensor([0.5, -1.1, 0.7], dtype=torch.float64)).matrix(),
+    1.15,
+    torch.tensor([0.03, -0.02, 0.05]),
+)
+"""Rotation, scale and shift of the object frame of the second half."""
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observed:
+    inputs = stage.gather(SCENE.capture, (), "mixed")
+    return Observed(stage.Config(), inputs, gather_keypoints((), NO_TRACKS, SCENE.capture.camera, len(R)))
+
+
+def half(frames: range) -> Partial:
+    return Partial(tuple(frames), R[list(frames)], T[list(frames)])
+
+
+def in_other_frame(part: Partial) -> Partial:
+    rotation, scale, shift = OTHER_FRAME
+    return part.moved(rotation, scale, shift.double())
+
+
+def test_two_halves_of_a_motion_are_joined_by_their_contours(observed: Observed) -> None:
+    """The object of the second half has another frame and size; its true poses come back."""
+    joint = contour_joint(observed, in_other_frame(half(range(12, 24))), half(range(12)))
+    assert joint is not None
+    assert joint.accepted(50)
+    error = angle_between(SO3.from_matrix(joint.part.R), SO3.from_matrix(R[12:24]))
+    assert math.degrees(float(error.max())) < 3
+    assert (joint.part.t - T[12:24]).norm(dim=-1).max() < 0.03
+
+
+def test_contours_of_another_object_are_not_joined(observed: Observed) -> None:
+    """The second half of the film shows a disc of the same size."""
+    masks = SCENE.capture.masks.clone()
+    row, column = torch.meshgrid(*map(torch.arange, masks.shape[1:]), indexing="ij")
+    for mask in masks[12:24]:
+        y, x = (mask != BACKGROUND).nonzero().double().mean(0)
+        radius = math.sqrt(int((mask != BACKGROUND).sum()) / math.pi)
+        mask[:] = torch.where((row - y).square() + (column - x).square() < radius**2, 255, 0).to(mask.dtype)
+    inputs = stage.gather(replace(SCENE.capture, masks=masks), (), "mixed")
+    joint = contour_joint(replace(observed, inputs=inputs), in_other_frame(half(range(12, 24))), half(range(12)))
+    assert joint is None or not joint.accepted(50)
+
+
+def test_parts_far_apart_in_time_are_not_compared(observed: Observed) -> None:
+    assert contour_joint(observed, half(range(18, 28)), half(range(10))) is None
+
+
+def test_short_parts_are_not_compared(observed: Observed) -> None:
+    assert contour_joint(observed, half(range(12, 18)), half(range(12))) is None
