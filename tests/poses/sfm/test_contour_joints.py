@@ -44,7 +44,7 @@ def test_two_halves_of_a_motion_are_joined_by_their_contours(observed: Observed)
     """The object of the second half has another frame and size; its true poses come back."""
     joint = contour_joint(observed, in_other_frame(half(range(12, 24))), half(range(12)))
     assert joint is not None
-    assert joint.accepted(50)
+    assert joint.accepted
     error = angle_between(SO3.from_matrix(joint.part.R), SO3.from_matrix(R[12:24]))
     assert math.degrees(float(error.max())) < 3
     assert (joint.part.t - T[12:24]).norm(dim=-1).max() < 0.03
@@ -60,7 +60,7 @@ def test_contours_of_another_object_are_not_joined(observed: Observed) -> None:
         mask[:] = torch.where((row - y).square() + (column - x).square() < radius**2, 255, 0).to(mask.dtype)
     inputs = stage.gather(replace(SCENE.capture, masks=masks), (), "mixed")
     joint = contour_joint(replace(observed, inputs=inputs), in_other_frame(half(range(12, 24))), half(range(12)))
-    assert joint is None or not joint.accepted(50)
+    assert joint is None or not joint.accepted
 
 
 def test_parts_far_apart_in_time_are_not_compared(observed: Observed) -> None:
@@ -69,3 +69,14 @@ def test_parts_far_apart_in_time_are_not_compared(observed: Observed) -> None:
 
 def test_short_parts_are_not_compared(observed: Observed) -> None:
     assert contour_joint(observed, half(range(12, 18)), half(range(12))) is None
+
+
+def test_parts_of_which_little_is_seen_are_not_joined(observed: Observed) -> None:
+    """Every other frame shows no contour at all."""
+    contours = observed.inputs.contours
+    reliable = contours.reliable & (torch.arange(len(R)) % 2 == 0)[:, None]
+    inputs = replace(observed.inputs, contours=replace(contours, reliable=reliable))
+    joint = contour_joint(replace(observed, inputs=inputs), in_other_frame(half(range(12, 24))), half(range(12)))
+    assert joint is not None
+    assert joint.cost < 0.2
+    assert not joint.accepted

@@ -241,7 +241,7 @@ def _best_by_contours(
         if (a, b) not in known.by_contours:
             known.by_contours[a, b] = contour_joint(observed, b, a)
     joints = [(pair, joint) for pair in pairs if (joint := known.by_contours[pair]) is not None]
-    joints = [(pair, joint) for pair, joint in joints if joint.accepted(MIN_GAPS)]
+    joints = [(pair, joint) for pair, joint in joints if joint.accepted]
     pair, joint = min(joints, key=lambda each: each[1].cost, default=(None, None))
     return (pair, joint.part) if pair and joint else None
 
