@@ -56,6 +56,7 @@ INPUTS = {
     "MC1": Input("HO-3D, cracker box, 141 frames", "--box 315 35 210 275 --focal 617", 617),
     "SMu1": Input("HO-3D, red mug, 130 frames", "--box 230 220 220 200 --focal 617", 617),
     "ABF14": Input("HO-3D, bleach bottle, 131 frames", "--box 340 160 240 180 --focal 617", 617),
+    "SM2": Input("HO-3D, mustard bottle, 126 frames", "--box 272 66 112 298 --focal 617", 617),
     "cube": Input("ViSP, cube_video.mp4, first 600 frames", "--box 390 155 222 222 --at 300 --focal 605", 605),
     "box": Input("OpenCV, box.mp4, 455 frames", "--box 292 16 308 225"),
     "dtu": Input("DTU scan 65 in the layout of NeuS: a skull, 49 photographs from a dome, their masks and poses", ""),
