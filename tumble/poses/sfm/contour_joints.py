@@ -7,7 +7,6 @@ motion goes on where the first part ends, so that smaller rotations are likely t
 
 import math
 from dataclasses import dataclass
-from itertools import product
 
 import torch
 from jaxtyping import Float
@@ -16,14 +15,15 @@ from torch import Tensor
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
 from tumble.poses.sfm.frontier_points import epipolar_tangencies
 from tumble.poses.sfm.partial import GAP_SCALE, Observed, Partial
+from tumble.poses.sfm.relocalization import JACOBIAN_STEP, candidate_rotations, damped_step, robust_cost
 
 MAX_GAP = 6
 """Largest distance in time between two parts that contours join [frames]."""
 MAX_TURN = math.radians(60)
 """Largest rotation from the end of one part to the beginning of the other [radians]: parts end where the object turns
 too fast for matching, but below a quarter of a revolution boxes do not look the same."""
-GRID = math.radians(10)
-"""Distance between the hypotheses for the rotation from one part to the other [radians]."""
+TURNS = tuple(math.radians(sign * angle) for angle in (10, 20, 30, 40, 50, 60) for sign in (-1, 1))
+"""Angles of the hypotheses for the rotation from one part to the other [radians]."""
 MIN_FRAMES = 10
 """Number of frames below which the contours of a part are too few."""
 USED_FRAMES = 20
@@ -43,11 +43,6 @@ MIN_RATIO = 2.0
 OTHER_ROTATION = math.radians(30)
 """Angle from which a joint is another one [radians]. Below it costs may hardly differ, because few contours of a hidden
 object are seen: about its axis a bottle's joint may be known to some ten degrees only."""
-DIFFERENCE_STEP = 1e-4
-"""Step of the finite differences [radians; mean distance]."""
-PRIOR = 10.0
-"""Weight of a unit of shift and of logarithm of scale [pixels]; contours hardly determine them where views are few."""
-
 Similarity = tuple[Float[Tensor, "h 3 3"], Float[Tensor, "h 4"]]
 """Hypotheses for the motion of a part to the object frame of another: rotation `R_new_obj`; shift [mean distance] and
 logarithm of the scale."""
@@ -66,6 +61,11 @@ class ContourJoint:
     """Lowest cost with another rotation; infinite if there is none."""
 
     @property
+    def strength(self) -> float:
+        """What the strongest of several joints has most of."""
+        return -self.cost
+
+    @property
     def accepted(self) -> bool:
         """Whether contours confirm that the two parts belong together in this way, and in no other."""
         return self.seen >= MIN_SEEN and self.cost <= MAX_COST and self.second >= MIN_RATIO * self.cost
@@ -78,11 +78,11 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     distance, p, q = min((abs(a - b), p, q) for p, a in enumerate(part.frames) for q, b in enumerate(other.frames))
     if not 0 < distance <= MAX_GAP:
         return None
-    turns = _turns(MAX_TURN)
+    turns = candidate_rotations(TURNS)
     R_new_obj = (turns @ other.R[q]).mT @ part.R[p]
     pairs = _Pairs(observed, *(each.select(_spread(len(each))) for each in (part, other)))
     start = R_new_obj, R_new_obj.new_zeros(len(turns), 4)
-    best = _robust_costs(pairs.gaps(start)).argsort()[:REFINED]
+    best = robust_cost(pairs.gaps(start), GAP_SCALE).argsort()[:REFINED]
     (R_new_obj, rest), cost = _refined(pairs, (start[0][best], start[1][best]))
     step = angle_between(SO3.from_matrix(part.R[p] @ R_new_obj.mT), SO3.from_matrix(other.R[q]))
     cost = torch.where(step <= MAX_TURN, cost, torch.inf)
@@ -96,15 +96,8 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     return ContourJoint(moved, float(cost[k]), seen, second)
 
 
-def _turns(largest: float) -> Float[Tensor, "h 3 3"]:
-    """Rotations up to an angle [radians], `GRID` apart about 26 axes."""
-    axes = torch.tensor([axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)], dtype=torch.float64)
-    angles = GRID * torch.arange(1, 1 + math.floor(largest / GRID + 1e-6), dtype=torch.float64)
-    omega = angles[:, None, None] * torch.nn.functional.normalize(axes, dim=-1)
-    return SO3.exp(torch.cat([omega.new_zeros(1, 3), omega.reshape(-1, 3)])).matrix()
-
-
 def _spread(n: int) -> list[int]:
+    """Up to `USED_FRAMES` evenly spaced places among `n`."""
     return sorted(set(torch.linspace(0, n - 1, USED_FRAMES).round().long().tolist()))
 
 
@@ -142,35 +135,20 @@ class _Pairs:
         return torch.where(found.valid, found.gap, torch.nan).reshape(h, -1)
 
 
-def _robust_costs(gaps: Float[Tensor, "h n"]) -> Float[Tensor, " h"]:
-    """Mean robust cost of the valid gaps of each hypothesis; infinite where there are none."""
-    valid = ~gaps.isnan()
-    cost = torch.log1p((torch.where(valid, gaps, 0.0) / GAP_SCALE).square()).sum(1)
-    return torch.where(valid.any(1), cost / valid.sum(1).clamp_min(1), torch.inf)
-
-
 def _refined(pairs: _Pairs, start: Similarity) -> tuple[Similarity, Float[Tensor, " h"]]:
     """Hypotheses after Levenberg-Marquardt with finite differences, and their costs."""
-    unit = DIFFERENCE_STEP * torch.eye(7, dtype=torch.float64)
+    unit = JACOBIAN_STEP * torch.eye(7, dtype=torch.float64)
 
-    def shifted(motion: Similarity, step: Tensor) -> Similarity:
-        return SO3.exp(step[..., :3]).matrix() @ motion[0], motion[1] + step[..., 3:]
+    def shifted(motion: Similarity, rotation: Tensor, rest: Tensor) -> Similarity:
+        return SO3.exp(rotation).matrix() @ motion[0], motion[1] + rest
 
     def linearised(motion: Similarity) -> Linearised:
         gaps = pairs.gaps(motion)
-        return Linearised(_robust_costs(gaps), gaps)
+        return Linearised(robust_cost(gaps, GAP_SCALE), gaps)
 
     def moved(motion: Similarity, gaps: Tensor, damping: Tensor) -> Similarity:
-        columns = [(pairs.gaps(shifted(motion, step)) - gaps) / DIFFERENCE_STEP for step in unit]
-        J = torch.stack(columns, -1)
-        valid = ~(gaps.isnan() | J.isnan().any(-1))
-        r, J = torch.where(valid, gaps, 0.0), torch.where(valid[..., None], J, 0.0)
-        w = valid / (1 + (r / GAP_SCALE).square())
-        H = torch.einsum("hn,hni,hnj->hij", w, J, J)
-        H = H + torch.diag(PRIOR**2 * torch.tensor([0.0] * 3 + [1.0] * 4, dtype=torch.float64))
-        H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-6)
-        step = -torch.linalg.solve(H, torch.einsum("hn,hni,hn->hi", w, J, r)[..., None])[..., 0]
-        return shifted(motion, torch.cat([step[:, :3].clamp(-0.2, 0.2), step[:, 3:].clamp(-0.05, 0.05)], 1))
+        columns = [(pairs.gaps(shifted(motion, step[:3], step[3:])) - gaps) / JACOBIAN_STEP for step in unit]
+        return shifted(motion, *damped_step(gaps, torch.stack(columns, -1), damping, GAP_SCALE))
 
     damping = Damping(start=1e-2, accepted=0.3, rejected=5.0)
     motion, last = minimise(start, linearised, moved, select_rows, steps=STEPS, damping=damping)

@@ -6,8 +6,8 @@ hypotheses. They are rated by all correspondences, by the contours, and by the m
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -84,6 +84,11 @@ class Joint:
     """Number of tangency gaps behind that cost."""
 
     @property
+    def strength(self) -> float:
+        """What the strongest of several joints has most of."""
+        return self.keypoints
+
+    @property
     def accepted(self) -> bool:
         """Whether the two parts belong together in this way."""
         if self.keypoints < MIN_JOINT_KEYPOINTS or self.frames < MIN_JOINT_FRAMES:
@@ -91,6 +96,12 @@ class Joint:
         if self.gaps < MIN_GAPS:
             return self.keypoints >= MIN_UNCONFIRMED_KEYPOINTS
         return self.cost <= MAX_CONTOUR_COST
+
+
+Propose = Callable[[Observed, Partial, Partial], Joint | ContourJoint | None]
+"""The best joint of a part and another, by keypoints or by contours; None if there is none."""
+Hypotheses = dict[tuple[Propose, Partial, Partial], Joint | ContourJoint | None]
+"""Joints that have been computed, of pairs of parts with the larger part first."""
 
 
 def solutions(
@@ -195,14 +206,6 @@ def _agreeing(
     return len(np.unique(keypoint[_errors(observed, pose, observed.keypoints.uv[keypoint], X) < error]))
 
 
-@dataclass
-class Hypotheses:
-    """Hypotheses for pairs of parts, the larger part first: what has been computed once is not computed again."""
-
-    by_keypoints: dict[tuple[Partial, Partial], Joint | None] = field(default_factory=dict)
-    by_contours: dict[tuple[Partial, Partial], ContourJoint | None] = field(default_factory=dict)
-
-
 def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> list[Partial]:
     """Join parts, the best confirmed pair first, until no two belong together.
 
@@ -213,37 +216,24 @@ def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> lis
     parts = sorted(parts, key=len, reverse=True)
     while True:
         pairs = [(a, b) for k, a in enumerate(parts) for b in parts[k + 1 :]]
-        found = _best_by_keypoints(observed, pairs, known) or _best_by_contours(observed, pairs, known)
+        # Contours join what shares no texture.
+        found = _best(observed, pairs, known, best_joint) or _best(observed, pairs, known, contour_joint)
         if found is None:
             return parts
-        (a, b), moved = found
-        both = pruned(observed, adjusted(observed, a.merged(moved), JOINING_SCALES), TOLERANCE)
+        (a, b), joint = found
+        both = pruned(observed, adjusted(observed, a.merged(joint.part), JOINING_SCALES), TOLERANCE)
         parts = sorted([part for part in parts if part is not a and part is not b] + [both], key=len, reverse=True)
 
 
-def _best_by_keypoints(
-    observed: Observed, pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses
-) -> tuple[tuple[Partial, Partial], Partial] | None:
-    """The pair that most keypoints join, and the smaller part in the object frame of the larger."""
+def _best(
+    observed: Observed, pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses, propose: Propose
+) -> tuple[tuple[Partial, Partial], Joint | ContourJoint] | None:
+    """The pair with the strongest accepted joint, and the joint."""
     for a, b in pairs:
-        if (a, b) not in known.by_keypoints:
-            known.by_keypoints[a, b] = best_joint(observed, b, a)
-    joints = [(pair, joint) for pair in pairs if (joint := known.by_keypoints[pair]) is not None and joint.accepted]
-    pair, joint = max(joints, key=lambda each: each[1].keypoints, default=(None, None))
-    return (pair, joint.part) if pair and joint else None
-
-
-def _best_by_contours(
-    observed: Observed, pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses
-) -> tuple[tuple[Partial, Partial], Partial] | None:
-    """The same for the pair whose contours agree best, for parts that share no texture."""
-    for a, b in pairs:
-        if (a, b) not in known.by_contours:
-            known.by_contours[a, b] = contour_joint(observed, b, a)
-    joints = [(pair, joint) for pair in pairs if (joint := known.by_contours[pair]) is not None]
-    joints = [(pair, joint) for pair, joint in joints if joint.accepted]
-    pair, joint = min(joints, key=lambda each: each[1].cost, default=(None, None))
-    return (pair, joint.part) if pair and joint else None
+        if (propose, a, b) not in known:
+            known[propose, a, b] = propose(observed, b, a)
+    joints = [((a, b), joint) for a, b in pairs if (joint := known[propose, a, b]) is not None and joint.accepted]
+    return max(joints, key=lambda each: each[1].strength, default=None)
 
 
 def grow(observed: Observed, part: Partial) -> Partial:

@@ -9,6 +9,7 @@ revolution. In a video, however, an object rotates by only a few degrees between
 by much more (a pose jump), those on one side are wrong, however small their gaps.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -90,11 +91,11 @@ def robust_cost(gaps: Float[Tensor, "h n"], scale: float) -> Float[Tensor, " h"]
     return torch.where(valid.sum(1) < MIN_GAPS, torch.inf, loss / valid.sum(1).clamp_min(1))
 
 
-def candidate_rotations() -> Float[Tensor, "k 3 3"]:
-    """The identity, and rotations by `CANDIDATE_ANGLES` about axes in 13 directions."""
+def candidate_rotations(angles: Sequence[float] = CANDIDATE_ANGLES) -> Float[Tensor, "k 3 3"]:
+    """The identity, and rotations by angles of either sign [radians] about axes in 13 directions."""
     axes = [axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if axis > (0.0, 0.0, 0.0)]
     unit = torch.nn.functional.normalize(torch.tensor(axes, dtype=torch.float64), dim=-1)
-    omega = torch.cat([torch.zeros(1, 3, dtype=torch.float64), *(angle * unit for angle in CANDIDATE_ANGLES)])
+    omega = torch.cat([torch.zeros(1, 3, dtype=torch.float64), *(angle * unit for angle in angles)])
     return SO3.exp(omega).matrix()
 
 
@@ -154,19 +155,11 @@ def _refine(
     constraints: ContourConstraints, R: Tensor, t: Tensor, scale: float, steps: int = 8
 ) -> tuple[tuple[Tensor, Tensor], Float[Tensor, " h"]]:
     """Candidates refined side by side by Levenberg-Marquardt with finite-difference Jacobians, and their costs."""
-    translation_damping = torch.diag(torch.tensor([0.0] * 3 + [TRANSLATION_DAMPING**2] * 3, dtype=torch.float64))
 
     def moved(pose: Poses, gaps: Tensor, damping: Tensor) -> Poses:
         R, t = pose
-        J = _jacobian(constraints, R, t, gaps)
-        valid = ~(gaps.isnan() | J.isnan().any(-1))
-        r, J = torch.where(valid, gaps, 0.0), torch.where(valid[..., None], J, 0.0)
-        w = valid / (1 + (r / scale).square())
-        H = torch.einsum("ho,hoi,hoj->hij", w, J, J) + translation_damping
-        g = torch.einsum("ho,hoi,ho->hi", w, J, r)
-        H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-6)
-        step = torch.linalg.solve(H, -g[..., None])[..., 0]
-        return SO3.exp(step[:, :3].clamp(-0.2, 0.2)).matrix() @ R, t + step[:, 3:].clamp(-0.05, 0.05)
+        rotation, shift = damped_step(gaps, _jacobian(constraints, R, t, gaps), damping, scale)
+        return SO3.exp(rotation).matrix() @ R, t + shift
 
     def linearised(pose: Poses) -> Linearised:
         gaps = constraints.gaps(*pose)
@@ -175,6 +168,28 @@ def _refine(
     damping = Damping(start=1e-2, accepted=0.3, rejected=5.0)
     pose, last = minimise((R, t), linearised, moved, select_rows, steps=steps, damping=damping)
     return pose, last.cost
+
+
+def damped_step(
+    gaps: Float[Tensor, "h n"], J: Float[Tensor, "h n p"], damping: Float[Tensor, " h"], scale: float
+) -> tuple[Float[Tensor, "h 3"], Float[Tensor, "h q"]]:
+    """Levenberg-Marquardt steps of the robust cost: rotations [radians], and all other parameters [mean distance].
+
+    Args:
+        gaps: Tangency gaps [pixels], NaN where not valid.
+        J: Their derivatives with respect to a rotation, and to lengths in units of the object's mean distance.
+        damping: Of every hypothesis, relative to the diagonal.
+        scale: Scale of the Cauchy loss [pixels].
+    """
+    valid = ~(gaps.isnan() | J.isnan().any(-1))
+    r, J = torch.where(valid, gaps, 0.0), torch.where(valid[..., None], J, 0.0)
+    w = valid / (1 + (r / scale).square())
+    of_lengths = J.new_tensor([0.0] * 3 + [TRANSLATION_DAMPING**2] * (J.shape[-1] - 3))
+    H = torch.einsum("hn,hni,hnj->hij", w, J, J) + torch.diag(of_lengths)
+    g = torch.einsum("hn,hni,hn->hi", w, J, r)
+    H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-6)
+    step = torch.linalg.solve(H, -g[..., None])[..., 0]
+    return step[:, :3].clamp(-0.2, 0.2), step[:, 3:].clamp(-0.05, 0.05)
 
 
 def information(

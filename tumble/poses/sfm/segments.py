@@ -71,7 +71,8 @@ def segmented_poses(
         R: Approximate rotations of all frames, `R_cam_obj`.
         rng: Source of random numbers.
     """
-    parts, known = [], Hypotheses()
+    parts: list[Partial] = []
+    known: Hypotheses = {}
     sure = _observed(cfg, inputs, inputs.tracks, wide)
     for tracks in (inputs.tracks, tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)):
         observed = sure if tracks is inputs.tracks else _observed(cfg, inputs, tracks, wide)
