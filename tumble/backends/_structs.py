@@ -37,7 +37,7 @@ class Raster(ctypes.Structure):
         *_pointers("means quats scales opacity sh corners R t focal mask"),
         *_ints("n k c height width threads"),
         *_floats("alpha_max alpha_min T_min facing near near_sigmas corner"),
-        *_ints("record_size gradient_size fixed_width corner_width mask_stride"),
+        *_ints("record_size gradient_size corner_start corner_width mask_stride"),
         *_pointers("record span keys ranks ranks_2 counts tile_start list"),
         *_ints("n_drawn n_pairs"),
         *_pointers("rgb alpha depth depth_var normal features weight touched dominant weight_parts touched_parts"),

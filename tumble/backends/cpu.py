@@ -59,13 +59,13 @@ __all__ = [
     "visible",
 ]
 
-TILE = 8
-"""Side of a tile in `native/raster.h` [pixels]."""
+TILE_W = 4
+"""Width of a tile in `native/raster.h`; it has as many pixels as a vector has numbers [pixels]."""
 RECORD = 32
 """Numbers of a Gaussian's record in `native/raster.h`, without features."""
-GEOMETRY = 16
-"""Numbers of a Gaussian's gradient in `native/raster.h`, without colour, normal and features."""
-SPAN = 5
+SUMS = 16, 24
+"""Numbers of a Gaussian's gradient in `native/raster.h` before those of the corners, without and with features."""
+SPAN = 16
 """Numbers of a Gaussian's footprint on screen in `native/raster.h`."""
 CAMERA = 16
 """Numbers of the camera's gradient in `native/raster.h`."""
@@ -131,7 +131,7 @@ class _Rasterize(torch.autograd.Function):
         mask = (mask if mask.numel() == 1 else mask.expand(height, width)).contiguous()
         r = _raster(n, k, c, height, width, mask.numel() > 1)
         kept = set_pointers(r, dict(zip(_INPUTS, inputs, strict=True)), mask=mask)
-        n_tiles = -(-height // TILE) * -(-width // TILE)
+        n_tiles = -(-height // (_native.library().lanes() // TILE_W)) * -(-width // TILE_W)
         kept += set_pointers(
             r,
             record=torch.empty(n * r.record_size),
@@ -196,8 +196,8 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
     """Arguments of the rasterizer with the sizes and constants of one view."""
     lanes = _native.library().lanes()
     c_drawn = -(-c // 4) * 4
-    fixed_width, corner_width = (-(-x // lanes) * lanes for x in (6, c_drawn))
-    gradient_size = GEOMETRY + fixed_width + 4 * corner_width
+    corner_start, corner_width = (-(-x // lanes) * lanes for x in (SUMS[c > 0], c_drawn))
+    gradient_size = corner_start + 4 * corner_width
     return Raster(
         n=n,
         k=k,
@@ -214,7 +214,7 @@ def _raster(n: int, k: int, c: int, height: int, width: int, masked: bool) -> Ra
         corner=CORNER,
         record_size=RECORD + 4 * c_drawn,
         gradient_size=gradient_size,
-        fixed_width=fixed_width,
+        corner_start=corner_start,
         corner_width=corner_width,
         mask_stride=int(masked),
     )

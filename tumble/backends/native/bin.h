@@ -27,32 +27,33 @@ static void sort_by_depth(Raster& r) {
     r.ranks_2 = to, r.ranks = from, r.n_drawn = n;
 }
 
-// Calls visit(tile) for every tile with a pixel centre inside a Gaussian's footprint. The leftmost and rightmost points
-// of the part of an ellipse within a row of tiles are the extreme points of the ellipse, or else its intersections with
-// the border of the row.
+// Calls visit(tile) for every tile of which a pixel centre is in a Gaussian's footprint, and for few others: for all tiles
+// of its bounding box if that is two tiles wide or high, else in each row for those between the leftmost and rightmost
+// points of the ellipse's part within the row. These are the extreme points of the ellipse, or else its intersections
+// with the border of the row.
 template <class F>
 INLINE void for_tiles(const Raster& r, int g, F visit) {
     const float* s = r.span + (i64)g * SPAN;
-    const float margin = 0.02f;
-    float x2 = fmax2(s[2], 0), y2 = fmax2(s[4], 1e-12f);
-    float half_x = __builtin_sqrtf(x2), half_y = __builtin_sqrtf(y2), slope = s[3] / y2;
-    float rest = fmax2(x2 - s[3] * slope, 0), inv_y2 = 1 / y2, extreme = half_x > 0 ? s[3] / half_x : 0;
-    float low = fmax2(s[1] - half_y - margin, 0), high = fmin2(s[1] + half_y + margin, (float)r.height);
-    int row_end = imin2(tiles_y(r), ((int)high + TILE) / TILE), across = tiles_x(r);
-    for (int row = (int)low / TILE; row < row_end; row++) {
-        // Pixel centres of the row, relative to the centre of the footprint.
-        float top = fmax2(row * TILE + 0.5f - margin - s[1], -half_y);
-        float bottom = fmin2(row * TILE + TILE - 0.5f + margin - s[1], half_y);
-        if (top > bottom) continue;
-        float e_r = fmin2(fmax2(extreme, top), bottom), e_l = fmin2(fmax2(-extreme, top), bottom);
-        float right = s[0] + slope * e_r + __builtin_sqrtf(rest * fmax2(1 - e_r * e_r * inv_y2, 0)) + margin;
-        float left = s[0] + slope * e_l - __builtin_sqrtf(rest * fmax2(1 - e_l * e_l * inv_y2, 0)) - margin;
-        left = fmax2(left, 0.5f), right = fmin2(right, (float)r.width - 0.5f);
-        if (left > right) continue;
-        // Pixels whose centre x + 1/2 lies in [left, right].
-        int from = (int)(left + 0.5f), to = (int)(right - 0.5f);
-        if (from > to) continue;
-        for (int tile = from / TILE; tile <= to / TILE && tile < across; tile++) visit(row * across + tile);
+    const int* range = (const int*)s;
+    int across = tiles_x(r);
+    if (range[COLUMN_END] - range[COLUMN] < 2 || range[ROW_END] - range[ROW] < 2) {
+        for (int row = range[ROW]; row <= range[ROW_END]; row++)
+            for (int column = range[COLUMN]; column <= range[COLUMN_END]; column++) visit(row * across + column);
+        return;
+    }
+    for (int first = range[ROW]; first <= range[ROW_END]; first += LANES) {
+        // Pixel centres of the rows, relative to the centre of the footprint.
+        vf y = __builtin_convertvector((lane_index() + first) * TILE_H, vf) + (0.5f - s[MID_Y]), half = splat(s[HALF_Y]);
+        vf top = vmax(y - 0.02f, -half), bottom = vmin(y + (TILE_H - 0.98f), half);
+        vf e_r = vmin(vmax(splat(s[EXTREME]), top), bottom), e_l = vmin(vmax(splat(-s[EXTREME]), top), bottom);
+        vf right = s[SLOPE] * e_r + vsqrt(s[REST] * vmax(1.0f - e_r * e_r * s[INV_Y2], vf{}));
+        vf left = s[SLOPE] * e_l - vsqrt(s[REST] * vmax(1.0f - e_l * e_l * s[INV_Y2], vf{}));
+        vi from, to;
+        pixels_between(s[MID_X] + left, s[MID_X] + right, r.width, from, to);
+        to = (top <= bottom) & (from <= to) ? to / TILE_W : vi{} - 1;
+        from /= TILE_W;
+        for (int row = first; row <= imin2(range[ROW_END], first + LANES - 1); row++)
+            for (int column = from[row - first]; column <= to[row - first]; column++) visit(row * across + column);
     }
 }
 

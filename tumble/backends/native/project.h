@@ -227,27 +227,45 @@ INLINE vi outline(const Raster& r, const Camera& cam, const Projected& o, vf cut
     vf zz = dot(Z, Z), xz = dot(X, Z), yz = dot(Y, Z), D = p.z * p.z - cut * zz, inv_D = 1.0f / D;
     V3 x = X * p.z + Z * (-p.x), y = Y * p.z + Z * (-p.y);
     vf scale = cut * inv_D * inv_D;
-    vf x2 = scale * (dot(x, x) + cut * (xz * xz - dot(X, X) * zz));
-    vf xy = scale * (dot(x, y) + cut * (xz * yz - dot(X, Y) * zz));
-    vf y2 = scale * (dot(y, y) + cut * (yz * yz - dot(Y, Y) * zz));
-    span[0] = cam.cx + cam.fx * (p.x * p.z - cut * xz) * inv_D;
-    span[1] = cam.cy + cam.fy * (p.y * p.z - cut * yz) * inv_D;
-    span[2] = cam.fx * cam.fx * x2, span[3] = cam.fx * cam.fy * xy, span[4] = cam.fy * cam.fy * y2;
+    vf x2 = cam.fx * cam.fx * scale * (dot(x, x) + cut * (xz * xz - dot(X, X) * zz));
+    vf xy = cam.fx * cam.fy * scale * (dot(x, y) + cut * (xz * yz - dot(X, Y) * zz));
+    vf y2 = cam.fy * cam.fy * scale * (dot(y, y) + cut * (yz * yz - dot(Y, Y) * zz));
+    x2 = vmax(x2, vf{}), y2 = vmax(y2, splat(1e-12f));
+    vf half_x = vsqrt(x2), inv_y2 = 1.0f / y2;
+    span[MID_X] = cam.cx + cam.fx * (p.x * p.z - cut * xz) * inv_D;
+    span[MID_Y] = cam.cy + cam.fy * (p.y * p.z - cut * yz) * inv_D;
+    span[HALF_Y] = vsqrt(y2), span[SLOPE] = xy * inv_y2, span[REST] = vmax(x2 - xy * span[SLOPE], vf{});
+    span[EXTREME] = keep(half_x > 0.0f, xy / half_x), span[INV_Y2] = inv_y2;
+    vi left, right, top, bottom;
+    pixels_between(span[MID_X] - half_x, span[MID_X] + half_x, r.width, left, right);
+    pixels_between(span[MID_Y] - span[HALF_Y], span[MID_Y] + span[HALF_Y], r.height, top, bottom);
+    span[COLUMN] = (vf)(left / TILE_W), span[COLUMN_END] = (vf)(right / TILE_W);
+    span[ROW] = (vf)(top / TILE_H), span[ROW_END] = (vf)(bottom / TILE_H);
     V3 n = {o.M(0, 2), o.M(1, 2), o.M(2, 2)};
-    vi drawn = (p.z > r.near) & (p.z > r.near_sigmas * vsqrt(zz)) & (o.opacity >= r.alpha_min) &
-               (dot(p, n) <= r.facing * vsqrt(dot(p, p)));
-    vf half_x = vsqrt(vmax(span[2], vf{})) + 0.05f, half_y = vsqrt(vmax(span[4], vf{})) + 0.05f;
-    // Footprints that contain no pixel centre of the image are culled as well.
-    return drawn & (span[0] + half_x > 0.5f) & (span[0] - half_x < (float)r.width - 0.5f) &
-           (span[1] + half_y > 0.5f) & (span[1] - half_y < (float)r.height - 0.5f);
+    return (p.z > r.near) & (p.z > r.near_sigmas * vsqrt(zz)) & (o.opacity >= r.alpha_min) &
+           (dot(p, n) <= r.facing * vsqrt(dot(p, p))) & (left <= right) & (top <= bottom);
+}
+
+// Writes N numbers per lane to rows of an array, for the lanes of a mask.
+template <int N>
+INLINE void write_rows(float* to, int stride, const Batch& b, u32 lanes, const vf* x) {
+    for (int first = 0; first < N; first += LANES) {
+        vf rows[LANES];
+        for (int i = 0; i < LANES; i++) rows[i] = x[first + i];
+        transpose(rows);
+        for (u32 some = lanes; some; some &= some - 1) {
+            int i = __builtin_ctz(some);
+            store(to + (i64)b.g[i] * stride + first, rows[i]);
+        }
+    }
 }
 
 static void project_batch(Raster& r, const Camera& cam, Batch& b) {
     b.pad();
     Projected o = project(r, cam, b);
     vf cut = 2.0f * vlog(vmax(o.opacity * (1.0f / r.alpha_min), splat(1.0f))) + 1e-4f;
-    vf span[SPAN];
-    u32 drawn = bits(outline(r, cam, o, cut, span));
+    vf span[SPAN] = {};
+    u32 drawn = bits(outline(r, cam, o, cut, span) & (lane_index() < b.count));
     vf uv = splat(1.0f / (2.0f * r.corner)), f[RECORD] = {};
     f[CX] = cam.cx + cam.fx * o.p.x * o.inv_z, f[CY] = cam.cy + cam.fy * o.p.y * o.inv_z;
     vf zh = o.p.z * o.h, zzh = o.p.z * zh;
@@ -258,23 +276,19 @@ static void project_batch(Raster& r, const Camera& cam, Batch& b) {
     for (int i = 0; i < 3; i++) f[NX + i] = o.R_obj_local(i, 2);
     f[EU] = uv * o.P.x, f[UX] = uv * o.p.z * o.E1.x, f[UY] = uv * o.p.z * o.E2.x;
     f[EV] = uv * o.P.y, f[VX] = uv * o.p.z * o.E1.y, f[VY] = uv * o.p.z * o.E2.y;
-    float lanes[RECORD][LANES], spans[SPAN][LANES];
-    for (int j = 0; j < RECORD; j++) store(lanes[j], f[j]);
-    for (int j = 0; j < SPAN; j++) store(spans[j], span[j]);
-    for (int i = 0; i < b.count; i++) {
-        int g = b.g[i];
-        if (!(drawn >> i & 1)) continue;
+    write_rows<RECORD>(r.record, r.record_size, b, drawn, f), write_rows<SPAN>(r.span, SPAN, b, drawn, span);
+    for (; drawn; drawn &= drawn - 1) {
+        int g = b.g[__builtin_ctz(drawn)], width = (r.record_size - RECORD) / 4;
         float* record = r.record + (i64)g * r.record_size;
-        for (int j = 0; j < RECORD; j++) record[j] = lanes[j][i];
-        for (int j = 0; j < SPAN; j++) r.span[(i64)g * SPAN + j] = spans[j][i];
         __builtin_memcpy(&r.keys[g], &record[PZ], 4);
         const float* f4 = r.corners + (i64)g * 4 * r.c;
+        float* out = record + RECORD;
         for (int ch = 0; ch < r.c; ch++) {
-            float *out = record + RECORD + 4 * ch, f00 = f4[ch], f10 = f4[r.c + ch], f01 = f4[2 * r.c + ch];
-            out[0] = f00, out[1] = f10 - f00, out[2] = f01 - f00;
-            out[3] = f4[3 * r.c + ch] - f10 - f01 + f00;
+            float f00 = f4[ch], f10 = f4[r.c + ch], f01 = f4[2 * r.c + ch];
+            out[ch] = f00, out[width + ch] = f10 - f00, out[2 * width + ch] = f01 - f00;
+            out[3 * width + ch] = f4[3 * r.c + ch] - f10 - f01 + f00;
         }
-        for (int j = RECORD + 4 * r.c; j < r.record_size; j++) record[j] = 0;
+        for (int ch = r.c; ch < width; ch++) out[ch] = out[width + ch] = out[2 * width + ch] = out[3 * width + ch] = 0;
     }
     b.count = 0;
 }
@@ -293,39 +307,39 @@ static void project_share(Raster& r, int share) {
     if (b.count) project_batch(r, cam, b);
 }
 
-// Gradients of the inputs from those of a record's fields, per lane. The gradient of the camera is accumulated in
-// `camera`: R (9), t (3), focal lengths and principal point (4).
-INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected& o, const vf* g, V3 v_rgb,
-                            V3 v_normal, const Batch& b, vf* camera) {
+// Gradients of the inputs from sums over pixels, per lane. The gradient of the camera is accumulated in `camera`: R (9),
+// t (3), focal lengths and principal point (4).
+INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected& o, const vf* g, const Batch& b, vf* camera) {
     vi drawn = lane_index() < b.count;
     vf z = o.p.z, iz = o.inv_z, uv = splat(1.0f / (2.0f * r.corner)), zh = z * o.h, zzh = z * zh;
     // Conic, slant and kappa.
-    vf v_S11 = zzh * g[G_A], v_S12 = 2.0f * zzh * g[G_B], v_S22 = zzh * g[G_C];
+    vf v_S11 = zzh * g[S_A], v_S12 = 2.0f * zzh * g[S_B], v_S22 = zzh * g[S_C], v_kappa = -g[S_KAPPA];
     vf m1 = o.e1 + o.tau * o.w1, m2 = o.e2 + o.tau * o.w2;
-    vf conic = v_S11 * o.S11 + v_S12 * o.S12 + v_S22 * o.S22, slant = zh * (g[G_BX] * m1 + g[G_BY] * m2);
-    vf v_z = g[G_PZ] + iz * (2.0f * conic + slant);
-    vf h_v_h = conic + slant + o.tau * o.h * g[G_KAPPA];   // h dL/dh
-    vf v_w1 = zh * o.tau * g[G_BX], v_w2 = zh * o.tau * g[G_BY];
+    vf h_v_h = v_S11 * o.S11 + v_S12 * o.S12 + v_S22 * o.S22 + zh * (g[S_BX] * m1 + g[S_BY] * m2) +
+               o.tau * o.h * v_kappa;   // h dL/dh
+    vf v_w1 = zh * o.tau * g[S_BX], v_w2 = zh * o.tau * g[S_BY];
     vf v_tau = v_S11 * o.g1 * o.g1 + v_S12 * o.g1 * o.g2 + v_S22 * o.g2 * o.g2 +
-               zh * (g[G_BX] * o.w1 + g[G_BY] * o.w2) + o.h * g[G_KAPPA] - o.PP * o.h * h_v_h;
+               zh * (g[S_BX] * o.w1 + g[S_BY] * o.w2) + o.h * v_kappa - o.PP * o.h * h_v_h;
     V2 v_F1 = o.F1 * (2.0f * v_S11) + o.F2 * v_S12, v_F2 = o.F2 * (2.0f * v_S22) + o.F1 * v_S12;
     vf v_g1 = o.tau * (2.0f * v_S11 * o.g1 + v_S12 * o.g2), v_g2 = o.tau * (2.0f * v_S22 * o.g2 + v_S12 * o.g1);
-    vf v_e1 = zh * g[G_BX] - dot(v_F1, o.P), v_e2 = zh * g[G_BY] - dot(v_F2, o.P);
+    vf v_e1 = zh * g[S_BX] - dot(v_F1, o.P), v_e2 = zh * g[S_BY] - dot(v_F2, o.P);
     V2 v_E1 = v_F1 + o.P * v_w1 + V2{-o.P.y, o.P.x} * v_g1, v_E2 = v_F2 + o.P * v_w2 + V2{-o.P.y, o.P.x} * v_g2;
     V2 v_P = v_F1 * -o.e1 + v_F2 * -o.e2 + o.E1 * v_w1 + o.E2 * v_w2 + V2{o.E1.y, -o.E1.x} * v_g1 +
              V2{o.E2.y, -o.E2.x} * v_g2 + o.P * (-2.0f * o.tau * o.h * h_v_h);
     // Corner coordinates.
     vf zuv = z * uv;
-    v_P.x += uv * g[G_EU], v_P.y += uv * g[G_EV];
-    v_E1.x += zuv * g[G_UX], v_E2.x += zuv * g[G_UY], v_E1.y += zuv * g[G_VX], v_E2.y += zuv * g[G_VY];
-    v_z += uv * (g[G_UX] * o.E1.x + g[G_UY] * o.E2.x + g[G_VX] * o.E1.y + g[G_VY] * o.E2.y);
-    // Projected centre.
-    V3 v_p = {g[G_CX] * cam.fx * iz, g[G_CY] * cam.fy * iz, v_z};
+    v_P.x += uv * g[S_EU], v_P.y += uv * g[S_EV];
+    v_E1.x += zuv * g[S_UX], v_E2.x += zuv * g[S_UY], v_E1.y += zuv * g[S_VX], v_E2.y += zuv * g[S_VY];
+    // Projected centre. Because v_l l + 2 v_K K = -v_zeta zeta in every pixel, the depth z of the centre has this gradient.
+    vf v_z = -iz * (g[S_L] + uv * (o.P.x * g[S_U] + o.P.y * g[S_V]));
+    vf v_cx = -2.0f * zzh * (o.S11 * g[S_KX] + o.S12 * g[S_KY]) - zh * m1 * g[S_L] - zuv * (o.E1.x * g[S_U] + o.E1.y * g[S_V]);
+    vf v_cy = -2.0f * zzh * (o.S12 * g[S_KX] + o.S22 * g[S_KY]) - zh * m2 * g[S_L] - zuv * (o.E2.x * g[S_U] + o.E2.y * g[S_V]);
+    V3 v_p = {v_cx * cam.fx * iz, v_cy * cam.fy * iz, v_z};
     v_p.z -= iz * (v_p.x * o.p.x + v_p.y * o.p.y);
     vf inv_fx = 1.0f / cam.fx, inv_fy = 1.0f / cam.fy;
-    camera[12] += keep(drawn, g[G_CX] * o.p.x * iz - (dot(o.E1, v_E1) + o.e1 * v_e1) * inv_fx);
-    camera[13] += keep(drawn, g[G_CY] * o.p.y * iz - (dot(o.E2, v_E2) + o.e2 * v_e2) * inv_fy);
-    camera[14] += keep(drawn, g[G_CX]), camera[15] += keep(drawn, g[G_CY]);
+    camera[12] += keep(drawn, v_cx * o.p.x * iz - (dot(o.E1, v_E1) + o.e1 * v_e1) * inv_fx);
+    camera[13] += keep(drawn, v_cy * o.p.y * iz - (dot(o.E2, v_E2) + o.e2 * v_e2) * inv_fy);
+    camera[14] += keep(drawn, v_cx), camera[15] += keep(drawn, v_cy);
     // Whitening.
     V3 v_s = {-o.inv_s.x * (o.P.x * v_P.x + o.E1.x * v_E1.x + o.E2.x * v_E2.x),
               -o.inv_s.y * (o.P.y * v_P.y + o.E1.y * v_E1.y + o.E2.y * v_E2.y),
@@ -338,8 +352,8 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     M3 v_M = {{o.p.x * w.x + w1.x, o.p.x * w.y + w1.y, o.p.x * w.z + w1.z, o.p.y * w.x + w2.x,
                o.p.y * w.y + w2.y, o.p.y * w.z + w2.z, o.p.z * w.x, o.p.z * w.y, o.p.z * w.z}};
     // Colour.
-    vf v_raw[3] = {keep(o.raw[0] >= 0.0f, v_rgb.x), keep(o.raw[1] >= 0.0f, v_rgb.y), keep(o.raw[2] >= 0.0f, v_rgb.z)};
-    vf v_Y[16];
+    vf v_raw[3], v_Y[16];
+    for (int ch = 0; ch < 3; ch++) v_raw[ch] = keep(o.raw[ch] >= 0.0f, g[S_RGB + ch]);
     for (int j = 0; j < r.k; j++) {
         v_Y[j] = vf{};
         for (int ch = 0; ch < 3; ch++) {
@@ -355,7 +369,7 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
             v_Rq.m[3 * i + j] = cam.R(0, i) * v_M(0, j) + cam.R(1, i) * v_M(1, j) + cam.R(2, i) * v_M(2, j);
-    v_Rq.m[2] += v_normal.x, v_Rq.m[5] += v_normal.y, v_Rq.m[8] += v_normal.z;
+    for (int i = 0; i < 3; i++) v_Rq.m[3 * i + 2] += g[S_NORMAL + i];
     vf vp[3] = {v_p.x, v_p.y, v_p.z}, pc[3] = {o.p.x, o.p.y, o.p.z}, vd[3] = {v_dir.x, v_dir.y, v_dir.z},
        mu[3] = {o.mu.x, o.mu.y, o.mu.z};
     for (int i = 0; i < 3; i++) {
@@ -373,31 +387,30 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     V3 v_mu = mul_T(cam.R, v_p);
     scatter3(r.v_means, b, {keep(drawn, v_mu.x), keep(drawn, v_mu.y), keep(drawn, v_mu.z)});
     scatter3(r.v_scales, b, {keep(drawn, v_s.x), keep(drawn, v_s.y), keep(drawn, v_s.z)});
-    scatter(r.v_opacity, 1, 0, b, keep(drawn, g[G_OPACITY]));
+    scatter(r.v_opacity, 1, 0, b, keep(drawn, -2.0f * g[S_RHO] / o.opacity));
 }
 
-// Gradients of a batch from the sums of its records' gradients.
+// Gradients of a batch from the sums over pixels of all shares.
 static void project_adjoint_batch(Raster& r, const Camera& cam, Batch& b, vf* camera) {
     b.pad();
-    float lanes[GEOMETRY + 6][LANES] = {};
     for (int i = 0; i < b.count; i++) {
         int g = b.g[i], size = r.gradient_size;
         float *total = r.parts + (i64)g * size, *v_corners = r.v_corners + (i64)g * 4 * r.c;
         for (int part = 1; part < r.threads; part++) {
             const float* more = r.parts + ((i64)part * r.n + g) * size;
-            for (int j = 0; j < size; j++) total[j] += more[j];
+            for (int j = 0; j < size; j += LANES) store(total + j, load(total + j) + load(more + j));
         }
-        for (int j = 0; j < GEOMETRY + 6; j++) lanes[j][i] = total[j];
-        const float* corner = total + GEOMETRY + r.fixed_width;
+        const float* corner = total + r.corner_start;
         for (int k = 0; k < 4; k++, corner += r.corner_width)
             for (int ch = 0; ch < r.c; ch++) v_corners[k * r.c + ch] = corner[ch];
     }
     if (r.v_means) {
-        vf g[GEOMETRY + 6];
-        for (int j = 0; j < GEOMETRY + 6; j++) g[j] = load(lanes[j]);
-        Projected o = project(r, cam, b);
-        const vf* c = g + GEOMETRY;
-        project_adjoint(r, cam, o, g, {c[0], c[1], c[2]}, {c[3], c[4], c[5]}, b, camera);
+        vf g[SUMS + LANES] = {};
+        for (int first = 0; first < r.corner_start; first += LANES) {
+            for (int i = 0; i < LANES; i++) g[first + i] = load(r.parts + (i64)b.g[i] * r.gradient_size + first);
+            transpose(g + first);
+        }
+        project_adjoint(r, cam, project(r, cam, b), g, b, camera);
     }
     b.count = 0;
 }

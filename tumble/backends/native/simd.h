@@ -19,9 +19,6 @@ typedef unsigned char u8;
 typedef unsigned int u32;
 typedef long long i64;
 
-// The lanes of a vector are a block of pixels, BLOCK_W wide.
-enum { BLOCK_W = 4, BLOCK_H = LANES / 4 };
-
 #define INLINE static inline __attribute__((always_inline))
 #define METHOD inline __attribute__((always_inline))
 
@@ -84,9 +81,20 @@ INLINE bool any(vi m) {
 #endif
 }
 
-// e^x for -87 < x < 88, relative error 2e-7.
-INLINE vf vexp(vf x) {
-    vf y = x * 1.44269504f, t = y + 12582912.f, f = y - (t - 12582912.f);
+// 1 / x to the last bit or two; a division would take as long as ten multiplications.
+INLINE vf inverse(vf x) {
+#if LANES == 16
+    typedef float v16sf __attribute__((vector_size(64)));
+    vf y = (vf)__builtin_ia32_rcp14ps512_mask((v16sf)x, (v16sf)x, -1);
+    return y + y * (1.0f - x * y);
+#else
+    return 1.0f / x;
+#endif
+}
+
+// 2^x for -126 < x < 127 and e^x for -87 < x < 88, relative error 2e-7.
+INLINE vf vexp2(vf x) {
+    vf t = x + 12582912.f, f = x - (t - 12582912.f);
     vf p = f * 1.327647042e-3f + 9.675541618e-3f;
     p = p * f + 5.550713281e-2f;
     p = p * f + 2.402211972e-1f;
@@ -94,6 +102,7 @@ INLINE vf vexp(vf x) {
     p = p * f + 1.000000072f;
     return (vf)((vi)p + ((vi)t << 23));
 }
+INLINE vf vexp(vf x) { return vexp2(x * 1.44269504f); }
 
 // Natural logarithm of a positive normal number, absolute error 1e-6.
 INLINE vf vlog(vf x) {
@@ -109,43 +118,45 @@ INLINE vf vlog(vf x) {
     return p * m + __builtin_convertvector(e, vf) * 0.693147181f;
 }
 
-#if LANES == 16
-INLINE vf zip_low(vf a, vf b) { return SHUFFLE(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23); }
-INLINE vf zip_high(vf a, vf b) { return SHUFFLE(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31); }
-INLINE vf fold1(vf a, vf b) {
-    vf x = SHUFFLE(a, b, 0, 17, 2, 19, 4, 21, 6, 23, 8, 25, 10, 27, 12, 29, 14, 31);
-    return x + SHUFFLE(a, b, 1, 16, 3, 18, 5, 20, 7, 22, 9, 24, 11, 26, 13, 28, 15, 30);
+// The numbers from 0 to N - 1 as template arguments, with which the lanes of a shuffle are named.
+template <int... I>
+struct Indices {};
+template <int N, int... I>
+struct Count : Count<N - 1, N - 1, I...> {};
+template <int... I>
+struct Count<0, I...> : Indices<I...> {};
+typedef Count<LANES> Lanes;
+
+// The lower (0) or upper (1) halves of two vectors, interleaved.
+template <int half, int... I>
+INLINE vf zip(vf a, vf b, Indices<I...>) {
+    return SHUFFLE(a, b, (I % 2 * LANES + I / 2 + half * LANES / 2)...);
 }
-INLINE vf fold2(vf a, vf b) {
-    vf x = SHUFFLE(a, b, 0, 1, 18, 19, 4, 5, 22, 23, 8, 9, 26, 27, 12, 13, 30, 31);
-    return x + SHUFFLE(a, b, 2, 3, 16, 17, 6, 7, 20, 21, 10, 11, 24, 25, 14, 15, 28, 29);
+// Sums of pairs of lanes `step` apart: those of a in lanes whose number lacks that bit, those of b in the others.
+template <int step, int... I>
+INLINE vf fold(vf a, vf b, Indices<I...>) {
+    return SHUFFLE(a, b, (I & step ? LANES + I : I)...) + SHUFFLE(a, b, (I & step ? LANES + I - step : I + step)...);
 }
-INLINE vf fold4(vf a, vf b) {
-    vf x = SHUFFLE(a, b, 0, 1, 2, 3, 20, 21, 22, 23, 8, 9, 10, 11, 28, 29, 30, 31);
-    return x + SHUFFLE(a, b, 4, 5, 6, 7, 16, 17, 18, 19, 12, 13, 14, 15, 24, 25, 26, 27);
+// Every third number from number `first` on of three vectors that follow each other, and the inverse: vector `which` of
+// the numbers x0 y0 z0 x1 y1 ...
+template <int first, int... I>
+INLINE vf third(vf a, vf b, vf c, Indices<I...>) {
+    vf ab = SHUFFLE(a, b, ((3 * I + first) % (2 * LANES))...);
+    return SHUFFLE(ab, c, (3 * I + first < 2 * LANES ? I : 3 * I + first - LANES)...);
 }
-INLINE vf fold8(vf a, vf b) {
-    vf x = SHUFFLE(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 24, 25, 26, 27, 28, 29, 30, 31);
-    return x + SHUFFLE(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23);
+template <int which, int... I>
+INLINE vf of_thirds(vf x, vf y, vf z, Indices<I...>) {
+    vf xy = SHUFFLE(x, y, ((which * LANES + I) % 3 % 2 * LANES + (which * LANES + I) / 3)...);
+    return SHUFFLE(xy, z, ((which * LANES + I) % 3 == 2 ? LANES + (which * LANES + I) / 3 : I)...);
 }
-#elif LANES == 8
-INLINE vf zip_low(vf a, vf b) { return SHUFFLE(a, b, 0, 8, 1, 9, 2, 10, 3, 11); }
-INLINE vf zip_high(vf a, vf b) { return SHUFFLE(a, b, 4, 12, 5, 13, 6, 14, 7, 15); }
-INLINE vf fold1(vf a, vf b) {
-    return SHUFFLE(a, b, 0, 9, 2, 11, 4, 13, 6, 15) + SHUFFLE(a, b, 1, 8, 3, 10, 5, 12, 7, 14);
+INLINE void load3(const float* p, vf* x) {
+    vf a = load(p), b = load(p + LANES), c = load(p + 2 * LANES);
+    x[0] = third<0>(a, b, c, Lanes()), x[1] = third<1>(a, b, c, Lanes()), x[2] = third<2>(a, b, c, Lanes());
 }
-INLINE vf fold2(vf a, vf b) {
-    return SHUFFLE(a, b, 0, 1, 10, 11, 4, 5, 14, 15) + SHUFFLE(a, b, 2, 3, 8, 9, 6, 7, 12, 13);
+INLINE void store3(float* p, const vf* x) {
+    store(p, of_thirds<0>(x[0], x[1], x[2], Lanes())), store(p + LANES, of_thirds<1>(x[0], x[1], x[2], Lanes()));
+    store(p + 2 * LANES, of_thirds<2>(x[0], x[1], x[2], Lanes()));
 }
-INLINE vf fold4(vf a, vf b) {
-    return SHUFFLE(a, b, 0, 1, 2, 3, 12, 13, 14, 15) + SHUFFLE(a, b, 4, 5, 6, 7, 8, 9, 10, 11);
-}
-#else
-INLINE vf zip_low(vf a, vf b) { return SHUFFLE(a, b, 0, 4, 1, 5); }
-INLINE vf zip_high(vf a, vf b) { return SHUFFLE(a, b, 2, 6, 3, 7); }
-INLINE vf fold1(vf a, vf b) { return SHUFFLE(a, b, 0, 5, 2, 7) + SHUFFLE(a, b, 1, 4, 3, 6); }
-INLINE vf fold2(vf a, vf b) { return SHUFFLE(a, b, 0, 1, 6, 7) + SHUFFLE(a, b, 2, 3, 4, 5); }
-#endif
 
 // Lane i of x[j] becomes lane j of x[i]: interleaving both halves rotates the bits of the index of an element by one.
 INLINE void transpose(vf* x) {
@@ -154,7 +165,7 @@ INLINE void transpose(vf* x) {
         vf y[LANES];
 #pragma GCC unroll 8
         for (int i = 0; i < LANES / 2; i++)
-            y[2 * i] = zip_low(x[i], x[i + LANES / 2]), y[2 * i + 1] = zip_high(x[i], x[i + LANES / 2]);
+            y[2 * i] = zip<0>(x[i], x[i + LANES / 2], Lanes()), y[2 * i + 1] = zip<1>(x[i], x[i + LANES / 2], Lanes());
 #pragma GCC unroll 16
         for (int i = 0; i < LANES; i++) x[i] = y[i];
     }
@@ -163,13 +174,13 @@ INLINE void transpose(vf* x) {
 // Lane i of the result is the sum of the lanes of x[i]: a transposed reduction with three operations per sum.
 INLINE vf sums_of(const vf* x) {
     vf a[LANES / 2];
-    for (int i = 0; i < LANES / 2; i++) a[i] = fold1(x[2 * i], x[2 * i + 1]);
-    for (int i = 0; i < LANES / 4; i++) a[i] = fold2(a[2 * i], a[2 * i + 1]);
+    for (int i = 0; i < LANES / 2; i++) a[i] = fold<1>(x[2 * i], x[2 * i + 1], Lanes());
+    for (int i = 0; i < LANES / 4; i++) a[i] = fold<2>(a[2 * i], a[2 * i + 1], Lanes());
 #if LANES >= 8
-    for (int i = 0; i < LANES / 8; i++) a[i] = fold4(a[2 * i], a[2 * i + 1]);
+    for (int i = 0; i < LANES / 8; i++) a[i] = fold<4>(a[2 * i], a[2 * i + 1], Lanes());
 #endif
 #if LANES >= 16
-    a[0] = fold8(a[0], a[1]);
+    a[0] = fold<8>(a[0], a[1], Lanes());
 #endif
     return a[0];
 }
