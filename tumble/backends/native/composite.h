@@ -188,6 +188,13 @@ struct Features {
     }
 };
 
+// Prefetches `size` numbers for the Gaussian that follows some places later in the lists of tiles, which follow each other.
+INLINE void prefetch(const Raster& r, const int* place, const float* array, int size) {
+    enum { AHEAD = 6 };
+    const float* p = array + (i64)place[imin2(AHEAD, (int)(r.list + r.n_pairs - 1 - place))] * size;
+    for (int i = 0; i < size; i += 16) __builtin_prefetch(p + i);
+}
+
 // Draws a tile, and moves the Gaussians that contribute to it to the beginning of its list; returns their number.
 template <int C>
 static int composite_tile(const Raster& r, const Tile& t, int* list, int count, Weights& weights, int* touched) {
@@ -202,6 +209,7 @@ static int composite_tile(const Raster& r, const Tile& t, int* list, int count, 
     for (int i = 0; i < count; i++) {
         int g = list[i];
         const float* f = r.record + (i64)g * r.record_size;
+        prefetch(r, list + i, r.record, RECORD + 4 * C);
         Peak p;
         if (!peak_at(f, t, alive, r.alpha_min, r.alpha_max, p)) continue;
         list[kept++] = g;
@@ -291,6 +299,8 @@ static void adjoint_tile(const Raster& r, const Tile& t, const int* list, int co
     for (int i = 0; i < count; i++) {
         int g = list[i];
         const float* f = r.record + (i64)g * r.record_size;
+        prefetch(r, list + i, r.record, RECORD + 4 * C);
+        prefetch(r, list + i, parts, PADDED<N> + (C ? 4 * PADDED<C + !C> : 0));
         Peak p;
         if (!peak_at(f, t, T >= r.T_min, r.alpha_min, r.alpha_max, p)) continue;
         float* out = parts + (i64)g * r.gradient_size;
