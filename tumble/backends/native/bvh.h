@@ -36,25 +36,30 @@ struct Rays {
     int *hit, *bits;
 };
 
+// Field j of the Gaussians [first, first + count) of an [n stride] array.
+INLINE void put(float* p, int stride, int j, int first, int count, vf value) {
+    for (int i = 0; i < count; i++) p[(i64)(first + i) * stride + j] = value[i];
+}
+
 static void leaf_fields(Bvh& t, float* fields) {
     for (int first = 0; first < t.n; first += LANES) {
         int count = imin2(LANES, t.n - first);
         vf q[4];
-        for (int j = 0; j < 4; j++) q[j] = gather(t.quats, 4, j, first, count);
+        gather<4>(t.quats, first, count, q);
         vf length = 1.0f / vsqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         for (int j = 0; j < 4; j++) q[j] *= length;
         M3 R = rotation(q);
         V3 s = gather3(t.scales, first, count), mu = gather3(t.means, first, count);
         vf inv[3] = {1.0f / s.x, 1.0f / s.y, 1.0f / s.z}, m[3] = {mu.x, mu.y, mu.z};
-        vf cut = 2.0f * vlog(vmax(gather(t.opacity, 1, 0, first, count) * (1.0f / t.alpha_min), splat(1.0f)));
+        vf cut = 2.0f * vlog(vmax(gather1(t.opacity, first, count) * (1.0f / t.alpha_min), splat(1.0f)));
         cut = vmin(cut + 1e-4f, splat(t.sigmas * t.sigmas * 1.0001f));
         for (int i = 0, k = 0; i < 3; i++) {
             V3 side = row(R, i) * s;
             vf half = vsqrt(cut * dot(side, side)) + 1e-6f;
-            for (int j = i; j < 3; j++, k++) scatter(fields, FIELDS, 9 + k, first, count, cut * dot(side, row(R, j) * s));
-            scatter(t.boxes, 6, i, first, count, m[i] - half), scatter(t.boxes, 6, 3 + i, first, count, m[i] + half);
-            scatter(t.normals, 3, i, first, count, R(i, 2));
-            for (int j = 0; j < 3; j++) scatter(fields, FIELDS, 3 * i + j, first, count, R(j, i) * inv[i]);
+            for (int j = i; j < 3; j++, k++) put(fields, FIELDS, 9 + k, first, count, cut * dot(side, row(R, j) * s));
+            put(t.boxes, 6, i, first, count, m[i] - half), put(t.boxes, 6, 3 + i, first, count, m[i] + half);
+            put(t.normals, 3, i, first, count, R(i, 2));
+            for (int j = 0; j < 3; j++) put(fields, FIELDS, 3 * i + j, first, count, R(j, i) * inv[i]);
         }
     }
 }

@@ -56,7 +56,7 @@ INLINE void read_three(const Raster& r, const float* image, const Tile& t, vf* c
     channels[0] = channels[1] = channels[2] = vf{};
     if (!image) return;
     read_pixels(r, image, t, 3, x);
-    load3(x, channels);
+    columns_of<3>(x, channels);
 }
 INLINE void write_one(const Raster& r, float* image, const Tile& t, vf value) {
     float x[LANES];
@@ -65,7 +65,7 @@ INLINE void write_one(const Raster& r, float* image, const Tile& t, vf value) {
 }
 INLINE void write_three(const Raster& r, float* image, const Tile& t, const vf* channels) {
     float x[3 * LANES];
-    store3(x, channels);
+    rows_of<3>(x, channels);
     write_pixels(r, image, t, 3, x);
 }
 

@@ -45,8 +45,10 @@ static void rank_term(const GaussianTerms& s) {
     vf total = {};
     for (int first = 0; first < s.n; first += LANES) {
         int count = imin2(LANES, s.n - first);
-        vf logs[3], sum = {}, entropy = {}, thickness = vexp(gather(s.log_scales, 3, 2, first, count)), highest;
-        for (int i = 0; i < 3; i++) logs[i] = 2.0f * gather(s.log_scales, 3, i, first, count);
+        vf logs[3], sum = {}, entropy = {}, thickness, highest;
+        gather<3>(s.log_scales, first, count, logs);
+        thickness = vexp(logs[2]);
+        for (int i = 0; i < 3; i++) logs[i] *= 2.0f;
         highest = vmax(vmax(logs[0], logs[1]), logs[2]);
         for (int i = 0; i < 3; i++) logs[i] = vmax(logs[i] - highest, splat(-80.0f)), sum += vexp(logs[i]);
         vf p[3], log_sum = vlog(sum);
@@ -54,10 +56,10 @@ static void rank_term(const GaussianTerms& s) {
         vf rank = vexp(entropy), above = rank - 1.0f, needle = -vlog(vmax(above, splat(1e-4f)));
         total += keep(lane_index() < count, vmax(needle, vf{}) + thickness);
         vf v_entropy = keep((needle >= 0.0f) & (above >= 1e-4f), -rank / above);
-        for (int i = 0; i < 3; i++) {
-            vf g = -2.0f * v_entropy * p[i] * (logs[i] + entropy) + (i == 2 ? thickness : vf{});
-            scatter(s.g_log_scales, 3, i, first, count, per_gaussian * g);
-        }
+        vf g[3];
+        for (int i = 0; i < 3; i++)
+            g[i] = per_gaussian * (-2.0f * v_entropy * p[i] * (logs[i] + entropy) + (i == 2 ? thickness : vf{}));
+        scatter<3>(s.g_log_scales, first, count, g);
     }
     s.terms[0] = per_gaussian * sum_of(total);
 }
@@ -86,14 +88,14 @@ static void projection_term(const GaussianTerms& s) {
     vf total = {}, v_R[3] = {}, v_t = {};
     for (int first = 0; first < s.n; first += LANES) {
         int count = imin2(LANES, s.n - first);
-        vi visible = (gather(s.weight, 1, 0, first, count) > 0.0f) & (lane_index() < count);
+        vi visible = (gather1(s.weight, first, count) > 0.0f) & (lane_index() < count);
         if (!any(visible)) {
             clear(s.g_means + 3 * (i64)first, 12 * count), clear(s.g_quats + 4 * (i64)first, 16 * count);
             clear(s.g_sdf + first, 4 * count);
             continue;
         }
-        vf q[4], sdf = gather(s.sdf, 1, 0, first, count);
-        for (int j = 0; j < 4; j++) q[j] = gather(s.quats, 4, j, first, count);
+        vf q[4], sdf = gather1(s.sdf, first, count);
+        gather<4>(s.quats, first, count, q);
         vf q_scale = 1.0f / vsqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         for (int j = 0; j < 4; j++) q[j] *= q_scale;
         M3 R_obj_local = rotation(q);
@@ -110,14 +112,15 @@ static void projection_term(const GaussianTerms& s) {
         total += keep(inlier, weight * error);
         vf along = s.R[6] * normal.x + s.R[7] * normal.y + s.R[8] * normal.z;
         scatter3(s.g_means, first, count, {-weight * s.R[6], -weight * s.R[7], -weight * s.R[8]});
-        scatter(s.g_sdf, 1, 0, first, count, weight * along);
+        scatter1(s.g_sdf, first, count, weight * along);
         v_R[0] -= weight * point.x, v_R[1] -= weight * point.y, v_R[2] -= weight * point.z, v_t -= weight;
         M3 g = {};
         g.m[2] = weight * sdf * s.R[6], g.m[5] = weight * sdf * s.R[7], g.m[8] = weight * sdf * s.R[8];
         vf v_q[4];
         rotation_adjoint(q, g, v_q);
         vf radial = v_q[0] * q[0] + v_q[1] * q[1] + v_q[2] * q[2] + v_q[3] * q[3];
-        for (int j = 0; j < 4; j++) scatter(s.g_quats, 4, j, first, count, (v_q[j] - radial * q[j]) * q_scale);
+        for (int j = 0; j < 4; j++) v_q[j] = (v_q[j] - radial * q[j]) * q_scale;
+        scatter<4>(s.g_quats, first, count, v_q);
     }
     s.terms[2] = sum_of(total);
     for (int i = 0; i < 3; i++) s.g_R[i] = sum_of(v_R[i]);

@@ -36,22 +36,35 @@ INLINE V3 mul_T(const M3& A, V3 b) {
 }
 INLINE V3 row(const M3& A, int i) { return {A(i, 0), A(i, 1), A(i, 2)}; }
 
-// Field j of the Gaussians [first, first + count) of an [n stride] array; further lanes repeat the last Gaussian.
-INLINE vf gather(const float* p, int stride, int j, int first, int count) {
-    float x[LANES];
-    for (int i = 0; i < LANES; i++) x[i] = p[(i64)(first + imin2(i, count - 1)) * stride + j];
-    return load(x);
+// The N numbers of each of the Gaussians [first, first + count) of an [n N] array; further lanes repeat the last Gaussian.
+template <int N>
+INLINE void gather(const float* p, int first, int count, vf* x) {
+    if (N <= 4 && count == LANES) return columns_of<N>(p + (i64)N * first, x);
+    float rows[LANES * (N + 1)];
+    for (int i = 0; i < LANES; i++) __builtin_memcpy(rows + N * i, p + (i64)N * (first + imin2(i, count - 1)), 4 * N);
+    columns_of<N>(rows, x);
 }
-INLINE void scatter(float* p, int stride, int j, int first, int count, vf value) {
-    float x[LANES];
-    store(x, value);
-    for (int i = 0; i < count; i++) p[(i64)(first + i) * stride + j] = x[i];
+template <int N>
+INLINE void scatter(float* p, int first, int count, const vf* x) {
+    if (count == LANES) return rows_of<N>(p + (i64)N * first, x);
+    float rows[LANES * N];
+    rows_of<N>(rows, x);
+    __builtin_memcpy(p + (i64)N * first, rows, 4 * N * count);
+}
+INLINE vf gather1(const float* p, int first, int count) {
+    vf x;
+    gather<1>(p, first, count, &x);
+    return x;
 }
 INLINE V3 gather3(const float* p, int first, int count) {
-    return {gather(p, 3, 0, first, count), gather(p, 3, 1, first, count), gather(p, 3, 2, first, count)};
+    vf x[3];
+    gather<3>(p, first, count, x);
+    return {x[0], x[1], x[2]};
 }
+INLINE void scatter1(float* p, int first, int count, vf x) { scatter<1>(p, first, count, &x); }
 INLINE void scatter3(float* p, int first, int count, V3 v) {
-    scatter(p, 3, 0, first, count, v.x), scatter(p, 3, 1, first, count, v.y), scatter(p, 3, 2, first, count, v.z);
+    const vf x[3] = {v.x, v.y, v.z};
+    scatter<3>(p, first, count, x);
 }
 
 // Up to LANES Gaussians with their indices; further lanes repeat the last one.
@@ -65,19 +78,27 @@ struct Batch {
         for (int i = count; i < LANES; i++) g[i] = g[count - 1];
     }
 };
-INLINE vf gather(const float* p, int stride, int j, const Batch& b) {
-    float x[LANES];
-    for (int i = 0; i < LANES; i++) x[i] = p[(i64)b.g[i] * stride + j];
-    return load(x);
+// N consecutive numbers of each Gaussian of a batch, in an array with `stride` numbers per Gaussian.
+template <int N>
+INLINE void gather(const float* p, int stride, const Batch& b, vf* x) {
+    float rows[LANES * (N + 1)];
+    for (int i = 0; i < LANES; i++) __builtin_memcpy(rows + N * i, p + (i64)b.g[i] * stride, 4 * N);
+    columns_of<N>(rows, x);
 }
-INLINE void scatter(float* p, int stride, int j, const Batch& b, vf value) {
-    float x[LANES];
-    store(x, value);
-    for (int i = 0; i < b.count; i++) p[(i64)b.g[i] * stride + j] = x[i];
+template <int N>
+INLINE void scatter(float* p, int stride, const Batch& b, const vf* x) {
+    float rows[LANES * N];
+    rows_of<N>(rows, x);
+    for (int i = 0; i < b.count; i++) __builtin_memcpy(p + (i64)b.g[i] * stride, rows + N * i, 4 * N);
 }
-INLINE V3 gather3(const float* p, const Batch& b) { return {gather(p, 3, 0, b), gather(p, 3, 1, b), gather(p, 3, 2, b)}; }
+INLINE V3 gather3(const float* p, const Batch& b) {
+    vf x[3];
+    gather<3>(p, 3, b, x);
+    return {x[0], x[1], x[2]};
+}
 INLINE void scatter3(float* p, const Batch& b, V3 v) {
-    scatter(p, 3, 0, b, v.x), scatter(p, 3, 1, b, v.y), scatter(p, 3, 2, b, v.z);
+    const vf x[3] = {v.x, v.y, v.z};
+    scatter<3>(p, 3, b, x);
 }
 
 struct Camera {
@@ -169,7 +190,7 @@ struct Projected {
 
 INLINE Projected project(const Raster& r, const Camera& cam, const Batch& b) {
     Projected o;
-    for (int j = 0; j < 4; j++) o.q[j] = gather(r.quats, 4, j, b);
+    gather<4>(r.quats, 4, b, o.q);
     o.q_scale = 1.0f / vsqrt(o.q[0] * o.q[0] + o.q[1] * o.q[1] + o.q[2] * o.q[2] + o.q[3] * o.q[3]);
     for (int j = 0; j < 4; j++) o.q[j] *= o.q_scale;
     o.R_obj_local = rotation(o.q);
@@ -180,7 +201,7 @@ INLINE Projected project(const Raster& r, const Camera& cam, const Batch& b) {
     o.mu = gather3(r.means, b);
     o.s = gather3(r.scales, b);
     o.inv_s = {1.0f / o.s.x, 1.0f / o.s.y, 1.0f / o.s.z};
-    o.opacity = gather(r.opacity, 1, 0, b);
+    gather<1>(r.opacity, 1, b, &o.opacity);
     o.mu_cam = mul(cam.R, o.mu);
     o.p = o.mu_cam + cam.t;
     o.inv_z = 1.0f / o.p.z;
@@ -201,9 +222,11 @@ INLINE Projected project(const Raster& r, const Camera& cam, const Batch& b) {
     o.dir_scale = 1.0f / vsqrt(dot(o.dir_p, o.dir_p));
     o.dir = o.dir_p * o.dir_scale;
     harmonics(r.k, o.dir, o.Y);
-    for (int ch = 0; ch < 3; ch++) {
-        o.raw[ch] = vf{};
-        for (int j = 0; j < r.k; j++) o.raw[ch] += o.Y[j] * gather(r.sh, 3 * r.k, 3 * j + ch, b);
+    o.raw[0] = o.raw[1] = o.raw[2] = vf{};
+    for (int j = 0; j < r.k; j++) {
+        vf sh[3];
+        gather<3>(r.sh + 3 * j, 3 * r.k, b, sh);
+        for (int ch = 0; ch < 3; ch++) o.raw[ch] += o.Y[j] * sh[ch];
     }
     return o;
 }
@@ -212,12 +235,12 @@ INLINE Projected project(const Raster& r, const Camera& cam, const Batch& b) {
 // in `outline`, which decides.
 INLINE u32 facing(const Raster& r, const Camera& cam, int first, int count) {
     vf q[4];
-    for (int j = 0; j < 4; j++) q[j] = gather(r.quats, 4, j, first, count);
+    gather<4>(r.quats, first, count, q);
     vf w = q[0], x = q[1], y = q[2], z = q[3], length2 = w * w + x * x + y * y + z * z;
     V3 n = {2.0f * (x * z + w * y), 2.0f * (y * z - w * x), w * w + z * z - x * x - y * y};
     V3 p = mul(cam.R, gather3(r.means, first, count)) + cam.t;
     vf along = dot(mul(cam.R, n), p), limit = (r.facing + 1e-3f) * vsqrt(dot(p, p)) * length2;
-    return bits((along <= limit) & (p.z > r.near) & (gather(r.opacity, 1, 0, first, count) >= r.alpha_min) &
+    return bits((along <= limit) & (p.z > r.near) & (gather1(r.opacity, first, count) >= r.alpha_min) &
                 (lane_index() < count));
 }
 
@@ -355,11 +378,11 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     vf v_raw[3], v_Y[16];
     for (int ch = 0; ch < 3; ch++) v_raw[ch] = keep(o.raw[ch] >= 0.0f, g[S_RGB + ch]);
     for (int j = 0; j < r.k; j++) {
-        v_Y[j] = vf{};
-        for (int ch = 0; ch < 3; ch++) {
-            v_Y[j] += v_raw[ch] * gather(r.sh, 3 * r.k, 3 * j + ch, b);
-            scatter(r.v_sh, 3 * r.k, 3 * j + ch, b, keep(drawn, v_raw[ch] * o.Y[j]));
-        }
+        vf sh[3], v_sh[3];
+        gather<3>(r.sh + 3 * j, 3 * r.k, b, sh);
+        v_Y[j] = v_raw[0] * sh[0] + v_raw[1] * sh[1] + v_raw[2] * sh[2];
+        for (int ch = 0; ch < 3; ch++) v_sh[ch] = v_raw[ch] * o.Y[j];
+        scatter<3>(r.v_sh + 3 * j, 3 * r.k, b, v_sh);
     }
     V3 v_dir = harmonics_adjoint(r.k, o.dir, v_Y);
     v_dir = (v_dir + o.dir * (-dot(v_dir, o.dir))) * o.dir_scale;
@@ -382,12 +405,10 @@ INLINE void project_adjoint(const Raster& r, const Camera& cam, const Projected&
     vf v_q[4];
     rotation_adjoint(o.q, v_Rq, v_q);
     vf radial = v_q[0] * o.q[0] + v_q[1] * o.q[1] + v_q[2] * o.q[2] + v_q[3] * o.q[3];
-    for (int j = 0; j < 4; j++)
-        scatter(r.v_quats, 4, j, b, keep(drawn, (v_q[j] - radial * o.q[j]) * o.q_scale));
-    V3 v_mu = mul_T(cam.R, v_p);
-    scatter3(r.v_means, b, {keep(drawn, v_mu.x), keep(drawn, v_mu.y), keep(drawn, v_mu.z)});
-    scatter3(r.v_scales, b, {keep(drawn, v_s.x), keep(drawn, v_s.y), keep(drawn, v_s.z)});
-    scatter(r.v_opacity, 1, 0, b, keep(drawn, -2.0f * g[S_RHO] / o.opacity));
+    for (int j = 0; j < 4; j++) v_q[j] = (v_q[j] - radial * o.q[j]) * o.q_scale;
+    vf v_opacity = -2.0f * g[S_RHO] / o.opacity;
+    scatter<4>(r.v_quats, 4, b, v_q), scatter<1>(r.v_opacity, 1, b, &v_opacity);
+    scatter3(r.v_means, b, mul_T(cam.R, v_p)), scatter3(r.v_scales, b, v_s);
 }
 
 // Gradients of a batch from the sums over pixels of all shares.

@@ -75,7 +75,7 @@ struct ShPoint {
 };
 
 INLINE void sh_point(const ShShade& s, const ShLight& light, const Batch& b, ShPoint& o) {
-    for (int j = 0; j < 4; j++) o.q[j] = gather(s.quats, 4, j, b);
+    gather<4>(s.quats, 4, b, o.q);
     o.q_scale = 1.0f / vsqrt(o.q[0] * o.q[0] + o.q[1] * o.q[1] + o.q[2] * o.q[2] + o.q[3] * o.q[3]);
     for (int j = 0; j < 4; j++) o.q[j] *= o.q_scale;
     M3 R = rotation(o.q);
@@ -94,10 +94,10 @@ INLINE void sh_point(const ShShade& s, const ShLight& light, const Batch& b, ShP
         slope = slope * o.m + o.reflectance, o.reflectance = o.reflectance * o.m + s.reflectance[k];
     o.slope = keep(o.n_v <= 1.0f, -slope);
     vf occluded[9], unoccluded[9];
-    for (int k = 0; k < 9 && s.shadowed; k++)
-        occluded[k] = gather(s.occluded, 9, k, b), unoccluded[k] = gather(s.unoccluded, 9, k, b);
+    if (s.shadowed) gather<9>(s.occluded, 9, b, occluded), gather<9>(s.unoccluded, 9, b, unoccluded);
+    gather<3>(s.albedo_logits, 3, b, o.albedo);
     for (int ch = 0; ch < 3; ch++) {
-        o.albedo[ch] = sigmoid(gather(s.albedo_logits, 3, ch, b)), o.ratio[ch] = splat(1.0f);
+        o.albedo[ch] = sigmoid(o.albedo[ch]), o.ratio[ch] = splat(1.0f);
         if (s.shadowed) {
             vf shadowed = irradiance(occluded, light, ch, o.albedo[ch]), full = irradiance(unoccluded, light, ch, o.albedo[ch]);
             o.ratio[ch] = vmin(shadowed / vmax(full, splat(1e-12f)), splat(s.ratio_max));
@@ -117,8 +117,9 @@ INLINE void for_facing(const ShShade& s, const ShLight& light, int share, const 
     int end = share_start(s.n, share + 1, s.threads);
     for (int first = share_start(s.n, share, s.threads); first < end; first += LANES) {
         int count = imin2(LANES, end - first);
-        vf w = gather(s.quats, 4, 0, first, count), x = gather(s.quats, 4, 1, first, count);
-        vf y = gather(s.quats, 4, 2, first, count), z = gather(s.quats, 4, 3, first, count);
+        vf q[4];
+        gather<4>(s.quats, first, count, q);
+        vf w = q[0], x = q[1], y = q[2], z = q[3];
         V3 n = {2.0f * (x * z + w * y), 2.0f * (y * z - w * x), w * w + z * z - x * x - y * y};
         V3 away = light.position + gather3(s.means, first, count) * splat(-1.0f);
         u32 some = bits((dot(n, away) > 0.0f) & (lane_index() < count));
@@ -137,9 +138,10 @@ static void sh_shade_share(const ShShade& s, const ShLight& light, int share) {
     for_facing(s, light, share, nullptr, [&](const Batch& b) {
         ShPoint o;
         sh_point(s, light, b, o);
+        vf out[3];
         for (int ch = 0; ch < 3; ch++)
-            scatter(s.out, 3, ch, b, o.albedo[ch] * o.ratio[ch] * o.lobe[0][ch] +
-                                         light.specular_scale * o.reflectance * o.lobe[1][ch]);
+            out[ch] = o.albedo[ch] * o.ratio[ch] * o.lobe[0][ch] + light.specular_scale * o.reflectance * o.lobe[1][ch];
+        scatter<3>(s.out, 3, b, out);
     });
 }
 
@@ -152,16 +154,18 @@ static void sh_shade_adjoint_share(const ShShade& s, const ShLight& light, int s
         vi inside = lane_index() < batch.count;
         ShPoint o;
         sh_point(s, light, batch, o);
-        vf v_reflectance = {}, v_series[2][3], v_Y[2][16] = {};
+        vf v_reflectance = {}, v_series[2][3], v_Y[2][16] = {}, v_out[3], v_logits[3];
+        gather<3>(s.v_out, 3, batch, v_out);
         for (int ch = 0; ch < 3; ch++) {
-            vf v = keep(inside, gather(s.v_out, 3, ch, batch)), v_lobe = v * light.specular_scale;
+            vf v = keep(inside, v_out[ch]), v_lobe = v * light.specular_scale;
             vf a = o.albedo[ch], shaded = a * o.ratio[ch];
-            scatter(s.v_albedo_logits, 3, ch, batch, v * o.lobe[0][ch] * shaded * (1.0f - a));
+            v_logits[ch] = v * o.lobe[0][ch] * shaded * (1.0f - a);
             v_reflectance += v_lobe * o.lobe[1][ch];
             sums[96] += v * o.lobe[1][ch] * o.reflectance;
             v_series[0][ch] = v * shaded * sigmoid(o.at[0][ch]);
             v_series[1][ch] = v_lobe * o.reflectance * sigmoid(o.at[1][ch]);
         }
+        scatter<3>(s.v_albedo_logits, 3, batch, v_logits);
         for (int i = 0; i < 2; i++)
             for (int k = 0; k < 16; k++)
                 for (int ch = 0; ch < 3; ch++) {
@@ -186,7 +190,8 @@ static void sh_shade_adjoint_share(const ShShade& s, const ShLight& light, int s
         vf v_q[4];
         rotation_adjoint(o.q, v_R, v_q);
         vf radial = v_q[0] * o.q[0] + v_q[1] * o.q[1] + v_q[2] * o.q[2] + v_q[3] * o.q[3];
-        for (int j = 0; j < 4; j++) scatter(s.v_quats, 4, j, batch, (v_q[j] - radial * o.q[j]) * o.q_scale);
+        for (int j = 0; j < 4; j++) v_q[j] = (v_q[j] - radial * o.q[j]) * o.q_scale;
+        scatter<4>(s.v_quats, 4, batch, v_q);
     });
     for (int i = 0; i < LIGHT_SUMS; i++) s.parts[share * LIGHT_SUMS + i] = sum_of(sums[i]);
 }

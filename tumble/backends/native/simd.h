@@ -137,25 +137,28 @@ template <int step, int... I>
 INLINE vf fold(vf a, vf b, Indices<I...>) {
     return SHUFFLE(a, b, (I & step ? LANES + I : I)...) + SHUFFLE(a, b, (I & step ? LANES + I - step : I + step)...);
 }
-// Every third number from number `first` on of three vectors that follow each other, and the inverse: vector `which` of
-// the numbers x0 y0 z0 x1 y1 ...
+// Every third or fourth number, from number `first` on, of vectors that follow each other.
 template <int first, int... I>
-INLINE vf third(vf a, vf b, vf c, Indices<I...>) {
+INLINE vf every(vf a, vf b, vf c, Indices<I...>) {
     vf ab = SHUFFLE(a, b, ((3 * I + first) % (2 * LANES))...);
     return SHUFFLE(ab, c, (3 * I + first < 2 * LANES ? I : 3 * I + first - LANES)...);
 }
+template <int first, int... I>
+INLINE vf every(vf a, vf b, vf c, vf d, Indices<I...>) {
+    vf ab = SHUFFLE(a, b, ((4 * I + first) % (2 * LANES))...), cd = SHUFFLE(c, d, ((4 * I + first) % (2 * LANES))...);
+    return SHUFFLE(ab, cd, (I < LANES / 2 ? I : LANES + I)...);
+}
+// The inverse: vector `which` of the numbers x0 y0 z0 x1 y1 ... or x0 y0 z0 w0 x1 ...
 template <int which, int... I>
-INLINE vf of_thirds(vf x, vf y, vf z, Indices<I...>) {
+INLINE vf woven(vf x, vf y, vf z, Indices<I...>) {
     vf xy = SHUFFLE(x, y, ((which * LANES + I) % 3 % 2 * LANES + (which * LANES + I) / 3)...);
     return SHUFFLE(xy, z, ((which * LANES + I) % 3 == 2 ? LANES + (which * LANES + I) / 3 : I)...);
 }
-INLINE void load3(const float* p, vf* x) {
-    vf a = load(p), b = load(p + LANES), c = load(p + 2 * LANES);
-    x[0] = third<0>(a, b, c, Lanes()), x[1] = third<1>(a, b, c, Lanes()), x[2] = third<2>(a, b, c, Lanes());
-}
-INLINE void store3(float* p, const vf* x) {
-    store(p, of_thirds<0>(x[0], x[1], x[2], Lanes())), store(p + LANES, of_thirds<1>(x[0], x[1], x[2], Lanes()));
-    store(p + 2 * LANES, of_thirds<2>(x[0], x[1], x[2], Lanes()));
+template <int which, int... I>
+INLINE vf woven(vf x, vf y, vf z, vf w, Indices<I...>) {
+    vf xy = SHUFFLE(x, y, (I % 2 * LANES + (which * LANES + I) / 4)...);
+    vf zw = SHUFFLE(z, w, (I % 2 * LANES + (which * LANES + I) / 4)...);
+    return SHUFFLE(xy, zw, (I % 4 < 2 ? I : LANES + I)...);
 }
 
 // Lane i of x[j] becomes lane j of x[i]: interleaving both halves rotates the bits of the index of an element by one.
@@ -168,6 +171,43 @@ INLINE void transpose(vf* x) {
             y[2 * i] = zip<0>(x[i], x[i + LANES / 2], Lanes()), y[2 * i + 1] = zip<1>(x[i], x[i + LANES / 2], Lanes());
 #pragma GCC unroll 16
         for (int i = 0; i < LANES; i++) x[i] = y[i];
+    }
+}
+
+// LANES rows of N numbers, which follow each other, as N vectors; up to LANES numbers beyond them are read if N > 4. And
+// the inverse, for N up to 4.
+template <int N>
+INLINE void columns_of(const float* p, vf* x) {
+    if constexpr (N == 1) {
+        x[0] = load(p);
+    } else if constexpr (N == 3) {
+        vf a = load(p), b = load(p + LANES), c = load(p + 2 * LANES);
+        x[0] = every<0>(a, b, c, Lanes()), x[1] = every<1>(a, b, c, Lanes()), x[2] = every<2>(a, b, c, Lanes());
+    } else if constexpr (N == 4) {
+        vf a = load(p), b = load(p + LANES), c = load(p + 2 * LANES), d = load(p + 3 * LANES);
+        x[0] = every<0>(a, b, c, d, Lanes()), x[1] = every<1>(a, b, c, d, Lanes());
+        x[2] = every<2>(a, b, c, d, Lanes()), x[3] = every<3>(a, b, c, d, Lanes());
+    } else {
+        for (int first = 0; first < N; first += LANES) {
+            vf group[LANES];
+            for (int l = 0; l < LANES; l++) group[l] = load(p + l * N + first);
+            transpose(group);
+            for (int i = 0; i < LANES && first + i < N; i++) x[first + i] = group[i];
+        }
+    }
+}
+template <int N>
+INLINE void rows_of(float* p, const vf* x) {
+    static_assert(N == 1 || N == 3 || N == 4, "not needed");
+    if constexpr (N == 1) {
+        store(p, x[0]);
+    } else if constexpr (N == 3) {
+        store(p, woven<0>(x[0], x[1], x[2], Lanes())), store(p + LANES, woven<1>(x[0], x[1], x[2], Lanes()));
+        store(p + 2 * LANES, woven<2>(x[0], x[1], x[2], Lanes()));
+    } else {
+        store(p, woven<0>(x[0], x[1], x[2], x[3], Lanes())), store(p + LANES, woven<1>(x[0], x[1], x[2], x[3], Lanes()));
+        store(p + 2 * LANES, woven<2>(x[0], x[1], x[2], x[3], Lanes()));
+        store(p + 3 * LANES, woven<3>(x[0], x[1], x[2], x[3], Lanes()));
     }
 }
 
