@@ -81,7 +81,8 @@ def stages() -> list[tuple[Any, Any, Any, list[dict[str, float]]]]:
     """Stages 2 and 3 of a textured sphere: the module, its settings and inputs, and the terms of two steps."""
     _, true, taken = textured_sphere()
     second = refine.Inputs(taken, Trajectory(true, "camera"))
-    cfg_2 = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    # No hull: whether a cell belongs to it may depend on rounding, and then every later draw.
+    cfg_2 = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200, start="sphere")
     refined, of_second = steps(refine, cfg_2, second, 2)
     third = decompose.Inputs(taken, refined)
     cfg_3 = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, fit_specular=False)
@@ -106,7 +107,7 @@ def test_steps_on_a_device_are_those_of_the_cpu(number: int, stages: list[Any], 
 def test_a_stage_on_a_device_goes_on_from_its_checkpoint(
     number: int, stages: list[Any], device: torch.device, tmp_path: Path
 ) -> None:
-    """The random draws are those of an uninterrupted run, whose outcome differs by the rounding of Adam's steps."""
+    """As if it had not been interrupted, on average; Adam turns rounding of gradients near zero into whole steps."""
     stage, cfg, inputs, _ = stages[number]
     cfg, inputs = dataclasses.replace(cfg, steps=3), on_device(inputs, device)
     made = []
@@ -127,7 +128,8 @@ def test_a_stage_on_a_device_goes_on_from_its_checkpoint(
     assert made == [0, 1, 2, 2]
     for (name, a), b in zip(tree.named_tensors(whole).items(), tree.named_tensors(resumed).values(), strict=True):
         assert a.device.type == b.device.type == device.type
-        torch.testing.assert_close(b.cpu(), a.cpu(), rtol=1e-2, atol=1e-2, msg=name)
+        difference = (b.double() - a.double()).abs().mean()
+        assert difference <= 1e-3 * a.double().abs().mean() + 1e-6, name
 
 
 @pytest.mark.gpu
