@@ -33,8 +33,10 @@ test-gpu: install
 	$(BIN)/python -m pytest -m gpu
 
 # Without a network: with the venv if there is one, else with the packages that PYTHON finds. Results go to $OUT.
+gpu: python = $(or $(wildcard $(BIN)/python),$(PYTHON))
 gpu:
-	$(or $(wildcard $(BIN)/python),$(PYTHON)) -m benchmarks.gpu
+	$(python) -m benchmarks.requirements
+	$(python) -m benchmarks.gpu
 
 check: install
 	$(BIN)/ruff check .

@@ -111,30 +111,6 @@ def test_an_interrupted_run_ends_the_same(
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("stage", [refine, decompose])
-def test_steps_on_a_gpu_are_those_of_the_cpu(capture: Path, finished: tuple[Path, Asset], stage: Any) -> None:
-    """The first steps of a stage, term by term: sums in another order, and what Adam makes of their rounding."""
-    if not torch.cuda.is_available():
-        pytest.skip("needs an NVIDIA GPU")
-    taken = folder.load(capture)
-    cfg = recipes.known_poses(RECIPE)
-    refined = tree.load(refine.Refined, finished[0] / runs.REFINE / runs.OUT)
-    second, third = refine.Inputs(taken, taken.trajectory), decompose.Inputs(taken, refined)
-    inputs, settings = (second, cfg.refine) if stage is refine else (third, cfg.decompose)
-
-    def terms(device: str) -> list[dict[str, float]]:
-        there = type(inputs)(*(tree.to(x, device) for x in vars(inputs).values()))
-        state, seen = stage.init(settings, there, torch.Generator().manual_seed(0)), []
-        for _ in range(8):
-            seen.append({name: float(value) for name, value in stage.step(settings, there, state).items()})
-            state.step += 1
-        return seen
-
-    for here, there in zip(terms("cpu"), terms("cuda"), strict=True):
-        assert there == pytest.approx(here, rel=2e-2, abs=1e-4)
-
-
-@pytest.mark.gpu
 def test_a_run_on_a_gpu_makes_an_asset(capture: Path, finished: tuple[Path, Asset], tmp_path: Path) -> None:
     """Densification decides by thresholds, so the number of Gaussians may differ a little."""
     if not torch.cuda.is_available():

@@ -7,7 +7,6 @@ import importlib.util
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,7 +20,7 @@ from tumble.backends import cuda, reference
 
 GPU = torch.device("cuda")
 
-CONFORMANCE = [
+KERNEL_CASES = [
     *[(conformance.test_values_and_gradients_are_those_of_the_reference, name) for name in cases.SCENES],
     *[(conformance.test_any_number_of_features_is_rendered, c) for c in (0, 8, 21)],
     *[(conformance.test_hits_are_those_of_brute_force, name) for name in ("shell", "hard", "empty")],
@@ -32,6 +31,9 @@ CONFORMANCE = [
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 256, 7, (0.03, 0.6)),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 1, 3, (0.5, 0.5)),
     (conformance.test_a_sphere_in_uniform_light_matches_the_integrated_brdf, 0.3),
+]
+CONFORMANCE = [
+    *KERNEL_CASES,
     (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, 9, 16, 200),
     (conformance.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference, 133, True),
     *[
@@ -114,18 +116,14 @@ def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any
     assert all((x.diff() >= 0).all() for x in ordered)
 
 
-def test_every_kernel_compiles_for_a_gpu_without_having_one(kernels: Any, tmp_path: Path) -> None:
+def test_every_kernel_compiles_for_a_gpu_without_having_one(kernels: Any) -> None:
     import warp
 
-    from tumble.backends import _warp_composite, _warp_project, _warp_shade, _warp_trace
+    from tests.backends import emulated_gpu
 
     if 90 not in warp.get_cuda_supported_archs():
         pytest.skip("this build of Warp has no compiler for sm_90")
-    modules = [warp.get_module(file.__name__) for file in (_warp_project, _warp_trace, _warp_shade)]
-    factories = _warp_composite.forward, _warp_composite.adjoint
-    modules += [make(channels).module for make in factories for channels in _warp_composite.WIDTHS]
-    for module in modules:
-        (path,) = warp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    for path in emulated_gpu.ptx_files():
         assert b".target sm_90" in path.read_bytes()
 
 

@@ -2,7 +2,8 @@
 
 A *lane* is one of the 32 threads of a GPU warp. When the pixels of a warp add to the same number, lanes are summed
 first and one of them adds the sum to memory, by native code on a GPU. On the CPU, where Warp runs one thread after
-another, these functions are plain additions, so that the same kernels can be tested on machines without a GPU.
+another, these functions are plain additions, so that the same kernels can be tested on machines without a GPU; their
+native code for a GPU is tested on an emulated one (`tests/backends/emulated_gpu.py`).
 
 Compiled kernels are cached in the folder of the CPU kernels unless $WARP_CACHE_PATH is set.
 """
