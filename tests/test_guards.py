@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "poses": {"io", "maths", "scene", "engine", "matching"},
     "inverse_rendering": {"io", "maths", "backends", "scene", "rendering", "engine"},
     "evaluation": {"io", "maths", "scene", "rendering", "datasets"},
-    "export": {"io", "maths", "scene", "rendering"},
+    "export": {"io", "maths", "backends", "scene", "rendering"},
     "report": {
         "io",
         "maths",

@@ -38,7 +38,6 @@ from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provena
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
 from tumble.rendering import relight as relighting
-from tumble.report import frames_of_run, write_report
 from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "relight.json"
@@ -217,6 +216,8 @@ def run_capture(
         ValueError: There is no such matcher, device, up direction or white pixel.
         BadFile: See `pipeline.capture_of` and `pipeline.reconstruct`.
     """
+    from tumble.report import write_report
+
     place = usable_device(device)
     load_plugin("matching", recipe.matcher)  # fail before the video is converted
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
@@ -460,6 +461,8 @@ def export_run(
 
 def _capture_of_run(out: Path, asset: Asset, names: list[str]) -> Capture | None:
     """The frames of a run's trajectory, with the masks of the run; None with a warning if the capture is gone."""
+    from tumble.report import frames_of_run
+
     path = run.capture_source(out)
     if not path.exists():
         text = f"{path} is gone: the base colour is baked from the Gaussians, not solved from the photographs"

@@ -8,10 +8,11 @@ import torch
 from torch.nn.functional import normalize
 
 from tests.surfaces import GAMMA, sphere
+from tumble import backends
 from tumble.export import atlas, bake, depth_fusion, mesh
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Textures
-from tumble.maths.images import linear_from_srgb
+from tumble.maths.images import linear_from_srgb, srgb_from_linear
 from tumble.maths.se3 import SE3
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
@@ -138,3 +139,34 @@ def test_hidden_texels_take_the_material_of_the_nearest_gaussian(asset: Asset) -
     points = torch.tensor([[0.2, 0.1, 0.0], [-0.1, 0.0, 0.3]])
     values = bake._nearest_material(asset, points, normalize(points, dim=-1))
     assert (values[:, :3] - colour(RADIUS * normalize(points, dim=-1))).abs().max() < 0.03
+
+
+def test_the_kernel_blends_maps_like_its_definition(asset: Asset, sphere_mesh: UnwrappedMesh) -> None:
+    """Sums of few terms in single precision; a fifth of the texels that face the camera are hidden or unknown."""
+    kernel = backends.blend_kernel(backends.load("cpu"))
+    assert kernel is not None, "the kernels are not compiled"
+    texels = bake.locate_texels(sphere_mesh, 96)
+    poses, camera = depth_fusion.surrounding_cameras(5, 80)
+    maps = torch.rand(80, 80, 9, generator=torch.Generator().manual_seed(0))
+    maps[..., 7] = 6 - RADIUS + 0.01 * maps[..., 7]
+    maps = maps * (maps[..., 8:] > 0.3)
+    maps[..., 8] = (maps[..., 8] > 0).float()
+    view = depth_fusion.posed_cameras(poses[2:3], camera)
+    sums = []
+    for blend in (kernel, bake.blend_by_operations):
+        total, weights = torch.ones(len(texels.points), 7), torch.ones(len(texels.points))
+        blend(total, weights, maps, view, texels.points, texels.normals, min_cosine=0.2, tolerance=0.1)
+        sums.append(torch.cat([total, weights[:, None]], -1))
+    assert 0.02 < float((sums[1][:, 7] > 1).float().mean()) < 0.3
+    torch.testing.assert_close(sums[0], sums[1], rtol=1e-4, atol=1e-5)
+
+
+def test_larger_textures_are_interpolated(asset: Asset, sphere_mesh: UnwrappedMesh) -> None:
+    """A texel of the larger texture lies a quarter of a texel from one of the smaller; colours vary slowly on it."""
+    small = baked(asset, sphere_mesh)
+    large = small.enlarged(384)
+    assert large.base_color.shape == (384, 384, 3)
+    assert large.roughness.shape == (384, 384)
+    texels = bake.locate_texels(sphere_mesh, 384)
+    error = (at(large.base_color, texels) - srgb_from_linear(colour(texels.points))).abs()
+    assert error.mean() < 0.012

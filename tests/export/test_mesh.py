@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.surfaces import GAMMA, MAJOR, MINOR, flat, sphere, torus
+from tumble import backends
 from tumble.export import depth_fusion, mesh
 from tumble.export.mesh import Mesh
 from tumble.maths.directions import fibonacci_sphere
@@ -219,3 +220,23 @@ def test_a_sphere_of_gaussians_keeps_its_radius() -> None:
     error = np.linalg.norm(fused(sphere(2000, radius=0.8)).vertices, axis=1) - 0.8
     assert abs(error.mean()) < 0.006
     assert error.std() < 0.02 * CELL
+
+
+def test_the_kernel_fuses_depth_maps_like_its_definition() -> None:
+    """Pixels on whose border a point lies may differ: one point in ten thousand."""
+    kernel = backends.fuse_kernel(backends.load("cpu"))
+    assert kernel is not None, "the kernels are not compiled"
+    generator = torch.Generator().manual_seed(0)
+    poses, camera = depth_fusion.surrounding_cameras(6, 64)
+    index = torch.randint(-2, 2000, (6, 64, 64), generator=generator, dtype=torch.int32)
+    index[:, :8] = depth_fusion.FREE
+    planes = torch.randn(2000, 5, generator=generator)
+    planes[:, :3] /= planes[:, :3].norm(dim=-1, keepdim=True)
+    planes[:, 3:] = torch.tensor([0.0, 6.0]) + 0.2 * planes[:, 3:]
+    points = 1.6 * torch.rand(5003, 3, generator=generator) - 0.8
+    arguments = points, backends.DepthMaps(index, planes), depth_fusion.posed_cameras(poses, camera)
+    given = {"cell": 0.05, "reach": 4.0, "distance": 6.0}
+    ours, theirs = (fuse(*arguments, **given) for fuse in (kernel, depth_fusion.sums_by_operations))
+    assert (theirs.abs() > 0.1).float().mean(1).min() > 0.1, "all sums occur"
+    different = ((ours - theirs).abs() > 1e-4).any(0)
+    assert different.float().mean() < 1e-3

@@ -137,7 +137,7 @@ def test_a_photograph_off_by_pixels_is_registered_and_an_exact_one_left_alone(te
     moved[4] = frame(POSES[4], 4, shift=(1.5, -1.0))
     start = truth(texels)
     parts = [photo_texture._equations(texels, f) for f in (moved[4], moved[3])]
-    new, same = (photo_texture._registered(part, start, CAMERA) for part in parts)
+    new, same = (photo_texture._registered(start, CAMERA, part) for part in parts)
     assert photo_texture._loss(new, start) < 0.1 * photo_texture._loss(parts[0], start)
     assert same is parts[1]
     assert error(photo_texture.solve(blurred(texels), texels, moved)[0], texels) < 0.011

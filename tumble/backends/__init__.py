@@ -5,8 +5,8 @@ kernels render: **rasterize** (splatting of Gaussians), **trace** (rays against 
 light). The others replace hundreds of small operations per step: colour (**sh_shade**), materials
 (**corner_features**), light (**lookup**, **bounce**) and loss terms (**image_terms**, **gaussian_terms**,
 **material_terms**). `reference.py` defines the correct result; the others compute the same, faster. There are no
-options: rules for culling, depth and interpolation are part of the method, and other rules need another module. One
-more kernel, that of relighting (`RelightKernel`), is optional.
+options: rules for culling, depth and interpolation are part of the method, and other rules need another module. Three
+more kernels are optional: relighting (`RelightKernel`), depth fusion (`FuseKernel`) and baking (`BlendKernel`).
 
 Vocabulary
     *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third axis
@@ -35,6 +35,10 @@ import torch
 
 from tumble.backends._contract import (
     Backend,
+    BlendKernel,
+    Cameras,
+    DepthMaps,
+    FuseKernel,
     GlossyGaussians,
     Hits,
     LightTables,
@@ -48,8 +52,12 @@ __all__ = [
     "ALPHA_MAX",
     "ALPHA_MIN",
     "Backend",
+    "BlendKernel",
     "CORNER",
+    "Cameras",
+    "DepthMaps",
     "FACING",
+    "FuseKernel",
     "GlossyGaussians",
     "Hits",
     "NEAR",
@@ -74,7 +82,9 @@ __all__ = [
     "T_MIN",
     "UNKNOWN",
     "VISIBLE",
+    "blend_kernel",
     "choose",
+    "fuse_kernel",
     "load",
     "names",
     "origin_of_kernels",
@@ -216,6 +226,16 @@ def choose(device: torch.device, dtype: torch.dtype) -> Backend:
 def relight_kernel(backend: Backend) -> RelightKernel | None:
     """The kernel of relighting of a backend, None if it has none."""
     return getattr(backend, "relight", None)
+
+
+def fuse_kernel(backend: Backend) -> FuseKernel | None:
+    """The kernel of depth fusion of a backend, None if it has none."""
+    return getattr(backend, "fuse", None)
+
+
+def blend_kernel(backend: Backend) -> BlendKernel | None:
+    """The kernel of texture baking of a backend, None if it has none."""
+    return getattr(backend, "blend", None)
 
 
 @cache

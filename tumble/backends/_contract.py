@@ -489,3 +489,83 @@ class RelightKernel(Protocol):
             f0: Reflectance at normal incidence, of points and Gaussians.
         """
         ...
+
+
+class Cameras(NamedTuple):
+    """Cameras around the object with common intrinsics."""
+
+    R: Float[Tensor, "v 3 3"]
+    """Rotations from the object frame to the camera frame."""
+    t: Float[Tensor, "v 3"]
+    """Translations from the object frame to the camera frame [object radius]."""
+    positions: Float[Tensor, "v 3"]
+    """Positions of the cameras, object frame [object radius]."""
+    fx_fy_cx_cy: Float[Tensor, "4"]
+    """Focal lengths and principal point [pixels]."""
+
+
+class DepthMaps(NamedTuple):
+    """Depth maps of all views, with planes only for pixels that show a surface."""
+
+    index: Int32[Tensor, "v h w"]
+    """Per pixel the row of its plane; -1 in unknown pixels, -2 in pixels that show free space."""
+    planes: Float[Tensor, "k 5"]
+    """Outward unit normal and offset of the tangent plane, object frame, and z-depth [object radius]."""
+
+
+@runtime_checkable
+class FuseKernel(Protocol):
+    """Optional function `fuse` of a backend: `export.depth_fusion.sums_by_operations`, the definition, as one kernel."""
+
+    def __call__(
+        self,
+        points: Float[Tensor, "n 3"],
+        maps: DepthMaps,
+        cameras: Cameras,
+        *,
+        cell: float,
+        reach: float,
+        distance: float,
+    ) -> Float[Tensor, "5 n"]:
+        """The sums of depth fusion at points; not differentiable.
+
+        Args:
+            points: Points, object frame.
+            maps: Depth maps of the cameras.
+            cameras: Poses and intrinsics.
+            cell: Unit of the distances [object radius].
+            reach: Distance from a surface up to which a map counts [cells].
+            distance: Distance of the cameras from the centre [object radius].
+        """
+        ...
+
+
+@runtime_checkable
+class BlendKernel(Protocol):
+    """Optional function `blend` of a backend: `export.bake.blend_by_operations`, the definition, as one kernel."""
+
+    def __call__(
+        self,
+        total: Float[Tensor, "n 7"],
+        weights: Float[Tensor, " n"],
+        maps: Float[Tensor, "h w 9"],
+        camera: Cameras,
+        points: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"],
+        *,
+        min_cosine: float,
+        tolerance: float,
+    ) -> None:
+        """Add a view's maps to weighted sums at points; not differentiable.
+
+        Args:
+            total: Weighted sums of the values, to which is added.
+            weights: Sums of the weights, to which is added.
+            maps: Seven values and the z-depth in pixels that show one surface, then 1; 0 in other pixels.
+            camera: Pose and intrinsics of the view.
+            points: Points, object frame.
+            normals: Outward unit normals of the surface at the points.
+            min_cosine: Cosine between normal and view direction above which a view counts.
+            tolerance: Maximum difference to the depth of the map at which a point is visible [object radius].
+        """
+        ...

@@ -170,9 +170,31 @@ class Relight(ctypes.Structure):
     ]
 
 
+class Fuse(ctypes.Structure):
+    """`Fuse` of `native/maps.h`: arguments of depth fusion."""
+
+    _fields_ = [
+        *_pointers("points R t positions index planes"),
+        *_ints("n n_views height width threads"),
+        *_floats("fx fy cx cy cell reach distance"),
+        *_pointers("out"),
+    ]
+
+
+class Blend(ctypes.Structure):
+    """`Blend` of `native/maps.h`: arguments of texture baking."""
+
+    _fields_ = [
+        *_pointers("maps points normals R t position"),
+        *_ints("n height width threads"),
+        *_floats("fx fy cx cy min_cosine tolerance"),
+        *_pointers("total weights"),
+    ]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
-    *(Lookup, Activation, Indirect, MaterialImage, Relight),
+    *(Lookup, Activation, Indirect, MaterialImage, Relight, Fuse, Blend),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

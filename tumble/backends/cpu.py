@@ -22,6 +22,8 @@ from tumble.backends import (
     TRACE_SIGMAS,
     TRACE_T_MIN,
     VISIBLE,
+    Cameras,
+    DepthMaps,
     GlossyGaussians,
     Hits,
     LightTables,
@@ -39,13 +41,15 @@ from tumble.backends._cpu_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
+from tumble.backends._structs import Blend, Bvh, Fuse, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
+    "blend",
     "blockers",
     "bounce",
     "build",
     "corner_features",
+    "fuse",
     "gaussian_terms",
     "image_terms",
     "lookup",
@@ -487,3 +491,49 @@ def relight(
     _native.library().relight_points(ctypes.byref(struct))
     del kept
     return out
+
+
+@torch.no_grad()
+def fuse(
+    points: Float[Tensor, "n 3"], maps: DepthMaps, cameras: Cameras, *, cell: float, reach: float, distance: float
+) -> Float[Tensor, "5 n"]:
+    """See `FuseKernel`."""
+    out = points.new_empty(5, len(points))
+    views, height, width = maps.index.shape
+    struct = Fuse(
+        n=len(points), n_views=views, cell=cell, reach=reach, distance=distance, **_size(height, width, cameras)
+    )
+    named = {"points": points, **maps._asdict(), **cameras._asdict()}
+    del named["fx_fy_cx_cy"]
+    kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, out=out)
+    _native.library().maps_fuse(ctypes.byref(struct))
+    del kept
+    return out
+
+
+@torch.no_grad()
+def blend(
+    total: Float[Tensor, "n 7"],
+    weights: Float[Tensor, " n"],
+    maps: Float[Tensor, "h w 9"],
+    camera: Cameras,
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    *,
+    min_cosine: float,
+    tolerance: float,
+) -> None:
+    """See `BlendKernel`."""
+    size = _size(*maps.shape[:2], camera)
+    struct = Blend(n=len(points), min_cosine=min_cosine, tolerance=tolerance, **size)
+    named = {"maps": maps, "points": points, "normals": normals, "R": camera.R, "t": camera.t}
+    named["position"] = camera.positions
+    kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, total=total, weights=weights)
+    _native.library().maps_blend(ctypes.byref(struct))
+    del kept
+
+
+def _size(height: int, width: int, cameras: Cameras) -> dict[str, Any]:
+    """Size of maps, intrinsics of their cameras, and number of threads, as fields of a structure."""
+    intrinsics = dict(zip(("fx", "fy", "cx", "cy"), cameras.fx_fy_cx_cy.tolist(), strict=True))
+    return {"height": height, "width": width, "threads": threads(), **intrinsics}

@@ -131,12 +131,14 @@ def textured_mesh(
             coarse = bake.bake(asset, flat, resolution=side, views=COARSE_VIEWS, pixels=side)
             flat = photo_texture.aligned_surface(flat, coarse.base_color, frames)
     with progress.task("baking textures"):
-        textures = bake.bake(asset, flat, resolution=preset.texture, views=3 * preset.views // 4, pixels=preset.pixels)
+        finest = max(bake.TEXELS_PER_PIXEL * preset.pixels, photo_texture.solved_side(asset.camera) if frames else 0)
+        side = min(preset.texture, finest)
+        textures = bake.bake(asset, flat, resolution=side, views=3 * preset.views // 4, pixels=preset.pixels)
     if frames:
         with progress.task("solving the albedo"):
             color = photo_texture.solved_base_color(textures.base_color, flat, frames)
         textures = replace(textures, base_color=color)
-    return flat, textures
+    return flat, textures.enlarged(preset.texture)
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:

@@ -8,15 +8,17 @@ at the largest common scale at which all fit. Long charts are cut in two where t
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Complex, Float, Int
-from scipy import fft
+from numpy import fft
 
 from tumble.export.mesh import Mesh, components, unit_rows, vertex_normals
+from tumble.io import in_threads
 from tumble.maths import local_frame
 
 CELL = 4
@@ -180,15 +182,12 @@ def _place(charts: list[Float[np.ndarray, "_ 3 2"]], n: int) -> list[Float[np.nd
     for index, chart in enumerate(charts):
         to_border = np.pad(1 - occupied, 1)
         distance = cv2.distanceTransform(to_border, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
-        spectra = np.asarray(fft.rfft2(np.stack([occupied.astype(np.float32), np.exp(-distance / (PROXIMITY * n))])))
-        options = []
-        for turn in range(ROTATIONS if index < LARGE_CHARTS else 1):
-            shape = _rasterized(chart, 2 * math.pi * turn / ROTATIONS)
-            if max(shape.cells.shape) <= n:
-                options.append((*_best_position(spectra, shape.cells, n), shape))
-        if not options or max(options, key=lambda option: option[0])[0] == -math.inf:
+        spectra = fft.rfft2(np.stack([occupied.astype(np.float32), np.exp(-distance / (PROXIMITY * n))]))
+        turns = [turn / ROTATIONS for turn in range(ROTATIONS if index < LARGE_CHARTS else 1)]
+        options = in_threads(partial(_placed, chart, spectra, n), turns)
+        value, row, column, shape = max(options, key=lambda option: option[0])
+        if value == -math.inf:
             return []
-        _, row, column, shape = max(options, key=lambda option: option[0])
         height, width = shape.cells.shape
         region = np.zeros_like(occupied)
         region[row : row + height, column : column + width] = shape.cells
@@ -205,6 +204,15 @@ class _Shape:
     """[cells]"""
     cells: np.ndarray
     """1 in all cells that the chart touches, u8[h w]."""
+
+
+def _placed(
+    chart: Float[np.ndarray, "f 3 2"], spectra: Complex[np.ndarray, "2 n _"], n: int, turn: float
+) -> tuple[float, int, int, _Shape]:
+    """The best position of the chart rotated by a part of a turn (see `_best_position`), and its shape."""
+    shape = _rasterized(chart, 2 * math.pi * turn)
+    place = _best_position(spectra, shape.cells, n) if max(shape.cells.shape) <= n else (-math.inf, 0, 0)
+    return *place, shape
 
 
 def _rasterized(chart: Float[np.ndarray, "f 3 2"], angle: float) -> _Shape:
@@ -234,10 +242,10 @@ def _best_position(spectra: Complex[np.ndarray, "2 n _"], cells: np.ndarray, n: 
     inner = cv2.erode(cells, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     outline = cells - inner
     # One axis after the other: most rows of the kernels are zero, and not all rows of the sums are used.
-    kernels = np.asarray(fft.fft(fft.rfft(np.stack([cells, outline]).astype(np.float32), n), n, axis=1))
+    kernels = fft.fft(fft.rfft(np.stack([cells, outline]).astype(np.float32), n), n, axis=1)
     product = np.multiply(spectra, np.conjugate(kernels, out=kernels), out=kernels)
-    rows = np.asarray(fft.ifft(product, axis=1, overwrite_x=True))[:, : n - height + 1]
-    overlap, value = np.asarray(fft.irfft(rows, n))[..., : n - width + 1]
+    rows = fft.ifft(product, axis=1)[:, : n - height + 1]
+    overlap, value = fft.irfft(rows, n)[..., : n - width + 1]
     value = np.where(overlap > 0.5, -np.inf, value / outline.sum())
     row, column = divmod(int(value.argmax()), value.shape[1])
     return float(value[row, column]), row, column

@@ -10,16 +10,19 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
-from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from tumble import backends
 from tumble.export.atlas import UnwrappedMesh
-from tumble.export.depth_fusion import surrounding_cameras
+from tumble.export.depth_fusion import posed_cameras, surrounding_cameras
 from tumble.maths import SE3, srgb_from_linear
 from tumble.rendering import Buffers, render_gbuffer
 from tumble.scene import Asset, Camera
 
+TEXELS_PER_PIXEL = 2
+"""Side of the baked textures, relative to that of the rendered maps: finer textures are interpolated, since a texel of
+an object that fills the maps is about as wide as half a pixel then."""
 MIN_COSINE = 0.2
 """Minimum cosine between normal and view direction at which a view contributes to a texel."""
 DEPTH_TOLERANCE = 0.03
@@ -27,7 +30,7 @@ DEPTH_TOLERANCE = 0.03
 SUBTEXEL_BITS = 4
 """Fractional bits of the vertex positions when triangles are rasterized into the texture."""
 CHUNK = 1 << 18
-"""Number of texels processed at once: limits memory, without effect on the result."""
+"""Number of texels processed at once by operations of torch: limits memory, without effect on the result."""
 CHANNELS = 7
 """Number of baked channels: albedo (3), roughness (1), normal (3)."""
 
@@ -42,8 +45,14 @@ class Textures:
     """Linear, perceptual."""
     normal: UInt8[np.ndarray, "r r 3"]
     """Tangent space: x along the tangent, y along the bitangent, z outwards."""
-    covered: Bool[np.ndarray, "r r"]
-    """Texels that a face covers; all others repeat the nearest of these."""
+
+    def enlarged(self, resolution: int) -> "Textures":
+        """The textures at another resolution, interpolated bilinearly."""
+        size = (resolution, resolution)
+        maps = (self.base_color, self.roughness, self.normal)
+        return Textures(
+            *(x if len(x) == resolution else cv2.resize(x, size, interpolation=cv2.INTER_LINEAR) for x in maps)
+        )
 
 
 @dataclass(frozen=True)
@@ -73,8 +82,8 @@ def bake(asset: Asset, mesh: UnwrappedMesh, *, resolution: int, views: int, pixe
     # A normal map cannot hold normals that point into the mesh.
     local = normalize(torch.cat([local[:, :2], local[:, 2:].clamp(min=0.05)], -1), dim=-1)
     encoded = torch.cat([srgb_from_linear(albedo), roughness, 0.5 + 0.5 * local], -1)
-    image, covered = _texture_image(texels, encoded, resolution)
-    return Textures(image[..., :3], image[..., 3], image[..., 4:], covered)
+    image = _texture_image(texels, encoded, resolution)
+    return Textures(image[..., :3], image[..., 3], image[..., 4:])
 
 
 @torch.no_grad()
@@ -84,19 +93,17 @@ def nearest_gaussian_texture(
     """Texture of values in [0, 1], one per Gaussian: each texel has the value of the nearest Gaussian."""
     texels = locate_texels(mesh, resolution)
     index = _nearest(texels.points, asset.gaussians.means)
-    return _texture_image(texels, values[index, None], resolution)[0][..., 0]
+    return _texture_image(texels, values[index, None], resolution)[..., 0]
 
 
-def _texture_image(
-    texels: Texels, values: Float[Tensor, "t c"], resolution: int
-) -> tuple[UInt8[np.ndarray, "r r c"], Bool[np.ndarray, "r r"]]:
-    """Padded 8-bit texture of values in [0, 1] at texels, and the mask of these texels."""
+def _texture_image(texels: Texels, values: Float[Tensor, "t c"], resolution: int) -> UInt8[np.ndarray, "r r c"]:
+    """8-bit texture of values in [0, 1] at texels; all other texels repeat the nearest of these."""
     image = np.zeros((resolution, resolution, values.shape[1]), np.uint8)
     covered = np.zeros((resolution, resolution), bool)
     at = (texels.rows.numpy(), texels.columns.numpy())
     image[at] = (values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     covered[at] = True
-    return pad(image, covered), covered
+    return pad(image, covered)
 
 
 def locate_texels(mesh: UnwrappedMesh, resolution: int) -> Texels:
@@ -158,49 +165,58 @@ def _averaged_maps(asset: Asset, texels: Texels, views: int, pixels: int) -> Flo
     camera = Camera(camera.fx_fy_cx_cy.to(like), pixels, pixels)
     poses = SE3(poses.wxyz.to(like), poses.xyz.to(like))
     points, normals = texels.points.to(like), texels.normals.to(like)
-    # Matrix products take a fraction of the time of sums over three columns.
-    along_normal, squared = (points * normals) @ like.new_ones(3), points.square() @ like.new_ones(3)
-    total, weights = points.new_zeros(len(points), CHANNELS), points.new_zeros(len(points), 1)
+    total, weights = points.new_zeros(len(points), CHANNELS), points.new_zeros(len(points))
+    blend = backends.blend_kernel(backends.choose(like.device, like.dtype)) or blend_by_operations
     for i in range(views):
-        stacked = _stacked_maps(render_gbuffer(asset, poses[i], camera))
-        centre = poses[i].inverse().xyz
-        for start in range(0, len(points), CHUNK):
-            chunk = slice(start, start + CHUNK)
-            distance = (centre.square().sum() + squared[chunk] - 2 * (points[chunk] @ centre)).sqrt()
-            cosine = (normals[chunk] @ centre - along_normal[chunk]) / distance
-            facing = torch.where(cosine > MIN_COSINE)[0]
-            values, visible = _sampled_maps(stacked, poses[i] @ points[chunk].index_select(0, facing), camera)
-            # The fourth power favours frontal views, which resolve the most detail.
-            weight = visible * cosine.index_select(0, facing)[:, None] ** 4
-            total[chunk].index_add_(0, facing, weight * values)
-            weights[chunk].index_add_(0, facing, weight)
-    values = total / weights.clamp(min=1e-6)
-    hidden = weights[:, 0] < 1e-3
+        maps = _stacked_maps(render_gbuffer(asset, poses[i], camera))
+        view = posed_cameras(poses[i : i + 1], camera)
+        blend(total, weights, maps, view, points, normals, min_cosine=MIN_COSINE, tolerance=DEPTH_TOLERANCE)
+    values = total / weights.clamp(min=1e-6)[:, None]
+    hidden = weights < 1e-3
     values[hidden] = _nearest_material(asset, points[hidden], normals[hidden])
     values[:, 4:] = normalize(values[:, 4:], dim=-1)
     return values.cpu()
 
 
-def _stacked_maps(view: Buffers) -> Float[Tensor, "1 9 h w"]:
+def _stacked_maps(view: Buffers) -> Float[Tensor, "h w 9"]:
     """Albedo, roughness, normal and depth of a view, 0 in pixels without a known surface; and which pixels have one."""
     known = ((view.alpha > 0.5) & (view.depth_var < DEPTH_TOLERANCE**2)).to(view.depth)[..., None]
     normal = normalize(view.normal, dim=-1)
     maps = torch.cat([view.features["albedo"], view.features["roughness"], normal, view.depth[..., None]], -1)
-    return torch.cat([maps * known, known], -1).movedim(-1, 0)[None].contiguous()
+    return torch.cat([maps * known, known], -1)
 
 
-def _sampled_maps(
-    stacked: Float[Tensor, "1 9 h w"], x_cam: Float[Tensor, "t 3"], camera: Camera
-) -> tuple[Float[Tensor, "t 7"], Float[Tensor, "t 1"]]:
-    """A view's maps at points, and the points' visibility in [0, 1]: 0 where another surface occludes them."""
-    size = torch.tensor([camera.width, camera.height]).to(x_cam)
-    grid = (2 * camera.project(x_cam) / size - 1)[None, None]
-    # Pixels without a known surface are left out of the bilinear interpolation.
-    values = grid_sample(stacked, grid, align_corners=False)[0, :, 0]
-    fraction = values[-1]
-    values = values[:-1] / fraction.clamp(min=1e-6)
-    near = (values[CHANNELS] - x_cam[:, 2]).abs() < DEPTH_TOLERANCE
-    return values[:CHANNELS].T, (near * (fraction > 0.25) * fraction)[:, None]
+def blend_by_operations(
+    total: Float[Tensor, "n 7"],
+    weights: Float[Tensor, " n"],
+    maps: Float[Tensor, "h w 9"],
+    camera: backends.Cameras,
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    *,
+    min_cosine: float,
+    tolerance: float,
+) -> None:
+    """The definition of `BlendKernel` by operations of torch."""
+    planes = maps.movedim(-1, 0)[None].contiguous()
+    size = torch.tensor([maps.shape[1], maps.shape[0]]).to(points)
+    focal, centre = camera.fx_fy_cx_cy.split(2)
+    for start in range(0, len(points), CHUNK):
+        x, chunk = points[start : start + CHUNK], slice(start, start + CHUNK)
+        to_camera = camera.positions[0] - x
+        cosine = (to_camera * normals[chunk]).sum(-1) / to_camera.norm(dim=-1)
+        facing = torch.where(cosine > min_cosine)[0]
+        x_cam = x[facing] @ camera.R[0].T + camera.t[0]
+        uv = x_cam[:, :2] / x_cam[:, 2:] * focal + centre
+        # Pixels without a known surface are left out of the bilinear interpolation.
+        values = grid_sample(planes, (2 * uv / size - 1)[None, None], align_corners=False)[0, :, 0]
+        fraction = values[-1]
+        values = values[:-1] / fraction.clamp(min=1e-6)
+        near = (values[CHANNELS] - x_cam[:, 2]).abs() < tolerance
+        # The fourth power favours frontal views, which resolve the most detail.
+        weight = near * (fraction > 0.25) * fraction * cosine[facing] ** 4
+        total[chunk].index_add_(0, facing, (weight * values[:CHANNELS]).T)
+        weights[chunk].index_add_(0, facing, weight)
 
 
 def _nearest_material(
@@ -215,4 +231,6 @@ def _nearest_material(
 
 def _nearest(points: Float[Tensor, "t 3"], means: Float[Tensor, "n 3"]) -> Int[Tensor, " t"]:
     """Index of the nearest Gaussian of every point."""
+    from scipy.spatial import KDTree
+
     return torch.from_numpy(KDTree(means.detach().cpu().numpy()).query(points.cpu().numpy())[1]).to(means.device)

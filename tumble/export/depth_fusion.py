@@ -5,14 +5,15 @@ instead of the distance along the ray. Object frame, object radius = 1. A *cell*
 the *values*: signed distances to the surface, positive outside, in units of a cell and clamped to `TRUNCATION`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int8, Int32
+from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from tumble import backends
 from tumble.maths import SE3, SO3, fibonacci_sphere, local_frame
 from tumble.rendering import Buffers, rasterize
 from tumble.scene import Camera, Gaussians
@@ -29,8 +30,10 @@ CAMERA_DISTANCE = 6.0
 """Distance of the cameras from the centre [object radius]."""
 HALF_SIDE = 1.08
 """Half the side of the grid, and radius of the sphere that the cameras' images cover [object radius]."""
+UNKNOWN, FREE = -1, -2
+"""Values of `DepthMaps.index` in pixels without a plane."""
 CHUNK = 1 << 18
-"""Number of points fused at once: limits memory, without effect on the result."""
+"""Number of points fused at once by operations of torch: limits memory, without effect on the result."""
 
 
 def surrounding_cameras(n: int, pixels: int) -> tuple[SE3, Camera]:
@@ -63,19 +66,22 @@ def signed_distances(
     camera = Camera(camera.fx_fy_cx_cy.to(means), pixels, pixels)
     poses = SE3(poses.wxyz.to(means), poses.xyz.to(means))
     cell, backs, centres = 2 * HALF_SIDE / cells, _flipped(gaussians), camera.pixel_centers().to(means)
-    maps, near = [], torch.zeros((cells + 1,) * 3, dtype=torch.bool, device=means.device)
+    index, planes = means.new_empty(views, pixels, pixels, dtype=torch.int32), [means.new_zeros(0, 5)]
+    near = torch.zeros((cells + 1,) * 3, dtype=torch.bool, device=means.device)
     for i in range(views):
         view = rasterize(gaussians, gamma, poses[i], camera, {})
         known, x_obj = _surface(view, poses[i], camera, centres, 2 * cell)
         back = rasterize(backs, gamma, poses[i], camera, {}).alpha
-        maps.append(_depth_map(view, known, back, x_obj))
+        index[i] = _plane_index(view, known, back, sum(map(len, planes)))
+        planes.append(_planes(view, known, x_obj))
         at = ((x_obj + HALF_SIDE) / cell).round().long().clamp(0, cells)
         near[at[:, 0], at[:, 1], at[:, 2]] = True
+    maps, cameras = backends.DepthMaps(index, torch.cat(planes)), posed_cameras(poses, camera)
     corners = torch.where(_dilated(near, TRUNCATION))
     coarse = torch.cartesian_prod(*[torch.arange(2, cells + 1, 4, device=means.device)] * 3)
 
     def fused(index: Int[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        return torch.cat([_fuse(rows * cell - HALF_SIDE, maps, poses, camera, cell) for rows in index.split(CHUNK)])
+        return _fuse(index * cell - HALF_SIDE, maps, cameras, cell)
 
     blocks = fused(coarse).sign().reshape((cells // 4,) * 3) * TRUNCATION
     values = torch.full((cells + 1,) * 3, float(TRUNCATION), device=means.device)
@@ -101,68 +107,87 @@ def _flipped(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, quats=(SO3(normalize(gaussians.quats, dim=-1)) @ half_turn).wxyz)
 
 
-@dataclass(frozen=True)
-class _DepthMap:
-    """Depth map of one view, stored compactly: planes only for pixels that show a surface."""
+def _plane_index(
+    view: Buffers, known: Bool[Tensor, "h w"], back: Float[Tensor, "h w"], first: int
+) -> Int32[Tensor, "h w"]:
+    """`DepthMaps.index` of a view; pixels that show only backs of Gaussians (`back`) look in through a hole: unknown.
 
-    state: Int8[Tensor, " p"]
-    """Per pixel: 1 surface, 0 unknown, -1 free space."""
-    depth: Float[Tensor, " p"]
-    """Per pixel, its z-depth [object radius]; meaningless unless the state is 1."""
-    plane_index: Int32[Tensor, " p"]
-    """Per pixel, its row in `planes`; meaningless unless the state is 1."""
-    planes: Float[Tensor, "k 4"]
-    """Unit normal and offset, object frame."""
+    Args:
+        first: Row of the view's first plane.
+    """
+    rows = (known.flatten().cumsum(0, dtype=torch.int32) + (first - 1)).view_as(known)
+    other = torch.where((view.alpha < 0.5) & (back < 0.5), FREE, UNKNOWN).int()
+    return torch.where(known, rows, other)
 
 
-def _depth_map(
-    view: Buffers, known: Bool[Tensor, "h w"], back: Float[Tensor, "h w"], x_obj: Float[Tensor, "k 3"]
-) -> _DepthMap:
-    """Depth map of a view; pixels that show only backs of Gaussians (`back`) look in through a hole: not free space."""
+def _planes(view: Buffers, known: Bool[Tensor, "h w"], x_obj: Float[Tensor, "k 3"]) -> Float[Tensor, "k 5"]:
+    """`DepthMaps.planes` of a view."""
     normal = normalize(view.normal[known], dim=-1)
-    offset = (normal * x_obj).sum(-1)
-    state = known.to(torch.int8) - ((view.alpha < 0.5) & (back < 0.5)).to(torch.int8)
-    plane_index = (known.flatten().cumsum(0, dtype=torch.int32) - 1).clamp(min=0)
-    planes = torch.cat([normal, offset[:, None]], -1)
-    return _DepthMap(state.flatten(), view.depth.flatten(), plane_index, planes)
+    return torch.cat([normal, (normal * x_obj).sum(-1, keepdim=True), view.depth[known][:, None]], -1)
+
+
+def posed_cameras(poses: SE3, camera: Camera) -> backends.Cameras:
+    """The cameras as kernels take them."""
+    return backends.Cameras(poses.rotation.matrix(), poses.xyz, poses.inverse().xyz, camera.fx_fy_cx_cy)
 
 
 def _fuse(
-    x_obj: Float[Tensor, "n 3"], maps: list[_DepthMap], poses: SE3, camera: Camera, cell: float
+    x_obj: Float[Tensor, "n 3"], maps: backends.DepthMaps, cameras: backends.Cameras, cell: float
 ) -> Float[Tensor, " n"]:
     """Signed distances of points [cells], from the depth maps of all views."""
-    total, weights, outer, outer_weights, n_free = x_obj.new_zeros(5, len(x_obj))
-    for i, view in enumerate(maps):
-        x_cam = poses[i] @ x_obj
-        column, row = camera.project(x_cam).floor().long().unbind(-1)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        pixel = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-        state = view.state.index_select(0, pixel)
-        behind = (x_cam[:, 2] - view.depth.index_select(0, pixel)) / cell
-        n_free += ~inside | (state < 0)
-        # The rest depends on the few points that are not far behind a surface.
-        index = torch.where(inside & (state > 0) & (behind < 3 * TRUNCATION))[0]
-        rows = view.planes.index_select(0, view.plane_index.index_select(0, pixel.index_select(0, index)))
-        x, behind, (normal, offset) = (
-            x_obj.index_select(0, index),
-            behind.index_select(0, index),
-            rows.split([3, 1], -1),
-        )
+    kernel = backends.fuse_kernel(backends.choose(x_obj.device, x_obj.dtype))
+    sums = (kernel or sums_by_operations)(x_obj, maps, cameras, cell=cell, reach=TRUNCATION, distance=CAMERA_DISTANCE)
+    total, weights, outer, outer_weights, n_free = sums
+    free = n_free > FREE_FRACTION * len(maps.index)
+    total, weights = torch.where(free, outer, total), torch.where(free, outer_weights, weights)
+    far = torch.where(n_free >= max(2, MIN_FREE_FRACTION * len(maps.index)), float(TRUNCATION), -float(TRUNCATION))
+    return torch.where(weights > 0.1, total / weights.clamp(min=0.1), far)
+
+
+def sums_by_operations(
+    points: Float[Tensor, "n 3"],
+    maps: backends.DepthMaps,
+    cameras: backends.Cameras,
+    *,
+    cell: float,
+    reach: float,
+    distance: float,
+) -> Float[Tensor, "5 n"]:
+    """The definition of `FuseKernel` by operations of torch: weighted sum of the distances to the planes and sum of the
+    weights, both sums over positive distances only, and number of views that show free space at the point."""
+    return torch.cat([_sums_of_chunk(x, maps, cameras, cell, reach, distance) for x in points.split(CHUNK)], -1)
+
+
+def _sums_of_chunk(
+    x_obj: Float[Tensor, "n 3"],
+    maps: backends.DepthMaps,
+    cameras: backends.Cameras,
+    cell: float,
+    reach: float,
+    camera_distance: float,
+) -> Float[Tensor, "5 n"]:
+    _, height, width = maps.index.shape
+    focal, centre = cameras.fx_fy_cx_cy.split(2)
+    sums = x_obj.new_zeros(5, len(x_obj))
+    for i, rows in enumerate(maps.index.flatten(1)):
+        x_cam = x_obj @ cameras.R[i].T + cameras.t[i]
+        column, row = (x_cam[:, :2] / x_cam[:, 2:] * focal + centre).floor().long().unbind(-1)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        plane = torch.where(inside, rows[torch.where(inside, row * width + column, 0)], FREE)
+        sums[4] += plane == FREE
+        index = torch.where(plane >= 0)[0]
+        normal, offset, depth = maps.planes[plane[index].long()].split([3, 1, 1], -1)
+        x, behind = x_obj[index], (x_cam[index, 2] - depth[:, 0]) / cell
         distance = ((normal * x).sum(-1) - offset[:, 0]) / cell
-        n_free.index_add_(0, index, ((behind < -3 * TRUNCATION) & (distance > TRUNCATION)).to(n_free))
-        cosine = (normal * (poses[i].inverse().xyz - x)).sum(-1) / CAMERA_DISTANCE
+        sums[4].index_add_(0, index, ((behind < -3 * reach) & (distance > reach)).to(sums))
+        cosine = (normal * (cameras.positions[i] - x)).sum(-1) / camera_distance
         # The weight fades to 0 two cells behind the surface, where a thin wall may have ended. With a wider fade, a
         # plate of three cells comes out four cells thick (test_a_thin_plate_keeps_both_sides).
         fade = (1 + (distance + 0.5).clamp(max=0) / 1.5).clamp(min=0)
-        weight = (distance.abs() < TRUNCATION) * (behind > -3 * TRUNCATION) * fade * cosine.clamp(min=0).square()
-        total.index_add_(0, index, weight * distance)
-        weights.index_add_(0, index, weight)
-        outer.index_add_(0, index, weight * distance.clamp(min=0))
-        outer_weights.index_add_(0, index, weight * (distance > 0))
-    free = n_free > FREE_FRACTION * len(maps)
-    total, weights = torch.where(free, outer, total), torch.where(free, outer_weights, weights)
-    far = torch.where(n_free >= max(2, MIN_FREE_FRACTION * len(maps)), float(TRUNCATION), -float(TRUNCATION))
-    return torch.where(weights > 0.1, total / weights.clamp(min=0.1), far)
+        weight = (distance.abs() < reach) * (behind.abs() < 3 * reach) * fade * cosine.clamp(min=0).square()
+        outside = weight * (distance > 0)
+        sums.index_add_(1, index, torch.stack([weight * distance, weight, outside * distance, outside, 0 * weight]))
+    return sums
 
 
 def _dilated(marked: Bool[Tensor, "a b c"], reach: int) -> Bool[Tensor, "a b c"]:

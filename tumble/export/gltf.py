@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from tumble import __version__
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Textures
-from tumble.io import files
+from tumble.io import files, in_threads
 from tumble.scene import DIELECTRIC
 
 FLOAT = 5126
@@ -55,11 +55,9 @@ class _Buffer:
         self.accessors.append({"bufferView": self.view(values.tobytes(), target=target), **properties})
         return len(self.accessors) - 1
 
-    def png(self, values: UInt8[np.ndarray, "h w *c"]) -> dict[str, Any]:
-        """Append an image as PNG; returns its entry for `images`."""
-        bgr = values[..., ::-1] if values.ndim == 3 else values
-        encoded = cv2.imencode(".png", bgr, PNG_SETTINGS)[1]
-        return {"bufferView": self.view(encoded.tobytes()), "mimeType": "image/png"}
+    def png(self, encoded: bytes) -> dict[str, Any]:
+        """Append a PNG file; returns its entry for `images`."""
+        return {"bufferView": self.view(encoded), "mimeType": "image/png"}
 
 
 def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float, metres: float) -> None:
@@ -75,7 +73,8 @@ def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float,
     buffer = _Buffer()
     rough = textures.roughness
     red, blue = np.full_like(rough, 255), np.zeros_like(rough)
-    images = [buffer.png(x) for x in (textures.base_color, np.stack([red, rough, blue], -1), textures.normal)]
+    maps = (textures.base_color, np.stack([red, rough, blue], -1), textures.normal)
+    images = [buffer.png(encoded) for encoded in in_threads(_png, maps)]
     vertices = (flat.vertices * metres).astype(np.float32)
     short_indices = len(vertices) < 65535
     attributes = {
@@ -120,6 +119,11 @@ def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float,
     header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
     data = header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
     files.write_atomically(path, lambda partial: partial.write_bytes(data))
+
+
+def _png(values: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """An RGB image as a PNG file."""
+    return cv2.imencode(".png", cv2.cvtColor(values, cv2.COLOR_RGB2BGR), PNG_SETTINGS)[1].tobytes()
 
 
 def reflectance_extension(f0: float) -> tuple[str, dict[str, float]]:

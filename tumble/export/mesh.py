@@ -100,23 +100,19 @@ def remove_floaters(mesh: Mesh) -> Mesh:
 
 
 def components(n: int, faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " n"]:
-    """Label of the connected component of each vertex, by propagation of minimum labels with pointer jumping."""
-    label = np.arange(n)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    while True:
-        smallest = label[ends].min(1)
-        spread = label.copy()
-        np.minimum.at(spread, label[ends].ravel(), smallest.repeat(2))
-        spread = spread[spread]
-        if (spread == label).all():
-            return label
-        label = spread
+    """Label of the connected component of each vertex."""
+    from scipy import sparse
+
+    start, end = faces[:, :2].ravel(), faces[:, 1:].ravel()
+    graph = sparse.coo_matrix((np.ones(len(start), bool), (start, end)), (n, n))
+    return sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
 def _compact(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Mesh:
     """The mesh without unused vertices."""
-    used, index = np.unique(faces, return_inverse=True)
-    return Mesh(vertices[used], index.reshape(-1, 3))
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return Mesh(vertices[used], (np.cumsum(used) - 1)[faces])
 
 
 def smooth(mesh: Mesh) -> Mesh:
@@ -124,13 +120,15 @@ def smooth(mesh: Mesh) -> Mesh:
 
     Each edge must belong to two triangles that are oriented alike, as in meshes of `marching_tetrahedra`.
     """
+    from scipy import sparse
+
     start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     n = len(mesh.vertices)
-    degree = np.bincount(start, minlength=n)[:, None].clip(1)
+    weight = 1 / np.bincount(start, minlength=n).clip(1)
+    mean = sparse.csr_matrix((weight[start], (start, end)), (n, n))
     x = mesh.vertices
     for fraction in (SHRINKING, GROWING) * SMOOTHING_STEPS:
-        mean = np.stack([np.bincount(start, x[end, axis], n) for axis in range(3)], 1) / degree
-        x = x + fraction * (mean - x)
+        x = x + fraction * (mean @ x - x)
     return Mesh(x, mesh.faces)
 
 

@@ -13,19 +13,24 @@ rendering much better after a smooth warp by optical flow (Zhou and Koltun 2014)
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from scipy import sparse
 from torch.nn.functional import max_pool2d
 
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels, pad
+from tumble.io import in_threads
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.rendering import lit_frames
 from tumble.scene import Camera
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 TEXELS_PER_PIXEL = 2.0
 """Side of the solved texture, relative to that of the photographs: about four texels then lie in a pixel."""
@@ -60,7 +65,7 @@ exact it makes textures worse."""
 class _Equations:
     """Linear equations of a frame's usable pixels that show texels: photo = (shows @ albedo) * diffuse + specular."""
 
-    shows: sparse.csr_matrix
+    shows: "sparse.csr_matrix"
     """Fraction of each texel in each pixel; rows (pixels) sum to 1."""
     pixels: Int[np.ndarray, " p"]
     """Indices of the pixels, counted row by row."""
@@ -146,18 +151,19 @@ def solve(
         frames: Photographs with their light.
         iterations: Number of iterations; photographs are warped after the second one.
     """
-    parts = [equations for frame in frames if len((equations := _equations(texels, frame)).pixels)]
+    parts = [part for part in in_threads(partial(_equations, texels), frames) if len(part.pixels)]
     albedo, losses = baked, list[float]()
     for iteration in range(iterations):
         if iteration == 2:
-            parts = [_registered(part, albedo, frames[0].camera) for part in parts]
+            parts = in_threads(partial(_registered, albedo, frames[0].camera), parts)
         total, weights = REGULARISATION * (baked - albedo), np.full_like(baked, REGULARISATION)
         for part in parts:
             residual = part.photo - part.rendered(albedo)
             robust = part.weight * HUBER / np.abs(residual).max(1, keepdims=True).clip(HUBER)
             total += part.shows.T @ (robust * part.diffuse * residual)
             weights += part.shows.T @ (robust * part.diffuse**2)
-        losses = [_loss(part, albedo) for part in parts]
+        if iteration == iterations - 1:
+            losses = [_loss(part, albedo) for part in parts]
         albedo = (albedo + total / weights).clip(0, 1).astype(np.float32)
     return albedo, sum(losses) / max(1, len(losses))
 
@@ -170,6 +176,8 @@ def _loss(equations: _Equations, albedo: Float[np.ndarray, "t 3"]) -> float:
 
 def _equations(texels: Texels, frame: lit_frames.LitFrame) -> _Equations:
     """Equations of a frame's usable pixels, over the texels that face the camera and that no other texel hides."""
+    from scipy import sparse
+
     camera = frame.camera
     to_camera = frame.T_cam_obj.inverse().xyz - texels.points
     cosine = (to_camera * texels.normals).sum(-1) / to_camera.norm(dim=-1)
@@ -186,18 +194,20 @@ def _equations(texels: Texels, frame: lit_frames.LitFrame) -> _Equations:
     index = index[torch.from_numpy(frame.usable).flatten()[pixel[index]]]
     slope = 3 / camera.fx_fy_cx_cy[0] * depth[index] * (cosine[index] ** -2 - 1).clamp(min=0).sqrt()
     index = index[depth[index] < around[pixel[index]] + DEPTH_TOLERANCE + slope]
-    pixels, of_texel = np.unique(pixel[index].numpy(), return_inverse=True)
+    shown = np.bincount(pixel[index].numpy(), minlength=camera.height * camera.width)
+    pixels = np.nonzero(shown)[0]
+    of_texel = (np.cumsum(shown > 0) - 1)[pixel[index].numpy()]
     # A texel's area in the image is proportional to its cosine; its distance hardly varies within a pixel.
     facing = cosine[index].numpy().astype(np.float32)
     area = np.bincount(of_texel, facing, len(pixels))
     shape, places = (len(pixels), len(texels.points)), (of_texel, index.numpy())
     shows = sparse.csr_matrix(((facing / area[of_texel]).astype(np.float32), places), shape)
-    mean_cosine = area / np.bincount(of_texel, minlength=len(pixels))
+    mean_cosine = area / shown[pixels]
     photo, diffuse, specular = (x.reshape(-1, 3)[pixels] for x in (frame.photo, frame.diffuse, frame.specular))
     return _Equations(shows, pixels, (mean_cosine**2).astype(np.float32)[:, None], photo, diffuse, specular)
 
 
-def _registered(equations: _Equations, albedo: Float[np.ndarray, "t 3"], camera: Camera) -> _Equations:
+def _registered(albedo: Float[np.ndarray, "t 3"], camera: Camera, equations: _Equations) -> _Equations:
     """The equations with the photograph warped onto the rendering if that lowers their loss to `WARPED_LOSS`."""
     size = (camera.height, camera.width)
 

@@ -1,5 +1,5 @@
 """Images, videos, JSON documents and trees of tensors on disk, network weights, the rules for
-outputs, progress, and loading plugins by file name.
+outputs, progress, threads, and loading plugins by file name.
 
 Every file is written atomically. Every reader raises `BadFile` with the rule that the file breaks and the fix.
 """
@@ -8,10 +8,12 @@ from tumble.io import files, limits, outputs, progress, tree, video, weights
 from tumble.io.checked_tensors import read_tensors, write_tensors
 from tumble.io.errors import BadFile, one_line
 from tumble.io.plugins import load_plugin, plugin_names
+from tumble.io.threads import in_threads
 
 __all__ = [
     "BadFile",
     "files",
+    "in_threads",
     "limits",
     "load_plugin",
     "one_line",

@@ -5,6 +5,7 @@
 #include "gaussian_terms.h"
 #include "image.h"
 #include "lookup.h"
+#include "maps.h"
 #include "material.h"
 #include "parallel.h"
 #include "project.h"
@@ -20,7 +21,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(Fuse), sizeof(Blend), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -132,4 +133,11 @@ API void material_loss(const MaterialImage* m) { material_terms(*m); }
 
 API void relight_points(const Relight* s) {
     parallel(s->threads, [=](int share) { relight_share(*s, share); });
+}
+
+API void maps_fuse(const Fuse* s) {
+    parallel(s->threads, [=](int share) { fuse_share(*s, share); });
+}
+API void maps_blend(const Blend* s) {
+    parallel(s->threads, [=](int share) { blend_share(*s, share); });
 }
