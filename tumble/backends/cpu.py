@@ -79,7 +79,7 @@ LEVELS = 8
 """Maximum number of levels of the tree in `native/bvh.h`."""
 LEAF = 20 * 16
 """Numbers of a leaf in `native/bvh.h`."""
-LEAF_FIELDS = 15
+LEAF_FIELDS = 16
 """Numbers of a Gaussian that are computed for its leaf."""
 NODE = 10 * 16
 """Numbers of a node in `native/bvh.h`."""
@@ -246,7 +246,7 @@ def build(
     """See `Backend.build`."""
     n = len(means)
     counts = [-(-n // WIDE)]
-    while len(counts) < 2 or counts[-1] > 1:
+    while len(counts) < 3 or counts[-1] > 1:  # a root and at least one level below it
         counts.append(max(1, -(-counts[-1] // WIDE)))
     first_node = [sum(counts[1:level]) for level in range(1, len(counts))]
     t = Bvh(

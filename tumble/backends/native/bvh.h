@@ -7,11 +7,15 @@
 #pragma once
 #include "project.h"
 
-enum { WIDE = 16, LEVELS = 8, BUFFER = 128, MAX_NEAR = 256, FIELDS = 15 };
+enum { WIDE = 16, LEVELS = 8, BUFFER = 128, MAX_NEAR = 256, FIELDS = 16 };
+
+constexpr float NEVER = -1e30f;
+typedef float v4 __attribute__((vector_size(16)));
 
 struct Leaf {
-    float W[9][WIDE], extent[6][WIDE], mean[3][WIDE], opacity[WIDE];   // extent: matrix whose form is the squared reach
+    float W[9][WIDE], mean[3][WIDE], log_opacity[WIDE];   // logarithm to base 2, NEVER where there is no Gaussian
     int id[WIDE];
+    float extent[6][WIDE];   // matrix whose form is the squared reach; rays do not need it
 };
 struct Node {
     float low[3][WIDE], high[3][WIDE], axis[3][WIDE], sine[WIDE];
@@ -36,11 +40,6 @@ struct Rays {
     int *hit, *bits;
 };
 
-// Field j of the Gaussians [first, first + count) of an [n stride] array.
-INLINE void put(float* p, int stride, int j, int first, int count, vf value) {
-    for (int i = 0; i < count; i++) p[(i64)(first + i) * stride + j] = value[i];
-}
-
 static void leaf_fields(Bvh& t, float* fields) {
     for (int first = 0; first < t.n; first += LANES) {
         int count = imin2(LANES, t.n - first);
@@ -51,15 +50,16 @@ static void leaf_fields(Bvh& t, float* fields) {
         M3 R = rotation(q);
         V3 s = gather3(t.scales, first, count), mu = gather3(t.means, first, count);
         vf inv[3] = {1.0f / s.x, 1.0f / s.y, 1.0f / s.z}, m[3] = {mu.x, mu.y, mu.z};
-        vf cut = 2.0f * vlog(vmax(gather1(t.opacity, first, count) * (1.0f / t.alpha_min), splat(1.0f)));
+        vf opacity = gather1(t.opacity, first, count), cut = 2.0f * vlog(vmax(opacity * (1.0f / t.alpha_min), splat(1.0f)));
+        scatter(fields, FIELDS, 15, first, count, 1.44269504f * vlog(vmax(opacity, splat(1e-30f))));
         cut = vmin(cut + 1e-4f, splat(t.sigmas * t.sigmas * 1.0001f));
         for (int i = 0, k = 0; i < 3; i++) {
             V3 side = row(R, i) * s;
             vf half = vsqrt(cut * dot(side, side)) + 1e-6f;
-            for (int j = i; j < 3; j++, k++) put(fields, FIELDS, 9 + k, first, count, cut * dot(side, row(R, j) * s));
-            put(t.boxes, 6, i, first, count, m[i] - half), put(t.boxes, 6, 3 + i, first, count, m[i] + half);
-            put(t.normals, 3, i, first, count, R(i, 2));
-            for (int j = 0; j < 3; j++) put(fields, FIELDS, 3 * i + j, first, count, R(j, i) * inv[i]);
+            for (int j = i; j < 3; j++, k++) scatter(fields, FIELDS, 9 + k, first, count, cut * dot(side, row(R, j) * s));
+            scatter(t.boxes, 6, i, first, count, m[i] - half), scatter(t.boxes, 6, 3 + i, first, count, m[i] + half);
+            scatter(t.normals, 3, i, first, count, R(i, 2));
+            for (int j = 0; j < 3; j++) scatter(fields, FIELDS, 3 * i + j, first, count, R(j, i) * inv[i]);
         }
     }
 }
@@ -143,12 +143,13 @@ static void fill_tree(Bvh& t, const float* fields) {
     for (int l = 0; l < t.n_leaves; l++) {
         Leaf& leaf = t.leaves[l];
         clear(&leaf, sizeof leaf);
+        for (int c = 0; c < WIDE; c++) leaf.log_opacity[c] = NEVER;
         for (int c = 0; c < WIDE && l * WIDE + c < t.n; c++) {
             int g = t.order[l * WIDE + c];
             for (int j = 0; j < 9; j++) leaf.W[j][c] = fields[FIELDS * (i64)g + j];
             for (int j = 0; j < 6; j++) leaf.extent[j][c] = fields[FIELDS * (i64)g + 9 + j];
             for (int j = 0; j < 3; j++) leaf.mean[j][c] = t.means[3 * (i64)g + j];
-            leaf.opacity[c] = t.opacity[g], leaf.id[c] = g;
+            leaf.log_opacity[c] = fields[FIELDS * (i64)g + 15], leaf.id[c] = g;
         }
     }
     i64 reach = WIDE;   // Gaussians below a child
@@ -171,13 +172,13 @@ INLINE Ray ray_at(const float* o, const float* d) {
     Ray r;
     for (int a = 0; a < 3; a++) {
         r.o[a] = o[a], r.d[a] = d[a];
-        r.inv[a] = 1 / (d[a] < 0 ? fmin2(d[a], -1e-12f) : fmax2(d[a], 1e-12f)), r.o_inv[a] = o[a] * r.inv[a];
+        r.inv[a] = 1 / __builtin_copysignf(fmax2(__builtin_fabsf(d[a]), 1e-12f), d[a]), r.o_inv[a] = o[a] * r.inv[a];
     }
     return r;
 }
 
-// Alphas of the Gaussians of a leaf on the ray (0 where not hit) and distances of their peaks.
-INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, vf& alpha, vf& z) {
+// Which Gaussians of a leaf the ray hits, the logarithms of their alphas to base 2, and the distances of their peaks.
+INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, float log_alpha_min, vf& log_alpha, vf& z) {
     vf p[3], Wd[3], Wp[3];
     for (int a = 0; a < 3; a++) p[a] = load(leaf.mean[a] + c) - r.o[a];
     for (int i = 0; i < 3; i++) {
@@ -186,16 +187,12 @@ INLINE vi met_gaussians(const Bvh& t, const Leaf& leaf, int c, const Ray& r, vf&
     }
     vf along = Wp[0] * Wd[0] + Wp[1] * Wd[1] + Wp[2] * Wd[2];
     vi on = (along > 0.0f) & (Wd[2] <= 0.0f);
-    if (!any(on)) return on;
-    z = along / (Wd[0] * Wd[0] + Wd[1] * Wd[1] + Wd[2] * Wd[2]);
+    z = along * inverse(Wd[0] * Wd[0] + Wd[1] * Wd[1] + Wd[2] * Wd[2]);
     vf x = z * Wd[0] - Wp[0], y = z * Wd[1] - Wp[1], w = z * Wd[2] - Wp[2], distance = x * x + y * y + w * w;
-    on &= distance <= t.sigmas * t.sigmas;
-    if (!any(on)) return on;
-    alpha = load(leaf.opacity + c) * vexp(-0.5f * pick(on, distance, vf{}));
-    on &= alpha >= t.alpha_min;
-    alpha = keep(on, vmin(alpha, splat(t.alpha_max)));
-    return on;
+    log_alpha = load(leaf.log_opacity + c) - 0.721347520f * distance;
+    return on & (distance <= t.sigmas * t.sigmas) & (log_alpha >= log_alpha_min);
 }
+INLINE float log_alpha_min(const Bvh& t) { return 1.44269504f * vlog(splat(t.alpha_min))[0]; }
 
 // Leaves that rays from one point into the half space above it may meet, in ascending order, in whole vectors.
 struct Near {
@@ -223,7 +220,7 @@ INLINE bool is_above(const Leaf& leaf, const float* o, const float* n) {
             height += (load(leaf.mean[a] + c) - o[a]) * n[a];
             for (int b = a; b < 3; b++, k++) form += load(leaf.extent[k] + c) * (n[a] * n[b] * (a == b ? 1 : 2));
         }
-        if (any((height + vsqrt(vmax(form, vf{})) > 0.0f) & (load(leaf.opacity + c) > 0.0f))) return true;
+        if (any((height + vsqrt(vmax(form, vf{})) > 0.0f) & (load(leaf.log_opacity + c) > NEVER))) return true;
     }
     return false;
 }
@@ -276,93 +273,74 @@ INLINE u32 met_boxes(const Boxes& n, int c, const Ray& r) {
     return bits((near <= far) & (along <= load(n.sine + c)));
 }
 
-// Children of a node that the ray may hit, one bit each.
-INLINE u32 met_children(const Node& n, const Ray& r) {
-    u32 met = 0;
-    for (int c = 0; c < WIDE; c += LANES) met |= met_boxes(n, c, r) << c;
-    return met;
-}
-
-// Calls visit(alpha, z, ids, on) for every group of Gaussians of a leaf with hits, until it returns false.
-template <class F>
-INLINE bool visit_leaf(const Bvh& t, int l, const Ray& ray, F visit) {
-    const Leaf& leaf = t.leaves[l];
-    for (int c = 0; c < WIDE; c += LANES) {
-        vf alpha, z;
-        vi on = met_gaussians(t, leaf, c, ray, alpha, z);
-        if (any(on) && !visit(alpha, z, leaf.id + c, on)) return false;
-    }
-    return true;
-}
-
-// The same for all leaves, in ascending order; those of `near` if it is given.
+// Calls visit(leaves, met) for groups of leaves of which a ray may hit those whose bits are set in `met`, in ascending order,
+// until it returns false; for those of `near` only if it is given.
 template <class F>
 INLINE void search(const Bvh& t, const Near* near, const Ray& ray, F visit) {
     if (near) {
         for (int c = 0; c < near->count; c += LANES)
-            for (u32 met = met_boxes(*near, c, ray); met; met &= met - 1)
-                if (!visit_leaf(t, near->leaf[c + __builtin_ctz(met)], ray, visit)) return;
+            if (!visit((vi)load((const float*)near->leaf + c), met_boxes(*near, c, ray))) return;
         return;
     }
     struct Task {
         int level, node;
         u32 met;
     } stack[LEVELS];
-    int top = 0, root = t.n_levels - 1;
-    stack[0] = {root, 0, met_children(t.nodes[t.first_node[root]], ray)};
+    auto met_children = [&](int level, int node) {
+        u32 met = 0;
+        for (int c = 0; c < WIDE; c += LANES) met |= met_boxes(t.nodes[t.first_node[level] + node], c, ray) << c;
+        return met;
+    };
+    int top = 0;
+    stack[0] = {t.n_levels - 1, 0, met_children(t.n_levels - 1, 0)};
     while (top >= 0) {
         Task& task = stack[top];
-        if (!task.met) {
+        if (task.level == 1) {
+            // Without waiting for the result of a box test before the next one.
+            for (u32 met = task.met; met; met &= met - 1) {
+                int node = task.node * WIDE + __builtin_ctz(met);
+                for (int c = 0; c < WIDE; c += LANES)
+                    if (!visit(lane_index() + (node * WIDE + c), met_boxes(t.nodes[node], c, ray))) return;
+            }
             top--;
-            continue;
+        } else if (task.met) {
+            int child = task.node * WIDE + __builtin_ctz(task.met), level = task.level - 1;
+            task.met &= task.met - 1;
+            stack[++top] = {level, child, met_children(level, child)};
+        } else {
+            top--;
         }
-        int child = task.node * WIDE + __builtin_ctz(task.met), level = task.level;
-        task.met &= task.met - 1;
-        if (level) {
-            u32 met = met_children(t.nodes[t.first_node[level - 1] + child], ray);
-            if (met) stack[++top] = {level - 1, child, met};
-            continue;
-        }
-        if (!visit_leaf(t, child, ray, visit)) return;
     }
-}
-
-INLINE float product(vf x) {
-    float p[LANES];
-    store(p, x);
-    for (int half = LANES / 2; half; half /= 2)
-        for (int i = 0; i < half; i++) p[i] *= p[i + half];
-    return p[0];
 }
 
 INLINE bool is_visible(const Bvh& t, const Near* near, const Ray& ray) {
-    float T = 1;
-    search(t, near, ray, [&](vf alpha, vf, const int*, vi) { return (T *= product(1.0f - alpha)) >= t.visible; });
+    float T = 1, least = log_alpha_min(t);
+    search(t, near, ray, [&](vi leaves, u32 met) {
+        for (; met; met &= met - 1)
+            for (int leaf = leaves[__builtin_ctz(met)], c = 0; c < WIDE; c += LANES) {
+                vf log_alpha, z;
+                vi on = met_gaussians(t, t.leaves[leaf], c, ray, least, log_alpha, z);
+                if (!any(on)) continue;
+                T *= product_of(1.0f - keep(on, vmin(vexp2(keep(on, log_alpha)), splat(t.alpha_max))));
+                if (T < t.visible) return false;
+            }
+        return true;
+    });
     return T >= t.visible;
 }
 
-// Hits of a ray.
+// Hits of a ray, in any order.
 struct Hits {
-    float z[BUFFER + LANES], alpha[BUFFER];
-    int id[BUFFER], order[BUFFER], count;
+    float z[BUFFER + LANES], log_alpha[BUFFER + LANES];
+    int id[BUFFER + LANES], count;
 
-    // Sorts into `order`, nearest first: the position of a hit is the number of nearer hits.
-    METHOD void sort() {
-        int sum = 0;
-        store(z + count, splat(2e30f));
+    METHOD bool is_behind(int i, float z_i, int id_i) const { return z[i] > z_i || (z[i] == z_i && id[i] > id_i); }
+
+    // Sorts indices, nearest first, hits at the same distance by id: the place of a hit is the number of nearer ones.
+    __attribute__((noinline)) void sort(int* order) {
         for (int i = 0; i < count; i++) {
             int place = 0;
-            for (int c = 0; c < count; c += LANES) place += __builtin_popcount(bits(load(z + c) < z[i]));
-            order[place] = i, sum += place;
-        }
-        if (sum != count * (count - 1) / 2) sort_duplicates();
-    }
-
-    // Orders hits of equal distance (exact duplicates) by id.
-    __attribute__((noinline)) void sort_duplicates() {
-        for (int i = 0; i < count; i++) {
-            int place = 0;
-            for (int j = 0; j < count; j++) place += z[j] < z[i] || (z[j] == z[i] && id[j] < id[i]);
+            for (int j = 0; j < count; j++) place += is_behind(i, z[j], id[j]);
             order[place] = i;
         }
     }
@@ -370,71 +348,158 @@ struct Hits {
     // Keeps the nearer half; returns the index of the farthest hit kept.
     inline int halve() {
         float z_kept[BUFFER / 2], alpha_kept[BUFFER / 2];
-        int id_kept[BUFFER / 2];
-        sort();
+        int id_kept[BUFFER / 2], order[BUFFER];
+        sort(order);
         count = BUFFER / 2;
         for (int i = 0; i < count; i++)
-            z_kept[i] = z[order[i]], alpha_kept[i] = alpha[order[i]], id_kept[i] = id[order[i]];
-        for (int i = 0; i < count; i++) z[i] = z_kept[i], alpha[i] = alpha_kept[i], id[i] = id_kept[i];
+            z_kept[i] = z[order[i]], alpha_kept[i] = log_alpha[order[i]], id_kept[i] = id[order[i]];
+        for (int i = 0; i < count; i++) z[i] = z_kept[i], log_alpha[i] = alpha_kept[i], id[i] = id_kept[i];
         return count - 1;
+    }
+
+    // Computes the transmittances `through` the hits, and `before` them as T times the product over all nearer hits. No sorting is needed unless two hits are at
+    // the same distance (exact duplicates), which the number of pairs in order reveals.
+    METHOD void attenuate(float T, float alpha_max, float* through, float* before) {
+        vi nearer = {};
+        store(z + count, splat(2e30f)), store(log_alpha + count, splat(-100.0f)), store((float*)id + count, vf{});
+        for (int c = 0; c <= count; c += LANES)
+            store(through + c, 1.0f - vmin(vexp2(load(log_alpha + c)), splat(alpha_max)));
+        for (int c = 0; c < count; c += LANES) {
+            vf even = splat(T), odd = splat(1.0f), at = load(z + c);
+            for (int j = 0; j < count; j += 2) {
+                vi in_front = at > z[j], next = at > z[j + 1];
+                even = in_front ? even * through[j] : even, odd = next ? odd * through[j + 1] : odd;
+                nearer = in_front ? nearer + 1 : nearer, nearer = next ? nearer + 1 : nearer;
+            }
+            store(before + c, even * odd);
+        }
+        int pairs = 0, padding = (LANES - count % LANES) % LANES;
+        for (int l = 0; l < LANES; l++) pairs += nearer[l];
+        if (pairs == count * (count - 1) / 2 + count * padding) return;
+        int order[BUFFER];
+        sort(order);
+        for (int place = 0; place < count; place++) before[order[place]] = T, T *= through[order[place]];
     }
 };
 
-// Collects the hits behind (after_z, after_id). If the buffer is too small, only the nearest ones, and `all` is false.
-static void collect(const Bvh& t, const Near* near, const Ray& ray, float after_z, int after_id, Hits& hits, bool& all) {
-    float limit_z = 1e30f;
-    int limit_id = 0;
-    hits.count = 0, all = true;
-    search(t, near, ray, [&](vf alpha, vf z, const int* id, vi on) {
-        float alphas[LANES], depths[LANES];
-        store(alphas, alpha), store(depths, z);
-        on &= (z >= after_z) & (z <= limit_z);
-        for (u32 b = bits(on); b; b &= b - 1) {
-            int i = __builtin_ctz(b);
-            if (depths[i] == after_z && id[i] <= after_id) continue;
-            if (depths[i] == limit_z && id[i] > limit_id) continue;
-            hits.z[hits.count] = depths[i], hits.alpha[hits.count] = alphas[i], hits.id[hits.count++] = id[i];
-        }
-        if (hits.count <= BUFFER - 2 * LANES) return true;
+// A ray on its way through the tree. Rays are traced a few at a time, step by step, because the steps of one ray wait for
+// each other.
+struct alignas(64) Traced {
+    enum { WAITING = 64 };
+    Hits hits;
+    Ray ray;
+    int waiting[WAITING + LANES], n_waiting;   // leaves that the ray may hit and that have not been searched yet
+    // Hits in front of `after` have been blended. If there are too many others, `hits` has those up to `limit` only.
+    float after_z, limit_z;
+    int after_id, limit_id;
+    bool all;
+    // Results: blended radiance, transmittance, and the dominant Gaussian with its weight.
+    float sum[3], T, best;
+    int dominant;
+
+    METHOD void start(const Ray& r) {
+        ray = r, after_z = -1, after_id = 0, T = 1, best = 0, dominant = -1;
+        for (int ch = 0; ch < 3; ch++) sum[ch] = 0;
+    }
+
+    METHOD void search_leaf(const Bvh& t, const Leaf& leaf, int c, float least) {
+        vf log_alpha, z;
+        vi on = met_gaussians(t, leaf, c, ray, least, log_alpha, z), id = (vi)load((const float*)leaf.id + c);
+        if (after_z >= 0) on &= (z > after_z) | ((z == after_z) & (id > after_id));
+        if (!all) on &= (z < limit_z) | ((z == limit_z) & (id <= limit_id));
+        u32 lanes = bits(on);
+        pack(hits.z + hits.count, lanes, z), pack(hits.log_alpha + hits.count, lanes, log_alpha);
+        pack((float*)hits.id + hits.count, lanes, (vf)id);
+        hits.count += __builtin_popcount(lanes);
+        if (hits.count <= BUFFER - LANES) return;
         int farthest = hits.halve();
         limit_z = hits.z[farthest], limit_id = hits.id[farthest], all = false;
-        return true;
-    });
-    hits.sort();
-}
-
-// Blends the hits of a ray front to back; returns the dominant Gaussian.
-static int trace_ray(const Bvh& t, const Near* near, const Ray& ray, const float* radiance, float* transmittance, float* out) {
-    float T = 1, best = 0, sum[3] = {}, z = -1;
-    int dominant = -1, id = 0;
-    bool all = false;
-    Hits hits;
-    while (!all && T >= t.T_min) {
-        collect(t, near, ray, z, id, hits, all);
-        for (int place = 0; place < hits.count && T >= t.T_min; place++) {
-            int i = hits.order[place];
-            float w = T * hits.alpha[i];
-            z = hits.z[i], id = hits.id[i];
-            if (w > best) best = w, dominant = id;
-            if (radiance)
-                for (int ch = 0; ch < 3; ch++) sum[ch] += w * radiance[3 * (i64)id + ch];
-            T -= w;
-        }
     }
-    float scale = T < t.T_min ? 1 / (1 - T) : 1;
-    if (out)
-        for (int ch = 0; ch < 3; ch++) out[ch] = sum[ch] * scale;
-    if (transmittance) *transmittance = T < t.T_min ? 0 : T;
-    return dominant;
+    METHOD void search_waiting(const Bvh& t) {
+        float least = log_alpha_min(t);
+        for (int i = 0; i < n_waiting; i++)
+            for (int c = 0; c < WIDE; c += LANES) search_leaf(t, t.leaves[waiting[i]], c, least);
+        n_waiting = 0;
+    }
+
+    // Finds the leaves that the ray may hit; of many, the first ones are searched already.
+    METHOD void find(const Bvh& t, const Near* near) {
+        hits.count = n_waiting = 0, all = true, limit_z = 1e30f, limit_id = 0;
+        search(t, near, ray, [&](vi leaves, u32 met) {
+            pack((float*)waiting + n_waiting, met, (vf)leaves);
+            n_waiting += __builtin_popcount(met);
+            if (n_waiting > WAITING - LANES) search_waiting(t);
+            return true;
+        });
+    }
+
+    // Blends the collected hits front to back.
+    METHOD void blend(const Bvh& t, const float* radiance) {
+        float through_hit[BUFFER + LANES], before_hit[BUFFER + LANES];
+        hits.attenuate(T, t.alpha_max, through_hit, before_hit);
+        vf rest = splat(T), largest = {};
+        vi of_largest = {};
+        float w[BUFFER + LANES];
+        for (int c = 0; c < hits.count; c += LANES) {
+            vf before = load(before_hit + c), after = before * load(through_hit + c);
+            vi blended = before >= t.T_min;
+            vf weight = keep(blended, before - after);
+            store(w + c, weight), rest = vmin(rest, pick(blended, after, rest));
+            vi better = weight > largest;
+            largest = pick(better, weight, largest);
+            of_largest = better ? (vi)load((const float*)hits.id + c) : of_largest;
+        }
+        T = -largest_of(-rest);
+        float weight = largest_of(largest);
+        if (weight > best) best = weight, dominant = of_largest[__builtin_ctz(bits(largest == weight))];
+        v4 even = {}, odd = {};
+        for (int i = 0; radiance && i < hits.count; i += 2) {
+            const float *a = radiance + 3 * (i64)hits.id[i], *b = radiance + 3 * (i64)hits.id[i + 1];
+            even += w[i] * v4{a[0], a[1], a[2], 0}, odd += w[i + 1] * v4{b[0], b[1], b[2], 0};
+        }
+        for (int ch = 0; ch < 3; ch++) sum[ch] += even[ch] + odd[ch];
+    }
+
+    // Traces what a full buffer left for later, and normalises the result.
+    METHOD void finish(const Bvh& t, const Near* near, const float* radiance) {
+        while (!all && T >= t.T_min) {
+            for (int i = 0; i < hits.count; i++)
+                if (hits.is_behind(i, after_z, after_id)) after_z = hits.z[i], after_id = hits.id[i];
+            find(t, near), search_waiting(t), blend(t, radiance);
+        }
+        if (T >= t.T_min) return;
+        for (int ch = 0; ch < 3; ch++) sum[ch] /= 1 - T;
+        T = 0;
+    }
+};
+
+// Calls done(i, result) for n rays ray_of(i), blended front to back.
+template <class RayOf, class Done>
+INLINE void trace_rays(const Bvh& t, const Near* near, const float* radiance, int n, RayOf ray_of, Done done) {
+    enum { AT_ONCE = 8 };
+    Traced rays[AT_ONCE];
+    for (int first = 0; first < n; first += AT_ONCE) {
+        int count = imin2(AT_ONCE, n - first);
+        for (int i = 0; i < count; i++) rays[i].start(ray_of(first + i)), rays[i].find(t, near);
+        for (int i = 0; i < count; i++) rays[i].search_waiting(t);
+        for (int i = 0; i < count; i++) rays[i].blend(t, radiance);
+        for (int i = 0; i < count; i++) rays[i].finish(t, near, radiance), done(first + i, rays[i]);
+    }
 }
 
 enum { RAYS_AT_ONCE = 64 };
 
 static void trace_share(const Rays& r, int share) {
-    for (i64 start = (i64)share * RAYS_AT_ONCE; start < r.n_rays; start += (i64)r.threads * RAYS_AT_ONCE)
-        for (i64 i = start; i < start + RAYS_AT_ONCE && i < r.n_rays; i++)
-            r.hit[i] = trace_ray(*r.bvh, nullptr, ray_at(r.origins + 3 * i, r.directions + 3 * i),
-                                 r.has_radiance ? r.radiance : nullptr, r.transmittance + i, r.out + 3 * i);
+    for (i64 start = (i64)share * RAYS_AT_ONCE; start < r.n_rays; start += (i64)r.threads * RAYS_AT_ONCE) {
+        int count = (int)(r.n_rays - start < RAYS_AT_ONCE ? r.n_rays - start : RAYS_AT_ONCE);
+        trace_rays(
+            *r.bvh, nullptr, r.has_radiance ? r.radiance : nullptr, count,
+            [&](int i) { return ray_at(r.origins + 3 * (start + i), r.directions + 3 * (start + i)); },
+            [&](int i, const Traced& ray) {
+                r.hit[start + i] = ray.dominant, r.transmittance[start + i] = ray.T;
+                for (int ch = 0; ch < 3; ch++) r.out[3 * (start + i) + ch] = ray.sum[ch];
+            });
+    }
 }
 
 INLINE bool above(const float* n, const float* d) { return n[0] * d[0] + n[1] * d[1] + n[2] * d[2] > 0; }
@@ -454,11 +519,21 @@ static void visible_share(const Rays& r, int share) {
 }
 
 static void blockers_share(const Rays& r, int share) {
-    for (i64 p = share; p < r.n_rays; p += r.threads)
+    for (i64 p = share; p < r.n_rays; p += r.threads) {
+        int blocked[64], count = 0;
+        auto trace = [&] {
+            trace_rays(
+                *r.bvh, nullptr, nullptr, count,
+                [&](int i) { return ray_at(r.origins + 3 * p, r.directions + 3 * blocked[i]); },
+                [&](int i, const Traced& ray) { r.hit[p * r.n_directions + blocked[i]] = ray.dominant; });
+            count = 0;
+        };
         for (int j = 0; j < r.n_directions; j++) {
-            const float* d = r.directions + 3 * j;
-            bool blocked = above(r.normals + 3 * p, d) && !((u32)r.bits[p * r.words + j / 32] >> j % 32 & 1);
-            int* hit = r.hit + p * r.n_directions + j;
-            *hit = blocked ? trace_ray(*r.bvh, nullptr, ray_at(r.origins + 3 * p, d), nullptr, nullptr, nullptr) : -1;
+            bool visible = (u32)r.bits[p * r.words + j / 32] >> j % 32 & 1;
+            r.hit[p * r.n_directions + j] = -1;
+            if (above(r.normals + 3 * p, r.directions + 3 * j) && !visible) blocked[count++] = j;
+            if (count == 64) trace();
         }
+        trace();
+    }
 }

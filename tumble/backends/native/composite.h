@@ -79,7 +79,10 @@ INLINE void read_features(const Raster& r, const float* image, const Tile& t, vf
     float x[LANES * C + LANES];
     for (int ch = 0; ch < C; ch++) features[ch] = vf{};
     if (!image) return;
-    read_pixels(r, image, t, r.c, x);
+    if (r.c == C)
+        read_pixels(r, image, t, C, x);   // a constant makes it faster
+    else
+        read_pixels(r, image, t, r.c, x);
     for (int first = 0; first < C; first += LANES) {
         vf group[LANES];
         for (int l = 0; l < LANES; l++) group[l] = load(x + l * r.c + first);
@@ -101,7 +104,10 @@ INLINE void write_features(const Raster& r, const Tile& t, const vf* features) {
                 for (int i = 0; i < imin2(r.c - first, LANES); i++) x[l * r.c + first + i] = group[l][i];
         }
     }
-    write_pixels(r, r.features, t, r.c, x);
+    if (r.c == C)
+        write_pixels(r, r.features, t, C, x);
+    else
+        write_pixels(r, r.features, t, r.c, x);
 }
 
 // The response of a Gaussian at the pixels of a tile, up to its alpha.
@@ -174,8 +180,12 @@ struct Features {
             const float* f = f4[i];
             vf w0 = w[i][0], w1 = w[i][1], w2 = w[i][2], w3 = w[i][3];
 #pragma GCC unroll 16
-            for (int ch = 0; ch < C; ch++)
-                s[ch] += w0 * f[ch] + w1 * f[C + ch] + w2 * f[2 * C + ch] + w3 * f[3 * C + ch];
+            for (int ch = 0; ch < C; ch++) {
+                s[ch] += w0 * f[ch];
+                s[ch] += w1 * f[C + ch];
+                s[ch] += w2 * f[2 * C + ch];
+                s[ch] += w3 * f[3 * C + ch];
+            }
         }
         for (int ch = 0; ch < C; ch++) sum[ch] = s[ch];
         count = 0;
@@ -306,7 +316,7 @@ static void adjoint_tile(const Raster& r, const Tile& t, const int* list, int co
         float* out = parts + (i64)g * r.gradient_size;
         vf w = p.alpha * T, depth = f[DZ] + f[PZ] * p.zeta_1, bent = depth * s.zz, slope = s.z + bent;
         vf value = s.alpha + depth * slope, v_zeta = f[PZ] * (w * (slope + bent)), x[PADDED<N>] = {};
-        for (int j = 0; j < 3; j++) value += s.fixed[j] * f[RED + j] + s.fixed[3 + j] * f[NX + j];
+        for (int j = 0; j < 6; j++) value += s.fixed[j] * f[j < 3 ? RED + j : NX + j - 3];
         if (C) {
             Corners c = corners_at(f, p);
             const float* f4 = f + RECORD;
@@ -351,6 +361,7 @@ static void corner_adjoint_tile(const Raster& r, const Tile& t, const int* list,
     vf T = keep(t.inside, splat(1.0f));
     for (int i = 0; i < count; i++) {
         const float* f = r.record + (i64)list[i] * r.record_size;
+        prefetch(r, list + i, r.record, RECORD + 4 * C);
         Peak p;
         if (!peak_at(f, t, T >= r.T_min, r.alpha_min, r.alpha_max, p)) continue;
         vf w = p.alpha * T;
@@ -385,11 +396,24 @@ static void composite_share(Raster& r, int share) {
     weights.flush();
 }
 
+// Adds the weights and counts of all shares.
+static void add_share(const Raster& r, int share) {
+    int start = share_start(r.n, share, r.threads), end = share_start(r.n, share + 1, r.threads);
+    for (int part = 0; part < r.threads; part++) {
+        const float* weight = r.weight_parts + (i64)part * r.n;
+        const int* touched = r.touched_parts + (i64)part * r.n;
+        for (int i = start; i < end; i++) {
+            r.weight[i] = (part ? r.weight[i] : 0) + weight[i];
+            r.touched[i] = (part ? r.touched[i] : 0) + touched[i];
+        }
+    }
+}
+
 template <int C>
 static void adjoint_share(Raster& r, int share) {
     float* parts = r.parts + (i64)share * r.n * r.gradient_size;
     for (int g = 0; g < r.n; g++)
-        if (r.keys[g] != ~0u) clear(parts + (i64)g * r.gradient_size, (i64)4 * r.gradient_size);
+        for (int j = 0; r.keys[g] != ~0u && j < r.gradient_size; j += LANES) store(parts + (i64)g * r.gradient_size + j, vf{});
     for (int tile = first_tile(r, share); tile < first_tile(r, share + 1); tile++) {
         const int* list = r.list + r.tile_start[tile];
         if (!r.counts[tile]) continue;

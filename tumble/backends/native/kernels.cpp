@@ -53,15 +53,7 @@ API void raster_forward(Raster* r) {
         case 3: forward<12>(r); break;
         default: forward<16>(r);
     }
-    for (int i = 0; i < r->n; i++) {
-        float weight = 0;
-        int touched = 0;
-        for (int part = 0; part < r->threads; part++) {
-            weight += r->weight_parts[(i64)part * r->n + i];
-            touched += r->touched_parts[(i64)part * r->n + i];
-        }
-        r->weight[i] = weight, r->touched[i] = touched;
-    }
+    parallel(r->threads, [=](int share) { add_share(*r, share); });
 }
 
 API void raster_adjoint(Raster* r) {

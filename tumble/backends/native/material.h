@@ -68,11 +68,9 @@ static void bounce_values(const Indirect& s, bool adjoint) {
         int count = imin2(LANES, s.n_directions - first);
         vf Y[16];
         harmonics(9, gather3(s.directions, first, count), Y);
-        vf radiance[3];
-        gather<3>(s.radiance, first, count, radiance);
         for (int ch = 0; ch < 3; ch++) {
-            radiance[ch] = keep(lane_index() < count, radiance[ch]);
-            for (int k = 0; k < 9; k++) projected[k][ch] += Y[k] * radiance[ch];
+            vf radiance = keep(lane_index() < count, gather(s.radiance, 3, ch, first, count));
+            for (int k = 0; k < 9; k++) projected[k][ch] += Y[k] * radiance;
         }
     }
     for (int k = 0; k < 9; k++)
@@ -80,35 +78,32 @@ static void bounce_values(const Indirect& s, bool adjoint) {
     for (int first = 0; first < s.n; first += LANES) {
         int count = imin2(LANES, s.n - first);
         vi inside = lane_index() < count;
-        vf t[9], albedo[3], v_out[3], out[3];
-        gather<9>(s.transfer, first, count, t), gather<3>(s.albedo, first, count, albedo);
-        if (adjoint) gather<3>(s.v_out, first, count, v_out);
+        vf t[9];
+        for (int k = 0; k < 9; k++) t[k] = gather(s.transfer, 9, k, first, count);
         vf hidden = 1.0f - vmin(vmax(t[0] * 1.12837917f, vf{}), splat(1.0f));
         for (int ch = 0; ch < 3; ch++) {
-            vf irradiance = {}, a = albedo[ch];
+            vf irradiance = {}, a = gather(s.albedo, 3, ch, first, count);
             for (int k = 0; k < 9; k++) irradiance += t[k] * coefficients[k][ch];
             vf rest = 1.0f - a * hidden, inverse = 1.0f / vmax(rest, splat(1e-3f)), lit = vmax(irradiance, vf{});
             if (!adjoint) {
-                out[ch] = 0.318309886f * a * lit * inverse;
+                scatter(s.out, 3, ch, first, count, 0.318309886f * a * lit * inverse);
                 continue;
             }
-            vf v = keep(inside, 0.318309886f * v_out[ch]);
+            vf v = keep(inside, 0.318309886f * gather(s.v_out, 3, ch, first, count));
             vf v_lit = keep(irradiance >= 0.0f, v * a * inverse);
             vf grows = keep(rest >= 1e-3f, a * hidden * inverse);
-            out[ch] = v * lit * inverse * (1.0f + grows);
+            scatter(s.v_albedo, 3, ch, first, count, v * lit * inverse * (1.0f + grows));
             for (int k = 0; k < 9; k++) sums[k][ch] += v_lit * t[k];
         }
-        scatter<3>(adjoint ? s.v_albedo : s.out, first, count, out);
     }
     if (!adjoint) return;
     for (int k = 0; k < 9; k++)
         for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(sums[k][ch]);
     for (int first = 0; first < s.n_directions; first += LANES) {
         int count = imin2(LANES, s.n_directions - first);
-        vf Y[16], v_radiance[3];
+        vf Y[16];
         harmonics(9, gather3(s.directions, first, count), Y);
-        for (int ch = 0; ch < 3; ch++) v_radiance[ch] = series(coefficients, Y, ch, 9);
-        scatter<3>(s.v_radiance, first, count, v_radiance);
+        for (int ch = 0; ch < 3; ch++) scatter(s.v_radiance, 3, ch, first, count, series(coefficients, Y, ch, 9));
     }
 }
 

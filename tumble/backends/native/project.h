@@ -51,6 +51,17 @@ INLINE void scatter(float* p, int first, int count, const vf* x) {
     rows_of<N>(rows, x);
     __builtin_memcpy(p + (i64)N * first, rows, 4 * N * count);
 }
+// The same for number j of an [n stride] array.
+INLINE vf gather(const float* p, int stride, int j, int first, int count) {
+    float x[LANES];
+    for (int i = 0; i < LANES; i++) x[i] = p[(i64)(first + imin2(i, count - 1)) * stride + j];
+    return load(x);
+}
+INLINE void scatter(float* p, int stride, int j, int first, int count, vf value) {
+    float x[LANES];
+    store(x, value);
+    for (int i = 0; i < count; i++) p[(i64)(first + i) * stride + j] = x[i];
+}
 INLINE vf gather1(const float* p, int first, int count) {
     vf x;
     gather<1>(p, first, count, &x);

@@ -177,18 +177,21 @@ INLINE void weigh(const Relight& s, const Relit& o, int j, Samples& batch) {
 // Traces the rays of a batch; adds their light, and lists those that hit Gaussians.
 static void trace_batch(const Relight& s, const Near* near, const float* origin, const Samples& batch, Occluded& occluded, float* sum) {
     occluded.count = 0;
-    for (int i = 0; i < batch.count; i++) {
-        float d[3] = {batch.w[0][i], batch.w[1][i], batch.w[2][i]}, T = 1, out[3] = {};
-        int hit = trace_ray(*s.bvh, near, ray_at(origin, d), s.radiance, &T, out);
-        for (int ch = 0; ch < 3; ch++) sum[ch] += T * batch.value[ch][i] + batch.weight[ch][i] * out[ch];
-        if (hit < 0 || !s.stack) continue;
+    auto ray_of = [&](int i) {
+        float d[3] = {batch.w[0][i], batch.w[1][i], batch.w[2][i]};
+        return ray_at(origin, d);
+    };
+    trace_rays(*s.bvh, near, s.radiance, batch.count, ray_of, [&](int i, const Traced& ray) {
+        for (int ch = 0; ch < 3; ch++) sum[ch] += ray.T * batch.value[ch][i] + batch.weight[ch][i] * ray.sum[ch];
+        if (ray.dominant < 0 || !s.stack) return;
         int to = occluded.count++;
-        occluded.roughness[to] = s.gaussian_roughness[hit];
+        occluded.roughness[to] = s.gaussian_roughness[ray.dominant];
         for (int a = 0; a < 3; a++) {
-            occluded.w[a][to] = d[a], occluded.normal[a][to] = s.gaussian_normals[3 * (i64)hit + a];
-            occluded.weight[a][to] = (1 - T) * batch.weight[a][i];
+            occluded.w[a][to] = ray.ray.d[a];
+            occluded.normal[a][to] = s.gaussian_normals[3 * (i64)ray.dominant + a];
+            occluded.weight[a][to] = (1 - ray.T) * batch.weight[a][i];
         }
-    }
+    });
 }
 
 // Adds the specular lobes of the Gaussians that were hit, by the split sum (`shading.specular`).

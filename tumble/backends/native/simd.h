@@ -81,6 +81,16 @@ INLINE bool any(vi m) {
 #endif
 }
 
+// Writes the lanes of a mask, given as bits, one after the other; what follows them is undefined up to LANES numbers.
+INLINE void pack(float* p, u32 lanes, vf x) {
+#if LANES == 16
+    typedef float v16sf __attribute__((vector_size(64)));
+    store(p, (vf)__builtin_ia32_compresssf512_mask((v16sf)x, (v16sf)x, (unsigned short)lanes));
+#else
+    for (; lanes; lanes &= lanes - 1) *p++ = x[__builtin_ctz(lanes)];
+#endif
+}
+
 // 1 / x to the last bit or two; a division would take as long as ten multiplications.
 INLINE vf inverse(vf x) {
 #if LANES == 16
@@ -223,6 +233,28 @@ INLINE vf sums_of(const vf* x) {
     a[0] = fold<8>(a[0], a[1], Lanes());
 #endif
     return a[0];
+}
+
+// x with the lanes exchanged that are `step` apart, with which all lanes of x are combined in few steps.
+template <int step, int... I>
+INLINE vf swapped(vf x, Indices<I...>) {
+    return SHUFFLE(x, x, (I ^ step)...);
+}
+template <int step = LANES / 2>
+INLINE float product_of(vf x) {
+    x *= swapped<step>(x, Lanes());
+    if constexpr (step == 1)
+        return x[0];
+    else
+        return product_of<step / 2>(x);
+}
+template <int step = LANES / 2>
+INLINE float largest_of(vf x) {
+    x = vmax(x, swapped<step>(x, Lanes()));
+    if constexpr (step == 1)
+        return x[0];
+    else
+        return largest_of<step / 2>(x);
 }
 
 INLINE float sum_of(vf x) {
