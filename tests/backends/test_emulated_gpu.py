@@ -129,11 +129,13 @@ WRONG = {
 """Kernels with an error that a GPU need not report, and its message."""
 
 SEEDS = range(1, 6)
-stages = test_device.stages
+"""Orders of threads that are tried."""
 LONG = (
     conformance.test_visibility_bits_and_blockers_are_those_of_brute_force,
     conformance.test_a_convex_object_hardly_shadows_itself,
 )
+"""Conformance tests that take more than two seconds."""
+stages = test_device.stages
 
 
 @pytest.fixture(scope="module")

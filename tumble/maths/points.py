@@ -7,11 +7,15 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 CHUNK_ROWS = 1024
-"""Rows of the distance matrix that are computed at once; limits memory and does not affect results."""
+"""Rows of the distance matrix that a GPU computes at once; limits memory and does not affect results."""
 
 
 def nearest(x: Float[Tensor, "a 3"], y: Float[Tensor, "b 3"]) -> Int64[Tensor, " a"]:
-    """Index of the nearest point of `y` for each point of `x`."""
+    """Index of the nearest point of `y` for each point of `x`: by a k-d tree, or on a GPU from all distances."""
+    if x.device.type == "cpu" and len(y):
+        from scipy.spatial import KDTree
+
+        return torch.from_numpy(KDTree(y.detach().numpy()).query(x.detach().numpy())[1]).long()
     indices = [torch.cdist(rows, y).argmin(1) for rows in x.split(CHUNK_ROWS)]
     return torch.cat([*indices, torch.zeros(0, dtype=torch.long, device=x.device)])
 

@@ -175,9 +175,10 @@ def _smoothed(inside: Float[Tensor, "x y z"], sigma: float = 1.5) -> Float[Tenso
     return smoothed[0, 0]
 
 
-def neighbour_spacing(positions: Float[Tensor, "n 3"], chunk: int = 2048) -> Float[Tensor, " n"]:
+def neighbour_spacing(positions: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Mean distance of every point to its three nearest neighbours [object radius]."""
-    near = [
-        torch.cdist(part, positions).topk(4, largest=False).values[:, 1:].mean(-1) for part in positions.split(chunk)
-    ]
-    return torch.cat(near)
+    from scipy.spatial import KDTree
+
+    points = positions.detach().cpu().numpy()
+    distances, _ = KDTree(points).query(points, 4)
+    return torch.from_numpy(distances[:, 1:].mean(-1)).to(positions)
