@@ -524,7 +524,7 @@ def blend(
     tolerance: float,
 ) -> None:
     """See `BlendKernel`."""
-    size = _size(*maps.shape[:2], camera)
+    size = _size(maps.shape[0], maps.shape[1], camera)
     struct = Baking(n=len(points), min_cosine=min_cosine, tolerance=tolerance, **size)
     named = {"maps": maps, "points": points, "normals": normals, "R": camera.R, "t": camera.t}
     named["position"] = camera.positions

@@ -211,8 +211,10 @@ def _placed(
 ) -> tuple[float, int, int, _Shape]:
     """The best position of the chart rotated by a part of a turn (see `_best_position`), and its shape."""
     shape = _rasterized(chart, 2 * math.pi * turn)
-    place = _best_position(spectra, shape.cells, n) if max(shape.cells.shape) <= n else (-math.inf, 0, 0)
-    return *place, shape
+    if max(shape.cells.shape) > n:
+        return -math.inf, 0, 0, shape
+    value, row, column = _best_position(spectra, shape.cells, n)
+    return value, row, column, shape
 
 
 def _rasterized(chart: Float[np.ndarray, "f 3 2"], angle: float) -> _Shape:
