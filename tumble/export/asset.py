@@ -4,7 +4,7 @@ All files use the object frame, which has +y up as in glTF (if the object has an
 the object's size is given, else the object radius.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,7 +83,11 @@ def write_asset(
         frames = beside.submit(_lit_frames, asset, capture if settings else None)
         score = beside.submit(_confidence, asset) if settings else None
         shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
-        flat, textures = textured_mesh(asset, shape, settings, frames.result) if settings and shape else (None, None)
+        flat, textures = None, None
+        if settings and shape:
+            with progress.task("texture coordinates"):
+                flat = atlas.unwrap(shape, settings.texture)
+            flat, textures = textured_mesh(asset, flat, settings, frames.result())
     surface = flat or shape
     metres = 1.0 if scale_mm is None or surface is None else scale_mm / 1000 / mesh.diameter(surface.vertices)
     facts = {
@@ -138,12 +142,9 @@ def _confidence(asset: Asset) -> Float[Tensor, " n"]:
 
 
 def textured_mesh(
-    asset: Asset, shape: Mesh, preset: Preset, lit: Callable[[], list[lit_frames.LitFrame]] = list
+    asset: Asset, flat: atlas.UnwrappedMesh, preset: Preset, frames: Sequence[lit_frames.LitFrame] = ()
 ) -> tuple[atlas.UnwrappedMesh, bake.Textures]:
-    """The unwrapped mesh and its textures; with photographs (`lit`), both are fitted to them (`photo_texture`)."""
-    with progress.task("texture coordinates"):
-        flat = atlas.unwrap(shape, preset.texture)
-    frames = lit()
+    """An unwrapped mesh and its textures; with photographs (`frames`), both are fitted to them (`photo_texture`)."""
     if frames:
         with progress.task("aligning the surface"):
             side = photo_texture.solved_side(asset.camera)
@@ -161,8 +162,10 @@ def textured_mesh(
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
-    """Unwrap the mesh, bake its textures, and write the GLB."""
-    flat, textures = textured_mesh(asset, shape, preset)
+    """Unwrap the mesh for display only, bake its textures, and write the GLB."""
+    with progress.task("texture coordinates"):
+        flat = atlas.unwrap_loosely(shape, preset.texture)
+    flat, textures = textured_mesh(asset, flat, preset)
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 
