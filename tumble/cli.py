@@ -494,7 +494,7 @@ def _require_text(words: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _imports() -> Iterator[None]:
-    """Context of imports without a search for garbage, of which they make none: it would take a seventh of their time."""
+    """Context of imports without searches for garbage, which would find none and take a seventh of the time."""
     gc.disable()
     try:
         yield

@@ -1,5 +1,6 @@
 """The texture atlas: few charts, no overlaps, a gap around every chart, and little of the texture left empty."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -106,3 +107,18 @@ def test_pieces_without_number_are_an_error_with_the_fix(monkeypatch: pytest.Mon
     monkeypatch.setattr(atlas, "_place", lambda charts, n: [])
     with pytest.raises(ValueError, match="has 1 pieces, too many for a texture; use --preset splat"):
         atlas.pack(np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]]), 256)
+
+
+def test_a_large_mesh_is_cut_in_parts_without_an_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its triangles keep their order and corners, and each texel belongs to one of them."""
+    monkeypatch.setattr(atlas, "MAX_PART", 700)
+    shape = mesh.simplify(mesh.smooth(marched(to_torus(grid()))), 2000)
+    for unwrap in (atlas.unwrap, atlas.unwrap_loosely):
+        flat = unwrap(shape, 256)
+        assert np.allclose(flat.vertices[flat.faces], shape.vertices[shape.faces])
+        corners = flat.uv[flat.faces] * 256
+        (a, b), (c, d) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+        drawn = np.zeros((256, 256), np.uint8)
+        cv2.fillPoly(drawn, list(np.rint(corners).astype(np.int32)), 1)
+        # Overlapping charts would cover less than the sum of their areas; drawing adds half a texel at borders.
+        assert np.abs(a * d - b * c).sum() / 2 < drawn.sum()

@@ -92,7 +92,7 @@ def page(asset: Asset, capture: Capture, tmp_path_factory: pytest.TempPathFactor
     masks[N - 1] = masks[N - 1].roll(SIDE // 4, 0)  # the health card names this frame
     names = tuple(f"{name} {HOSTILE}" for name in capture.names)
     run_capture = dataclasses.replace(capture, names=names, masks=masks)
-    rows = report.build(asset, run_capture, folder / "asset.glb", SUMMARY, None, folder / "report.html")
+    rows = report.build(asset, run_capture, lambda: folder / "asset.glb", SUMMARY, None, folder / "report.html")
     assert any(HOSTILE in row.sentence for row in rows)
     return folder / "report.html"
 
@@ -407,7 +407,7 @@ def test_another_capture_is_refused(asset: Asset, capture: Capture) -> None:
 
 
 def test_without_a_surface_the_live_view_is_left_out(asset: Asset, capture: Capture, tmp_path: Path) -> None:
-    report.build(asset, capture, None, SUMMARY, None, tmp_path / "report.html")
+    report.build(asset, capture, lambda: None, SUMMARY, None, tmp_path / "report.html")
     source = (tmp_path / "report.html").read_text("utf-8")
     assert "<script" not in source
     assert "#relight" not in re.sub(r"<style>.*?</style>", "", source, flags=re.S)

@@ -515,7 +515,7 @@ class DepthMaps(NamedTuple):
 
 @runtime_checkable
 class FuseKernel(Protocol):
-    """Optional function `fuse` of a backend: `export.depth_fusion.sums_by_operations`, the definition, as one kernel."""
+    """Optional function `fuse` of a backend: `export.depth_fusion.sums_by_operations`, its definition, in one."""
 
     def __call__(
         self,
@@ -542,7 +542,7 @@ class FuseKernel(Protocol):
 
 @runtime_checkable
 class BlendKernel(Protocol):
-    """Optional function `blend` of a backend: `export.bake.blend_by_operations`, the definition, as one kernel."""
+    """Optional function `blend` of a backend: `export.bake.blend_by_operations`, its definition, in one."""
 
     def __call__(
         self,

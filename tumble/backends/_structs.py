@@ -170,8 +170,8 @@ class Relight(ctypes.Structure):
     ]
 
 
-class Fuse(ctypes.Structure):
-    """`Fuse` of `native/maps.h`: arguments of depth fusion."""
+class Fusion(ctypes.Structure):
+    """`Fusion` of `native/maps.h`: arguments of depth fusion."""
 
     _fields_ = [
         *_pointers("points R t positions index planes"),
@@ -181,8 +181,8 @@ class Fuse(ctypes.Structure):
     ]
 
 
-class Blend(ctypes.Structure):
-    """`Blend` of `native/maps.h`: arguments of texture baking."""
+class Baking(ctypes.Structure):
+    """`Baking` of `native/maps.h`: arguments of texture baking."""
 
     _fields_ = [
         *_pointers("maps points normals R t position"),
@@ -194,7 +194,7 @@ class Blend(ctypes.Structure):
 
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
-    *(Lookup, Activation, Indirect, MaterialImage, Relight, Fuse, Blend),
+    *(Lookup, Activation, Indirect, MaterialImage, Relight, Fusion, Baking),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

@@ -41,7 +41,7 @@ from tumble.backends._cpu_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends._structs import Blend, Bvh, Fuse, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
+from tumble.backends._structs import Baking, Bvh, Fusion, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
     "blend",
@@ -500,7 +500,7 @@ def fuse(
     """See `FuseKernel`."""
     out = points.new_empty(5, len(points))
     views, height, width = maps.index.shape
-    struct = Fuse(
+    struct = Fusion(
         n=len(points), n_views=views, cell=cell, reach=reach, distance=distance, **_size(height, width, cameras)
     )
     named = {"points": points, **maps._asdict(), **cameras._asdict()}
@@ -524,8 +524,8 @@ def blend(
     tolerance: float,
 ) -> None:
     """See `BlendKernel`."""
-    size = _size(*maps.shape[:2], camera)
-    struct = Blend(n=len(points), min_cosine=min_cosine, tolerance=tolerance, **size)
+    size = _size(maps.shape[0], maps.shape[1], camera)
+    struct = Baking(n=len(points), min_cosine=min_cosine, tolerance=tolerance, **size)
     named = {"maps": maps, "points": points, "normals": normals, "R": camera.R, "t": camera.t}
     named["position"] = camera.positions
     kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, total=total, weights=weights)

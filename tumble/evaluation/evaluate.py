@@ -19,7 +19,7 @@ from tumble.datasets import reader_for
 from tumble.evaluation import lpips, metrics, score_sheet
 from tumble.evaluation.prediction import Prediction
 from tumble.evaluation.published import published_scores
-from tumble.io import BadFile, files, progress
+from tumble.io import BadFile, files, in_threads, progress
 from tumble.scene import REGIONS, UNKNOWN, Capture, Truth
 
 MIN_SIDE = 11
@@ -174,8 +174,8 @@ def compare(predicted: Prediction, capture: Capture, truth: Truth, networks: Seq
     """
     notes = _missing_parts(predicted, truth)
     scale = _albedo_scale(predicted, truth, notes)
-    indices = progress.track(range(len(truth)), "scoring views", len(truth))
-    rows = [_view_scores(i, predicted, truth, scale, networks) for i in indices]
+    with progress.task("scoring views"):
+        rows = in_threads(lambda i: _view_scores(i, predicted, truth, scale, networks), range(len(truth)))
     light: dict[str, Any] = {}
     if predicted.light is not None and truth.light is not None:
         light = metrics.light_scores(predicted.light, truth.light, torch.ones(3) if scale is None else scale)

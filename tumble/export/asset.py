@@ -4,9 +4,14 @@ All files use the object frame, which has +y up as in glTF (if the object has an
 the object's size is given, else the object radius.
 """
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
 
 from tumble import __version__
 from tumble.export import atlas, bake, confidence, gltf, mesh, photo_texture, ply
@@ -73,8 +78,16 @@ def write_asset(
         ValueError: A mesh is needed, but the Gaussians have no surface.
     """
     settings = PRESETS[preset]
-    shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
-    flat, textures = textured_mesh(asset, shape, settings, capture) if settings and shape else (None, None)
+    with ThreadPoolExecutor(1) as beside:
+        # The mesh is made by one thread most of the time.
+        frames = beside.submit(_lit_frames, asset, capture if settings else None)
+        score = beside.submit(_confidence, asset) if settings else None
+        shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
+        flat, textures = None, None
+        if settings and shape:
+            with progress.task("texture coordinates"):
+                flat = atlas.unwrap(shape, settings.texture)
+            flat, textures = textured_mesh(asset, flat, settings, frames.result())
     surface = flat or shape
     metres = 1.0 if scale_mm is None or surface is None else scale_mm / 1000 / mesh.diameter(surface.vertices)
     facts = {
@@ -87,11 +100,9 @@ def write_asset(
         "tumble": __version__,
     }
     files.write_json(out / EXPORT_FILE, facts)
-    if flat and textures:
+    if flat and textures and score:
         gltf.write_glb(out / "asset.glb", flat, textures, f0=float(asset.material.f0), metres=metres)
-        with progress.task("confidence of the material"):
-            score = confidence.confidence_of(asset, asset.camera).score
-            texture = bake.nearest_gaussian_texture(score, asset, flat, resolution=512)
+        texture = bake.nearest_gaussian_texture(score.result(), asset, flat, resolution=512)
         files.write_png(out / CONFIDENCE_FILE, texture[..., None])
     ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
     ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
@@ -116,16 +127,25 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
         return mesh.simplify(mesh.smooth(whole), preset.triangles)
 
 
+def _lit_frames(asset: Asset, capture: Capture | None) -> list[lit_frames.LitFrame]:
+    """The photographs of a capture with their light."""
+    if capture is None:
+        return []
+    found = lit_frames.lit_frames(asset, capture)
+    return list(progress.track(found, "light of the photographs", lit_frames.count(capture)))
+
+
+def _confidence(asset: Asset) -> Float[Tensor, " n"]:
+    """The confidence of each Gaussian's material, 0 to 1."""
+    with progress.task("confidence of the material"):
+        return confidence.confidence_of(asset, asset.camera).score
+
+
 def textured_mesh(
-    asset: Asset, shape: Mesh, preset: Preset, capture: Capture | None = None
+    asset: Asset, flat: atlas.UnwrappedMesh, preset: Preset, frames: Sequence[lit_frames.LitFrame] = ()
 ) -> tuple[atlas.UnwrappedMesh, bake.Textures]:
-    """The unwrapped mesh and its textures; with a capture, both are fitted to its photographs (`photo_texture`)."""
-    with progress.task("texture coordinates"):
-        flat = atlas.unwrap(shape, preset.texture)
-    frames: list[lit_frames.LitFrame] = []
-    if capture is not None:
-        found = lit_frames.lit_frames(asset, capture)
-        frames = list(progress.track(found, "light of the photographs", lit_frames.count(capture)))
+    """An unwrapped mesh and its textures; with photographs (`frames`), both are fitted to them (`photo_texture`)."""
+    if frames:
         with progress.task("aligning the surface"):
             side = photo_texture.solved_side(asset.camera)
             coarse = bake.bake(asset, flat, resolution=side, views=COARSE_VIEWS, pixels=side)
@@ -142,8 +162,10 @@ def textured_mesh(
 
 
 def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
-    """Unwrap the mesh, bake its textures, and write the GLB."""
-    flat, textures = textured_mesh(asset, shape, preset)
+    """Unwrap the mesh for display only, bake its textures, and write the GLB."""
+    with progress.task("texture coordinates"):
+        flat = atlas.unwrap_loosely(shape, preset.texture)
+    flat, textures = textured_mesh(asset, flat, preset)
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 

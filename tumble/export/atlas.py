@@ -47,6 +47,9 @@ SUBCELL_BITS = 4
 """Fractional bits of the vertex positions when charts are drawn into the grid."""
 MAX_COST = 8.0
 """Cost at which xatlas stops to add faces to a chart; four times its default, for fewer and larger charts."""
+MAX_PART = 12_500
+"""Number of triangles above which a mesh is cut in two before its charts are found, which takes time that grows with
+the square of the number of triangles."""
 ITERATIONS = 1
 """Number of times that xatlas grows the charts, from better seeds each time; most of its time."""
 
@@ -66,7 +69,7 @@ class UnwrappedMesh:
 
 
 def unwrap(mesh: Mesh, resolution: int) -> UnwrappedMesh:
-    """The mesh with one set of texture coordinates without overlaps.
+    """The mesh with one set of texture coordinates without overlaps, of few charts that fill the texture.
 
     Args:
         resolution: Side of the texture [texels].
@@ -74,24 +77,73 @@ def unwrap(mesh: Mesh, resolution: int) -> UnwrappedMesh:
     Raises:
         ValueError: The surface is in too many pieces for a texture.
     """
+    charts = _charts(mesh, resolution)
+    if charts.count > MAX_CHARTS:
+        return _unwrapped(mesh, charts.origin, charts.uv, charts.faces)
+    uv, faces, source = pack(charts.uv * charts.size, charts.faces, resolution)
+    return _unwrapped(mesh, charts.origin[source], uv, faces)
+
+
+def unwrap_loosely(mesh: Mesh, resolution: int) -> UnwrappedMesh:
+    """As `unwrap`, in two thirds of the time: xatlas places the charts, so that up to half of the texture is empty."""
+    charts = _charts(mesh, resolution)
+    return _unwrapped(mesh, charts.origin, charts.uv, charts.faces)
+
+
+@dataclass(frozen=True)
+class _Charts:
+    """The charts of a mesh as xatlas cuts, flattens and places them."""
+
+    count: int
+    origin: Int[np.ndarray, " w"]
+    """Vertex of the mesh that each vertex is."""
+    uv: Float[np.ndarray, "w 2"]
+    """glTF texture coordinates."""
+    faces: Int[np.ndarray, "f 3"]
+    size: tuple[int, int]
+    """Width and height of the texture for which they are placed [texels]."""
+
+
+def _charts(mesh: Mesh, resolution: int) -> _Charts:
     import xatlas
 
-    normals = vertex_normals(mesh)
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), normals.astype(np.float32))
+    atlas, normals, parts = xatlas.Atlas(), vertex_normals(mesh), []
+    for part in _halved(mesh.vertices[mesh.faces].mean(1), np.arange(len(mesh.faces))):
+        used, local = np.unique(mesh.faces[part], return_inverse=True)
+        parts.append((part, used))
+        triangles = local.reshape(-1, 3).astype(np.uint32)
+        atlas.add_mesh(mesh.vertices[used].astype(np.float32), triangles, normals[used].astype(np.float32))
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_cost, charts.max_iterations, charts.fix_winding = MAX_COST, ITERATIONS, True
     packing.resolution, packing.padding, packing.bilinear = resolution, GAP * CELL, True
     packing.rotate_charts = False
     atlas.generate(charts, packing)
-    origin, faces, uv = atlas[0]
+    origin, uv, faces, first = [], [], np.empty_like(mesh.faces), 0
+    for i, (part, used) in enumerate(parts):
+        of_vertex, triangles, coordinates = atlas[i]
+        origin.append(used[of_vertex])
+        uv.append(coordinates.astype(np.float64))
+        faces[part] = triangles.astype(np.int64).reshape(-1, 3) + first
+        first += len(of_vertex)
     # The v of xatlas points up (its charts are counterclockwise), that of glTF down.
-    faces = faces.astype(np.int64).reshape(-1, 3)
-    uv = np.stack([uv[:, 0], 1 - uv[:, 1]], 1).astype(np.float64)
-    if atlas.chart_count <= MAX_CHARTS:
-        uv, faces, source = pack(uv * [atlas.width, atlas.height], faces, resolution)
-        origin = origin[source]
-    vertices, normals = mesh.vertices[origin], normals[origin]
+    uv = np.concatenate(uv) * [1, -1] + [0, 1]
+    return _Charts(atlas.chart_count, np.concatenate(origin), uv, faces, (atlas.width, atlas.height))
+
+
+def _halved(centres: Float[np.ndarray, "f 3"], part: Int[np.ndarray, " p"]) -> list[Int[np.ndarray, " _"]]:
+    """The triangles, given by their centres, halved along their longest axis until parts have at most `MAX_PART`."""
+    if len(part) <= MAX_PART:
+        return [part]
+    relative = centres[part] - centres[part].mean(0)
+    along = relative @ np.linalg.svd(relative, full_matrices=False)[2][0]
+    upper = along > np.median(along)
+    return [piece for side in (~upper, upper) for piece in _halved(centres, part[side])]
+
+
+def _unwrapped(
+    mesh: Mesh, origin: Int[np.ndarray, " w"], uv: Float[np.ndarray, "w 2"], faces: Int[np.ndarray, "f 3"]
+) -> UnwrappedMesh:
+    vertices, normals = mesh.vertices[origin], vertex_normals(mesh)[origin]
     return UnwrappedMesh(vertices, normals, _tangents(vertices, normals, uv, faces), uv, faces)
 
 
@@ -211,8 +263,10 @@ def _placed(
 ) -> tuple[float, int, int, _Shape]:
     """The best position of the chart rotated by a part of a turn (see `_best_position`), and its shape."""
     shape = _rasterized(chart, 2 * math.pi * turn)
-    place = _best_position(spectra, shape.cells, n) if max(shape.cells.shape) <= n else (-math.inf, 0, 0)
-    return *place, shape
+    if max(shape.cells.shape) > n:
+        return -math.inf, 0, 0, shape
+    value, row, column = _best_position(spectra, shape.cells, n)
+    return value, row, column, shape
 
 
 def _rasterized(chart: Float[np.ndarray, "f 3 2"], angle: float) -> _Shape:

@@ -66,12 +66,14 @@ def signed_distances(
     camera = Camera(camera.fx_fy_cx_cy.to(means), pixels, pixels)
     poses = SE3(poses.wxyz.to(means), poses.xyz.to(means))
     cell, backs, centres = 2 * HALF_SIDE / cells, _flipped(gaussians), camera.pixel_centers().to(means)
+    # Whether a hole shows backs is a matter of larger regions than pixels.
+    small, rows = camera.resized(-(-pixels // 2), -(-pixels // 2)), torch.arange(pixels, device=means.device) // 2
     index, planes = means.new_empty(views, pixels, pixels, dtype=torch.int32), [means.new_zeros(0, 5)]
     near = torch.zeros((cells + 1,) * 3, dtype=torch.bool, device=means.device)
     for i in range(views):
         view = rasterize(gaussians, gamma, poses[i], camera, {})
         known, x_obj = _surface(view, poses[i], camera, centres, 2 * cell)
-        back = rasterize(backs, gamma, poses[i], camera, {}).alpha
+        back = rasterize(backs, gamma, poses[i], small, {}).alpha[rows[:, None], rows]
         index[i] = _plane_index(view, known, back, sum(map(len, planes)))
         planes.append(_planes(view, known, x_obj))
         at = ((x_obj + HALF_SIDE) / cell).round().long().clamp(0, cells)

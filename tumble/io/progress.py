@@ -2,7 +2,8 @@
 
 On a terminal a task is one live line with a bar. Elsewhere it is a line in the log `tumble` of Python's `logging` when
 it starts, and another every `LOG_SECONDS`. The command line prints this log; in Python nobody sees it unless asked for:
-`logging.basicConfig(level="INFO")`. Tasks do not contain each other.
+`logging.basicConfig(level="INFO")`. Tasks do not contain each other; those of threads beside the main one have
+no bar.
 """
 
 import contextlib
@@ -40,6 +41,9 @@ def task(name: str, total: int | None = None) -> Iterator[Update]:
         total: Number of steps, if it is known.
     """
     console, name = Console(stderr=True), one_line(name)
+    if console.is_terminal and threading.current_thread() is not threading.main_thread():
+        yield lambda step, describe: None
+        return
     with _bar(name, total, console) if console.is_terminal else _log_lines(name, total) as update:
         yield update
 

@@ -47,9 +47,16 @@ def rasterize_material(asset: HasMaterial, corners: Float[Tensor, "n 4 7"], T_ca
     return replace(view, normal=view.normal + view.features["material"][..., 4:])
 
 
-def render_gbuffer(asset: HasMaterial, T_cam_obj: SE3, camera: Camera) -> Buffers:
-    """G-buffer of one view with one sample at each pixel's centre; normals include the material's normal offset."""
-    view = rasterize_material(asset, corner_features(asset.material)[0], T_cam_obj, camera)
+def render_gbuffer(
+    asset: HasMaterial, T_cam_obj: SE3, camera: Camera, corners: Float[Tensor, "n 4 7"] | None = None
+) -> Buffers:
+    """G-buffer of one view with one sample at each pixel's centre; normals include the material's normal offset.
+
+    Args:
+        corners: `corner_features` of the material, if they are known.
+    """
+    corners = corner_features(asset.material)[0] if corners is None else corners
+    view = rasterize_material(asset, corners, T_cam_obj, camera)
     images = view.features["material"].split([3, 1, 3], -1)
     return replace(view, features=dict(zip(("albedo", "roughness", "offset"), images, strict=True)))
 
@@ -57,7 +64,7 @@ def render_gbuffer(asset: HasMaterial, T_cam_obj: SE3, camera: Camera) -> Buffer
 @torch.no_grad()
 def antialiased_gbuffer(asset: HasMaterial, T_cam_obj: SE3, camera: Camera) -> Buffers:
     """G-buffer of one view with four samples per pixel, for final images; not differentiable."""
-    views = []
+    views, corners = [], corner_features(asset.material)[0]
     for x, y in (
         (-SAMPLE_OFFSET, -SAMPLE_OFFSET),
         (SAMPLE_OFFSET, -SAMPLE_OFFSET),
@@ -65,7 +72,7 @@ def antialiased_gbuffer(asset: HasMaterial, T_cam_obj: SE3, camera: Camera) -> B
         (SAMPLE_OFFSET, SAMPLE_OFFSET),
     ):
         shifted = camera.fx_fy_cx_cy + camera.fx_fy_cx_cy.new_tensor([0.0, 0.0, x, y])
-        views.append(render_gbuffer(asset, T_cam_obj, Camera(shifted, camera.height, camera.width)))
+        views.append(render_gbuffer(asset, T_cam_obj, Camera(shifted, camera.height, camera.width), corners))
     alphas = torch.stack([view.alpha for view in views])
     coverage_weights = alphas / alphas.sum(0).clamp_min(torch.finfo(alphas.dtype).tiny)
 

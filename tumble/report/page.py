@@ -11,7 +11,8 @@ import json
 import math
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -104,10 +105,12 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
     with tempfile.TemporaryDirectory() as folder:
         asset = tree.to(asset, device)
-        glb = write_model(asset, Path(folder))
         quality = tracked.quality if tracked else None
         all_frames = AllFrames(full_capture, refined, hand_coloured)
-        build(asset, run_capture, glb, summary, quality, out / run.REPORT, all_frames=all_frames)
+        with ThreadPoolExecutor(1) as beside:
+            # The mesh is made by one thread most of the time.
+            model = beside.submit(write_model, asset, Path(folder))
+            build(asset, run_capture, model.result, summary, quality, out / run.REPORT, all_frames=all_frames)
     return out / run.REPORT
 
 
@@ -143,7 +146,7 @@ def write_model(asset: Asset, folder: Path) -> Path | None:
 def build(
     asset: Asset,
     capture: Capture,
-    glb: Path | None,
+    model: Callable[[], Path | None],
     summary: RunSummary,
     quality: PoseQuality | None,
     out: Path,
@@ -155,7 +158,7 @@ def build(
     Args:
         asset: Asset with material and light.
         capture: The asset's training frames, in the order of its trajectory.
-        glb: Mesh for the live view; without one the live view is left out.
+        model: Returns a GLB for the live view when it is needed; without one the live view is left out.
         quality: Quality of the poses, if they were estimated.
         all_frames: The frames of `capture` and those without a pose; None if all have one.
     """
@@ -172,6 +175,9 @@ def build(
     said = _what_to_record(told.sentence, quality, n_lost)
     progress.LOG.info(said)
     hero = figures.hero_image(scene, views[0])
+    comparisons = [figures.comparison(frame) for frame in sorted(selected, key=lambda frame: frame.number)]
+    maps, of_confidence = figures.material_maps(asset, views), figures.confidence_maps(asset, views, confidence)
+    glb = model()
     lights = {} if glb is None else _live_view_lights(asset, views[0])
     page = TEMPLATES.get_template("page.html").render(
         summary=summary,
@@ -181,8 +187,8 @@ def build(
         hero=figures.webp(hero),
         facts=_facts(asset, capture, summary),
         sections={key: title for key, title in SECTIONS.items() if glb is not None or key != "relight"},
-        comparisons=[figures.comparison(frame) for frame in sorted(selected, key=lambda frame: frame.number)],
-        maps=figures.material_maps(asset, views),
+        comparisons=comparisons,
+        maps=maps,
         panorama=figures.webp(figures.panorama(_environment(asset), 256)),
         light_caption=LIGHT_CAPTIONS[asset.trajectory.light],
         path=svg.globes(asset.trajectory.camera_positions.cpu().numpy()),
@@ -193,7 +199,7 @@ def build(
         n_frames=len(frames),
         rows=[(row, health_card.RATING_LABELS[row.rating], svg.bars(row.bars, row.marks)) for row in rows],
         worst=figures.worst_frames(worst_frames.worst_frames(all_frames or AllFrames(capture, capture), frames)),
-        confidence=figures.confidence_maps(asset, views, confidence),
+        confidence=of_confidence,
         timings=_timings(summary.records),
         configuration=_configuration(summary.recipe),
         version=__version__,

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 
 from tumble.maths import SE3
 from tumble.scene import Camera, Environment
@@ -89,6 +88,8 @@ def glb_images(
 
 def _continued(values: Float[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w c"]:
     """The map with pixels near the mask set to their nearest pixel in it."""
+    from scipy.ndimage import distance_transform_edt
+
     if not mask.any():
         return values
     found: Any = distance_transform_edt(~mask, return_indices=True)

@@ -21,7 +21,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(Fuse), sizeof(Blend), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(Fusion), sizeof(Baking), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -127,9 +127,9 @@ API void relight_points(const Relight* s) {
     parallel(s->threads, [=](int share) { relight_share(*s, share); });
 }
 
-API void maps_fuse(const Fuse* s) {
+API void maps_fuse(const Fusion* s) {
     parallel(s->threads, [=](int share) { fuse_share(*s, share); });
 }
-API void maps_blend(const Blend* s) {
+API void maps_blend(const Baking* s) {
     parallel(s->threads, [=](int share) { blend_share(*s, share); });
 }

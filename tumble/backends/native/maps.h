@@ -3,7 +3,7 @@
 #pragma once
 #include "simd.h"
 
-struct Fuse {
+struct Fusion {
     const float* points;              // n x 3
     const float *R, *t, *positions;   // object to camera, and positions of the cameras, by view
     const int* index;                 // of each view's pixels: row of `planes`, -1 unknown, -2 free space
@@ -23,7 +23,7 @@ struct FuseBlock {
 };
 
 // Depths of the points in a view, and rows of their planes, which are on their way into the cache then.
-INLINE void find_planes(const Fuse& s, int view, int count, FuseBlock& block) {
+INLINE void find_planes(const Fusion& s, int view, int count, FuseBlock& block) {
     const float *R = s.R + 9 * view, *t = s.t + 3 * view;
     const int* index = s.index + (i64)view * s.height * s.width;
     for (int j = 0; j < count; j += LANES) {
@@ -42,7 +42,7 @@ INLINE void find_planes(const Fuse& s, int view, int count, FuseBlock& block) {
     }
 }
 
-INLINE void fuse_view(const Fuse& s, int view, int count, FuseBlock& block) {
+INLINE void fuse_view(const Fusion& s, int view, int count, FuseBlock& block) {
     const float* c = s.positions + 3 * view;
     for (int j = 0; j < count; j += LANES) {
         vf x[3] = {load(block.x[0] + j), load(block.x[1] + j), load(block.x[2] + j)}, plane[5];
@@ -72,7 +72,7 @@ INLINE void fuse_view(const Fuse& s, int view, int count, FuseBlock& block) {
     }
 }
 
-static void fuse_share(const Fuse& s, int share) {
+static void fuse_share(const Fusion& s, int share) {
     FuseBlock block;
     i64 end = (i64)s.n * (share + 1) / s.threads;
     for (i64 first = (i64)s.n * share / s.threads; first < end; first += FUSED_AT_ONCE) {
@@ -89,7 +89,7 @@ static void fuse_share(const Fuse& s, int share) {
 
 enum { BLENDED = 7, MAPS = BLENDED + 2 };
 
-struct Blend {
+struct Baking {
     const float* maps;                  // height x width x MAPS: values, depth, and 1 in pixels that show a surface; else 0
     const float *points, *normals;      // n x 3
     const float *R, *t, *position;
@@ -98,7 +98,7 @@ struct Blend {
     float *total, *weights;             // n x BLENDED and n, to which is added
 };
 
-static void blend_share(const Blend& s, int share) {
+static void blend_share(const Baking& s, int share) {
     i64 end = (i64)s.n * (share + 1) / s.threads;
     for (i64 i = (i64)s.n * share / s.threads; i < end; i++) {
         const float *x = s.points + 3 * i, *n = s.normals + 3 * i, *R = s.R, *c = s.position;
