@@ -700,3 +700,41 @@ def test_constants_that_the_kernels_repeat_are_those_of_the_package() -> None:
 
 def test_float64_is_rendered_by_the_reference() -> None:
     assert backends.choose(CPU, torch.float64) is reference
+
+
+def test_activations_and_their_gradients_are_those_of_the_reference(backend: backends.Backend) -> None:
+    rng = torch.Generator().manual_seed(0)
+    n = 333
+    inputs = [2 * torch.randn(n, 3, generator=rng) - 3, 0.1 * torch.randn(n, generator=rng), torch.tensor(30.0)]
+    seeds = torch.randn(n, 3, generator=rng), torch.randn(n, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        results = by.activate(*x)
+        return [*results, *torch.autograd.grad(results, x, [y.to(dtype) for y in seeds])]
+
+    _compare(backend, run)
+    x = [y[:4].double() if y.ndim else y.double() for y in inputs]
+    assert torch.autograd.gradcheck(lambda *y: reference.activate(*y), [y.requires_grad_() for y in x])
+
+
+@pytest.mark.parametrize("count", [1, 50])
+def test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none(
+    backend: backends.Backend, count: int
+) -> None:
+    rng = torch.Generator().manual_seed(count)
+    shapes = (), (7, 3), (40, 4, 3), (0, 3)
+    values = [[torch.rand(shape, generator=rng) for _ in range(4)] for shape in shapes]
+
+    def run(by: backends.Backend, dtype: torch.dtype, broken: float = 0.0) -> list[torch.Tensor]:
+        leaves = [backends.Leaf(*(x.to(dtype, copy=True) for x in each), 0.1, count) for each in values]
+        leaves[2].gradient[3, 1, 2] += broken
+        assert by.adam(leaves, 0.9, 0.999, 1e-15) == math.isfinite(broken)
+        return [x for leaf in leaves for x in (leaf.value, leaf.first, leaf.second)]
+
+    _compare(backend, run)
+    for broken in (math.nan, math.inf, -math.inf):
+        unchanged = run(backend, torch.float32, broken)
+        assert all(
+            torch.equal(a, b) for a, b in zip(unchanged, [x for v in values for x in (v[0], *v[2:])], strict=True)
+        )

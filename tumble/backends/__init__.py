@@ -37,6 +37,7 @@ from tumble.backends._contract import (
     Backend,
     GlossyGaussians,
     Hits,
+    Leaf,
     LightTables,
     Lobes,
     RelightKernel,
@@ -55,6 +56,7 @@ __all__ = [
     "NEAR",
     "IRRADIANCE_FLOOR",
     "KNEE",
+    "Leaf",
     "LightTables",
     "Lobes",
     "NEAR_SIGMAS",
@@ -193,6 +195,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")))
 
 
+@cache
 def load(name: str) -> Backend:
     """The backend with the given name, imported."""
     return cast(Backend, importlib.import_module(f"{__name__}.{name}"))

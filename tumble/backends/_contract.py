@@ -3,6 +3,7 @@
 Vocabulary and conventions are those of `tumble.backends`, whose constants appear here in capitals.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -54,6 +55,21 @@ class Lobes(NamedTuple):
     """Of the specular lobe with reflectance 1 at normal incidence."""
     specular_visibility: Float[Tensor, " p"]
     """Visible fraction of the specular lobe. Not differentiable."""
+
+
+class Leaf(NamedTuple):
+    """A parameter that `Backend.adam` moves, in place; its tensors are contiguous and have one shape."""
+
+    value: Tensor
+    gradient: Tensor
+    first: Tensor
+    """Running mean of the gradient."""
+    second: Tensor
+    """Running mean of the gradient's square."""
+    rate: float
+    """Learning rate."""
+    count: int
+    """Number of steps, this one included."""
 
 
 @runtime_checkable
@@ -281,8 +297,9 @@ class Backend(Protocol):
         fx_fy_cx_cy: Float[Tensor, "4"],
         ssim_weight: float,
         crease: float,
+        weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
     ) -> Float[Tensor, "4"]:
-        """Loss terms of a rendered view (`Rendering`) against a photo, each a mean over the image.
+        """Weighted loss terms of a rendered view (`Rendering`) against a photo, each a mean over the image.
 
         0. `(1 - w) |x - y| + w (1 - SSIM(x, y))`, w = ssim_weight, with x the rendering in sRGB and y the photo, both
            black where the mask is UNKNOWN; SSIM is averaged over windows within the image. Where the photo is SATURATED
@@ -308,6 +325,7 @@ class Backend(Protocol):
             fx_fy_cx_cy: Focal lengths and principal point [pixels].
             ssim_weight: Weight of SSIM in the first term, 0 to 1.
             crease: Saturation of the third term.
+            weights: Factors of the terms.
         """
         ...
 
@@ -325,8 +343,9 @@ class Backend(Protocol):
         fx_fy_cx_cy: Float[Tensor, "4"],
         floor: float,
         reach: float,
+        weights: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> Float[Tensor, "3"]:
-        """Loss terms of the Gaussians.
+        """Weighted loss terms of the Gaussians.
 
         0. Mean of `max(0, -log(max(1e-4, exp(H) - 1)))`, with H the entropy of the squared scales divided by their sum,
            plus the mean third scale. Differentiable in log_scales.
@@ -350,6 +369,26 @@ class Backend(Protocol):
             fx_fy_cx_cy: Focal lengths and principal point [pixels].
             floor: Lower limit of the median distance.
             reach: Limit of the depth difference.
+            weights: Factors of the terms.
+        """
+        ...
+
+    def activate(
+        self, log_scales: Float[Tensor, "n 3"], sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+        """Standard deviations `exp(log_scales)` and opacities `4 s (1 - s)`, s = sigmoid(-gamma sdf), of Gaussians.
+
+        Differentiable in all arguments.
+        """
+        ...
+
+    def adam(self, leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+        """One step of Adam (Kingma and Ba 2015) on all leaves at once, unless a gradient is not finite.
+
+        With bias-corrected moments m and v, a value moves by -rate m / (sqrt(v) + eps).
+
+        Returns:
+            Whether all gradients were finite; if not, nothing was changed. A host waits for this of a GPU.
         """
         ...
 

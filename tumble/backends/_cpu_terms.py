@@ -2,6 +2,7 @@
 
 import ctypes
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -18,11 +19,15 @@ from tumble.backends import (
     SSIM_SIGMA,
     SSIM_STABILISERS,
     SSIM_WINDOW,
+    Leaf,
     _native,
     threads,
 )
 from tumble.backends._structs import (
     Activation,
+    AdamLeaf,
+    AdamStep,
+    GaussianActivation,
     GaussianTerms,
     Image,
     Indirect,
@@ -115,10 +120,11 @@ def image_terms(
     fx_fy_cx_cy: Float[Tensor, "4"],
     ssim_weight: float,
     crease: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
 ) -> Float[Tensor, "4"]:
     """See `Backend.image_terms`."""
     inputs = (rgb, alpha, depth, depth_var, normal, R_cam_obj)
-    return _ImageTermsFunction.apply(*inputs, photo, mask, fx_fy_cx_cy, ssim_weight, crease)
+    return _ImageTermsFunction.apply(*inputs, photo, mask, fx_fy_cx_cy, ssim_weight, crease, weights)
 
 
 _IMAGE_INPUTS: tuple[str, ...] = ("rgb", "alpha", "depth", "depth_var", "normal", "R")
@@ -132,7 +138,7 @@ class _ImageTermsFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:
-        *tensors, ssim_weight, crease = args
+        *tensors, ssim_weight, crease, weights = args
         tensors = [x.contiguous() for x in tensors]
         (height, width), lanes = tensors[1].shape, _native.library().lanes()
         plane_size = (height + SSIM_WINDOW) * (width + SSIM_WINDOW + 2 * lanes)
@@ -147,6 +153,7 @@ class _ImageTermsFunction(torch.autograd.Function):
             knee=KNEE,
             c1=SSIM_STABILISERS[0],
             c2=SSIM_STABILISERS[1],
+            weights=(ctypes.c_float * 4)(*weights),
         )
         terms, gradients = torch.empty(4), [torch.empty_like(x) for x in tensors[:6]]
         named = dict(zip((*_IMAGE_INPUTS, "photo", "mask", "focal"), tensors, strict=True))
@@ -164,9 +171,11 @@ class _ImageTermsFunction(torch.autograd.Function):
 
 def _scaled(ctx: Any, v_terms: Tensor, term: tuple[int, ...]) -> tuple[Tensor | None, ...]:
     """Gradients of the inputs: the saved ones times that of the term to which each belongs; None for other inputs."""
-    v, needed = v_terms.unbind(), ctx.needs_input_grad
+    v, needed = v_terms.tolist(), ctx.needs_input_grad
     gradients = zip(ctx.saved_tensors, term, needed[: len(term)], strict=True)
-    return (*(v[k] * x if need else None for x, k, need in gradients), *(None for _ in needed[len(term) :]))
+    # In training every term counts once.
+    scaled = ((x if v[k] == 1 else v[k] * x) if need else None for x, k, need in gradients)
+    return (*scaled, *(None for _ in needed[len(term) :]))
 
 
 @cache
@@ -189,10 +198,11 @@ def gaussian_terms(
     fx_fy_cx_cy: Float[Tensor, "4"],
     floor: float,
     reach: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Float[Tensor, "3"]:
     """See `Backend.gaussian_terms`."""
     inputs = (means, quats, log_scales, sdf, gamma, R_cam_obj, t_cam_obj)
-    return _GaussianTermsFunction.apply(*inputs, weight, depth, fx_fy_cx_cy, floor, reach)
+    return _GaussianTermsFunction.apply(*inputs, weight, depth, fx_fy_cx_cy, floor, reach, weights)
 
 
 _GAUSSIAN_INPUTS: tuple[str, ...] = ("means", "quats", "log_scales", "sdf", "gamma", "R", "t")
@@ -206,11 +216,12 @@ class _GaussianTermsFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:
-        *tensors, floor, reach = args
+        *tensors, floor, reach, weights = args
         tensors = [x.detach().contiguous() for x in tensors]
         named = dict(zip((*_GAUSSIAN_INPUTS, "weight", "depth", "focal"), tensors, strict=True))
         n, (height, width) = len(named["means"]), named["depth"].shape
         struct = GaussianTerms(n=n, height=height, width=width, threads=threads(), floor=floor, reach=reach)
+        struct.weights = (ctypes.c_float * 3)(*weights)
         terms, gradients = torch.empty(3), [torch.empty_like(x) for x in tensors[:5]]
         gradients += [torch.zeros(3, 3), torch.zeros(3)]
         kept = set_pointers(struct, named, terms=terms, magnitudes=torch.empty(n, dtype=torch.int32))
@@ -338,3 +349,56 @@ class _MaterialTermsFunction(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         return _scaled(ctx, v_terms, _MATERIAL_TERM)
+
+
+def activate(
+    log_scales: Float[Tensor, "n 3"], sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """See `Backend.activate`."""
+    return _ActivateFunction.apply(log_scales, sdf, gamma)
+
+
+class _ActivateFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> tuple[Tensor, Tensor]:
+        inputs = [x.contiguous() for x in args]
+        results = torch.empty_like(inputs[0]), torch.empty_like(inputs[1])
+        struct, kept = _activation_launch((*inputs, *results))
+        _native.library().activation_forward(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*inputs, *results)
+        return results
+
+    @staticmethod
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+        v_log_scales, v_sdf, parts = (*(torch.empty_like(x) for x in ctx.saved_tensors[:2]), torch.empty(threads()))
+        v_scales, v_opacity = (v.contiguous() for v in v_results)
+        more = {"v_scales": v_scales, "v_opacity": v_opacity, "v_log_scales": v_log_scales, "v_sdf": v_sdf}
+        struct, kept = _activation_launch(ctx.saved_tensors, parts=parts, **more)
+        _native.library().activation_adjoint(ctypes.byref(struct))
+        del kept
+        return v_log_scales, v_sdf, parts.sum()
+
+
+def _activation_launch(tensors: Any, **more: Tensor) -> tuple[GaussianActivation, list[Tensor]]:
+    """Arguments of the activation of Gaussians, and the tensors that they point to."""
+    struct = GaussianActivation(n=len(tensors[1]), threads=threads())
+    return struct, set_pointers(struct, dict(zip(_ACTIVATION, tensors, strict=True)), **more)
+
+
+_ACTIVATION = ("log_scales", "sdf", "gamma", "scales", "opacity")
+"""Arguments and results of `activate` by their names in `native/parameters.h`."""
+
+
+@torch.no_grad()
+def adam(leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+    """See `Backend.adam`."""
+    rows = []
+    for leaf in leaves:
+        corrections = leaf.rate / (1 - beta_1**leaf.count), math.sqrt(1 - beta_2**leaf.count)
+        rows.append((*(x.data_ptr() for x in leaf[:4]), leaf.value.numel(), *corrections))
+    rates = {"beta_2": beta_2, "rest_1": 1 - beta_1, "rest_2": 1 - beta_2, "eps": eps}
+    struct = AdamStep(n_leaves=len(rows), threads=threads(), **rates)
+    array = (AdamLeaf * len(rows))(*rows)
+    struct.leaves = ctypes.addressof(array)
+    return bool(_native.library().adam(ctypes.byref(struct)))

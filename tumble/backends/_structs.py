@@ -99,6 +99,7 @@ class Image(ctypes.Structure):
         *_pointers("rgb alpha depth depth_var normal photo mask R focal taps"),
         *_ints("height width plane_size threads"),
         *_floats("ssim_weight crease saturated knee c1 c2"),
+        ("weights", ctypes.c_float * 4),
         *_pointers("scratch terms g_rgb g_alpha g_depth g_depth_var g_normal g_R"),
     ]
 
@@ -110,6 +111,7 @@ class GaussianTerms(ctypes.Structure):
         *_pointers("means quats log_scales sdf gamma weight depth R t focal"),
         *_ints("n height width threads"),
         *_floats("floor reach"),
+        ("weights", ctypes.c_float * 3),
         *_pointers("magnitudes terms g_means g_quats g_log_scales g_sdf g_gamma g_R g_t"),
     ]
 
@@ -170,9 +172,31 @@ class Relight(ctypes.Structure):
     ]
 
 
+class GaussianActivation(ctypes.Structure):
+    """`GaussianActivation` of `native/parameters.h`: arguments of the activation of Gaussians."""
+
+    _fields_ = [
+        *_pointers("log_scales sdf gamma"),
+        *_ints("n threads"),
+        *_pointers("scales opacity v_scales v_opacity v_log_scales v_sdf parts"),
+    ]
+
+
+class AdamLeaf(ctypes.Structure):
+    """`AdamLeaf` of `native/parameters.h`: a leaf of the optimizer."""
+
+    _fields_ = [*_pointers("value gradient first second"), ("n", ctypes.c_longlong), *_floats("rate root_correction")]
+
+
+class AdamStep(ctypes.Structure):
+    """`AdamStep` of `native/parameters.h`: arguments of the optimizer's step."""
+
+    _fields_ = [*_pointers("leaves"), *_ints("n_leaves threads"), *_floats("beta_2 rest_1 rest_2 eps")]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
-    *(Lookup, Activation, Indirect, MaterialImage, Relight),
+    *(Lookup, Activation, Indirect, MaterialImage, Relight, GaussianActivation, AdamLeaf, AdamStep),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

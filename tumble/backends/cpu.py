@@ -32,6 +32,8 @@ from tumble.backends import (
     threads,
 )
 from tumble.backends._cpu_terms import (
+    activate,
+    adam,
     bounce,
     corner_features,
     gaussian_terms,
@@ -42,6 +44,8 @@ from tumble.backends._cpu_terms import (
 from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
+    "activate",
+    "adam",
     "blockers",
     "bounce",
     "build",

@@ -16,6 +16,8 @@ from torch.nn.functional import pad
 
 from tumble.backends import Hits, Lobes, Rendering
 from tumble.backends.reference import (
+    activate,
+    adam,
     bounce,
     corner_features,
     gaussian_terms,
@@ -26,6 +28,8 @@ from tumble.backends.reference import (
 )
 
 __all__ = [
+    "activate",
+    "adam",
     "blockers",
     "bounce",
     "build",

@@ -5,6 +5,7 @@ frame, `W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -31,12 +32,15 @@ from tumble.backends import (
     SSIM_WINDOW,
     T_MIN,
     UNKNOWN,
+    Leaf,
     Lobes,
     Rendering,
 )
 from tumble.backends._brute import blockers, build, rotation, trace, unpack, visible
 
 __all__ = [
+    "activate",
+    "adam",
     "blockers",
     "bounce",
     "build",
@@ -416,6 +420,7 @@ def image_terms(
     fx_fy_cx_cy: Float[Tensor, "4"],
     ssim_weight: float,
     crease: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
 ) -> Float[Tensor, "4"]:
     """See `Backend.image_terms`."""
     known, image = (mask != UNKNOWN).to(rgb), photo.to(rgb) / 255
@@ -426,9 +431,9 @@ def image_terms(
     photometric = (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - similarity(x, y)).mean()
     silhouette = ((alpha - (mask == OBJECT).to(rgb)) ** 2 * known).mean()
     deviation = torch.where(alpha > 0, (depth_var.clamp(min=0) + 1e-6).sqrt() - 1e-3, 0).mean()
-    return torch.stack(
-        [photometric, silhouette, _normal_term(depth, alpha, normal, R_cam_obj, fx_fy_cx_cy, crease), deviation]
-    )
+    consistency = _normal_term(depth, alpha, normal, R_cam_obj, fx_fy_cx_cy, crease)
+    terms = (photometric, silhouette, consistency, deviation)
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
 
 
 def similarity(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 h-10 w-10"]:
@@ -486,6 +491,7 @@ def gaussian_terms(
     fx_fy_cx_cy: Float[Tensor, "4"],
     floor: float,
     reach: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Float[Tensor, "3"]:
     """See `Backend.gaussian_terms`."""
     if not len(means):
@@ -504,7 +510,29 @@ def gaussian_terms(
         inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
         surface = torch.where(inlier, surface, 0)  # NaN behind the camera would reach the gradients
     difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)
-    return torch.stack([needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference])
+    terms = (needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference)
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
+
+
+def activate(
+    log_scales: Float[Tensor, "n 3"], sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """See `Backend.activate`."""
+    inside = torch.sigmoid(-gamma * sdf)
+    return log_scales.exp(), 4 * inside * (1 - inside)
+
+
+@torch.no_grad()
+def adam(leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+    """See `Backend.adam`."""
+    if not all(bool(leaf.gradient.isfinite().all()) for leaf in leaves):
+        return False
+    for leaf in leaves:
+        leaf.first.lerp_(leaf.gradient, 1 - beta_1)
+        leaf.second.mul_(beta_2).addcmul_(leaf.gradient, leaf.gradient, value=1 - beta_2)
+        root = leaf.second.sqrt() / math.sqrt(1 - beta_2**leaf.count) + eps
+        leaf.value.addcdiv_(leaf.first, root, value=-leaf.rate / (1 - beta_1**leaf.count))
+    return True
 
 
 def corner_features(

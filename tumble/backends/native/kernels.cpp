@@ -7,6 +7,7 @@
 #include "lookup.h"
 #include "material.h"
 #include "parallel.h"
+#include "parameters.h"
 #include "project.h"
 #include "relight.h"
 #include "sh_shade.h"
@@ -20,7 +21,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -113,6 +114,14 @@ API void sh_shade_adjoint(const ShShade* s) {
     sh_light(*s, light);
     parallel(s->threads, [=, &light](int share) { sh_shade_adjoint_share(*s, light, share); });
 }
+
+API void activation_forward(const GaussianActivation* s) {
+    parallel(s->threads, [=](int share) { gaussian_activation_share(*s, share); });
+}
+API void activation_adjoint(const GaussianActivation* s) {
+    parallel(s->threads, [=](int share) { gaussian_activation_adjoint_share(*s, share); });
+}
+API int adam(const AdamStep* s) { return adam_step(*s); }
 
 API void image_loss(const Image* m) { image_terms(*m); }
 API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
