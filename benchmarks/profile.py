@@ -42,7 +42,7 @@ PARTS: dict[str, dict[str, list[tuple[Any, str]]]] = {
     },
     "decompose": {
         "render": [(decompose, "corner_features"), (decompose, "rasterize_material")],
-        "colour": [(decompose, "_bounce"), (decompose, "_shade")],
+        "colour": [(decompose, "_render_term")],
         "losses": [(losses, "light_smoothness"), (losses, "material_terms")],
         "backward": [(torch.autograd, "grad")],
         "optimizer": [(optim.Adam, "step")],

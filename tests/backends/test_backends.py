@@ -738,3 +738,38 @@ def test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_
         assert all(
             torch.equal(a, b) for a, b in zip(unchanged, [x for v in values for x in (v[0], *v[2:])], strict=True)
         )
+
+
+@pytest.mark.parametrize(("n", "d", "p"), [(60, 100, 70), (0, 48, 17)])
+def test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference(
+    backend: backends.Backend, n: int, d: int, p: int
+) -> None:
+    rng = torch.Generator().manual_seed(p)
+    height, width = 12, 15
+    R, _, focal = (x.float() for x in cases.camera(height, width))
+    R_env = cases.camera(9, 9)[0].float().T
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=rng)
+
+    # Normals towards the camera, but for some at the rim; a roughness on both sides of every limit.
+    normal = -R[2] + 0.8 * (rand(height, width, 3) - 0.5)
+    features = torch.cat([rand(height, width, 3), 0.7 * rand(height, width, 1), 0.2 * rand(height, width, 3)], -1)
+    stack = _stack(5, 8, 1)[0] ** 3
+    moving = [features, 0.5 + 0.5 * rand(height, width), normal, stack, rand(n, 3), rand(3), R, R_env]
+    dominant = torch.randint(-1, 60, (height, width), generator=rng).int()
+    photo = torch.randint(0, 256, (height, width, 3), generator=rng).to(torch.uint8)
+    pixels = torch.randint(-20, height * width, (p,), generator=rng)
+    visibility = _brute.pack(rand(60, d) > 0.3)
+    blocker = torch.randint(-1, n, (60, d), generator=rng).int() if n else torch.full((1, 1), -1).int()
+    directions, transfer, table = cases.fibonacci(d).float(), 0.3 + 0.2 * rand(n, 9), rand(16, 16)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in moving]
+        constant = [y.to(dtype) for y in (directions, transfer, table, focal)]
+        view = backends.ShadedPixels(*x[:3], dominant, photo, pixels)
+        light = backends.ShadingLight(x[3], constant[0], visibility, blocker, x[4], *constant[1:3])
+        term = by.shading_term(view, light, x[6], x[7], constant[3], x[5])
+        return [term[None], *torch.autograd.grad(3 * term, x, materialize_grads=True)]
+
+    _compare(backend, run)

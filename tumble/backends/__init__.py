@@ -42,6 +42,8 @@ from tumble.backends._contract import (
     Lobes,
     RelightKernel,
     Rendering,
+    ShadedPixels,
+    ShadingLight,
     SurfaceSamples,
 )
 
@@ -53,6 +55,7 @@ __all__ = [
     "FACING",
     "GlossyGaussians",
     "Hits",
+    "NARROW_ROUGHNESS",
     "NEAR",
     "IRRADIANCE_FLOOR",
     "KNEE",
@@ -70,6 +73,8 @@ __all__ = [
     "SSIM_SIGMA",
     "SSIM_STABILISERS",
     "SSIM_WINDOW",
+    "ShadedPixels",
+    "ShadingLight",
     "SurfaceSamples",
     "TRACE_SIGMAS",
     "TRACE_T_MIN",
@@ -111,6 +116,9 @@ VISIBLE = 0.5
 """Minimum transmittance at which a direction is visible from a point."""
 ROUGHNESS_MIN = 0.05
 """Lower limit of the roughness used for shading; narrower lobes would fall between the sampled directions."""
+NARROW_ROUGHNESS = (0.3, 0.45)
+"""Range of roughness over which shading blends from the prefiltered lobe to the sum over directions; below it, a few
+hundred directions cannot resolve the lobe."""
 NORMAL_GRADIENT = 0.3
 """Factor of the gradient from `sh_shade` to the normals: the low-order light causes errors in the full gradient."""
 IRRADIANCE_FLOOR = 0.03

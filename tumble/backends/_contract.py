@@ -57,6 +57,37 @@ class Lobes(NamedTuple):
     """Visible fraction of the specular lobe. Not differentiable."""
 
 
+class ShadedPixels(NamedTuple):
+    """A view with the material of `Backend.corner_features`, and the pixels that `Backend.shading_term` shades."""
+
+    features: Float[Tensor, "h w 7"]
+    """Albedo, roughness and normal offset."""
+    alpha: Float[Tensor, "h w"]
+    normal: Float[Tensor, "h w 3"]
+    """Outward normals of any length, object frame, without the offset."""
+    dominant: Int32[Tensor, "h w"]
+    """Row of visibility and blockers of each pixel; a negative one counts as 0."""
+    photo: UInt8[Tensor, "h w 3"]
+    """Input image, sRGB."""
+    pixels: Int64[Tensor, " p"]
+    """Indices of the pixels, counted row by row; a negative one adds nothing to the sum."""
+
+
+class ShadingLight(NamedTuple):
+    """Light and occlusion of `Backend.shading_term`, with arguments of `lookup`, `shade` and `bounce`."""
+
+    stack: Float[Tensor, "levels map_h map_w 3"]
+    directions: Float[Tensor, "d 3"]
+    """Evenly distributed unit directions, object frame."""
+    visibility: Int32[Tensor, "q words"]
+    blocker: Int32[Tensor, "#q #d"]
+    albedo: Float[Tensor, "n 3"]
+    """Albedo of all Gaussians; none (n = 0) for black blockers."""
+    transfer: Float[Tensor, "n 9"]
+    table: Float[Tensor, "size size"]
+    """Directional albedo of the specular lobe divided by f0, by n.v (0 to 1) and roughness (ROUGHNESS_MIN to 1)."""
+
+
 class Leaf(NamedTuple):
     """A parameter that `Backend.adam` moves, in place; its tensors are contiguous and have one shape."""
 
@@ -423,6 +454,36 @@ class Backend(Protocol):
             transfer: Transfer vectors from light to shadowed irradiance.
             directions: Evenly distributed unit directions.
             radiance: Light from these directions.
+        """
+        ...
+
+    def shading_term(
+        self,
+        view: ShadedPixels,
+        light: ShadingLight,
+        R_cam_obj: Float[Tensor, "3 3"],
+        R_env_obj: Float[Tensor, "3 3"],
+        fx_fy_cx_cy: Float[Tensor, "4"],
+        f0: Float[Tensor, "3"],
+    ) -> Float[Tensor, ""]:
+        """Mean over pixels and channels of |x - y|, x = sRGB(alpha L), with the reflected radiance L, and y the photo.
+
+            L = albedo diffuse + f0 (s specular + (1 - s) specular_visibility G(n.v, roughness) S(m, roughness))
+
+        The lobes and specular_visibility are those of `shade` with the normal n = normalize(normal + offset), the
+        direction v to the camera, radiance S(w, d^(-1/4)) from the d directions w, and that of `bounce` from blockers.
+        m = 2 (n.v) n - v, S is `lookup` in the direction R_env_obj m, and G is bilinear in the table. s rises from 0 to
+        1 over NARROW_ROUGHNESS. Where the photo is SATURATED and x larger, x = y.
+
+        Differentiable in features, alpha, normal, stack, albedo of the Gaussians, f0, and both rotations.
+
+        Args:
+            view: View, photo and pixels.
+            light: Light and occlusion.
+            R_cam_obj: Rotation from object to camera.
+            R_env_obj: Rotation from the object frame to the env frame.
+            fx_fy_cx_cy: Focal lengths and principal point [pixels].
+            f0: Reflectance at normal incidence.
         """
         ...
 

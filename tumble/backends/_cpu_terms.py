@@ -13,13 +13,17 @@ from torch import Tensor
 from tumble.backends import (
     IRRADIANCE_FLOOR,
     KNEE,
+    NARROW_ROUGHNESS,
     NORMAL_GRADIENT,
     RATIO_MAX,
+    ROUGHNESS_MIN,
     SATURATED,
     SSIM_SIGMA,
     SSIM_STABILISERS,
     SSIM_WINDOW,
     Leaf,
+    ShadedPixels,
+    ShadingLight,
     _native,
     threads,
 )
@@ -32,6 +36,7 @@ from tumble.backends._structs import (
     Image,
     Indirect,
     MaterialImage,
+    ShadingTerm,
     ShShade,
     scratch,
     set_pointers,
@@ -39,6 +44,8 @@ from tumble.backends._structs import (
 
 PLANES = 11
 """Planes of scratch memory in `native/image.h` (per channel) and `native/material.h`."""
+POINT_SUMS = 22
+"""Numbers of a share of the points in `native/shading_term.h`."""
 LIGHT_SUMS = 109
 """Numbers of the gradient of light, specular scale, rotation and position in `native/sh_shade.h`."""
 
@@ -308,7 +315,7 @@ class _BounceFunction(torch.autograd.Function):
 
 def _bounce_launch(tensors: Any, **more: Tensor) -> tuple[Indirect, list[Tensor]]:
     """Arguments of indirect light, and the tensors that they point to."""
-    struct = Indirect(n=len(tensors[0]), n_directions=len(tensors[2]))
+    struct = Indirect(n=len(tensors[0]), n_directions=len(tensors[2]), threads=threads())
     named = dict(zip(("albedo", "transfer", "directions", "radiance"), tensors, strict=True))
     return struct, set_pointers(struct, named | more)
 
@@ -349,6 +356,74 @@ class _MaterialTermsFunction(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         return _scaled(ctx, v_terms, _MATERIAL_TERM)
+
+
+def shading_term(
+    view: ShadedPixels,
+    light: ShadingLight,
+    R_cam_obj: Float[Tensor, "3 3"],
+    R_env_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    f0: Float[Tensor, "3"],
+) -> Float[Tensor, ""]:
+    """See `Backend.shading_term`."""
+    moving = (view.features, view.alpha, view.normal, light.stack, light.albedo, f0, R_cam_obj, R_env_obj)
+    seen = (light.directions, light.visibility, light.blocker, light.transfer, light.table)
+    return _ShadingTermFunction.apply(*moving, view.dominant, view.photo, view.pixels, *seen, fx_fy_cx_cy)
+
+
+_SHADING_MOVING = ("features", "alpha", "normal", "stack", "albedo", "f0", "R_cam_obj", "R_env_obj")
+"""Differentiable arguments of `shading_term` by their names in `native/shading_term.h`."""
+_SHADING_REST = ("dominant", "photo", "pixels", "directions", "visibility", "blocker", "transfer", "table", "focal")
+"""The other arguments by these names."""
+
+
+class _ShadingTermFunction(torch.autograd.Function):
+    """The kernel computes value and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        tensors = [x.contiguous() for x in args]
+        named = dict(zip((*_SHADING_MOVING, *_SHADING_REST), tensors, strict=True))
+        gradients = [torch.empty_like(x) for x in tensors[: len(_SHADING_MOVING)]]
+        p, d, n, shares = len(named["pixels"]), len(named["directions"]), len(named["albedo"]), threads()
+        rows = torch.nn.functional.pad(named["directions"].T, (0, -d % _native.library().lanes())).contiguous()
+        stride, blocker, stack = rows.shape[1], named["blocker"], named["stack"]
+        struct = ShadingTerm(
+            n_points=p,
+            n_features=named["features"].shape[2],
+            width=named["alpha"].shape[1],
+            n_pixels=named["alpha"].numel(),
+            n_directions=d,
+            stride=stride,
+            words=named["visibility"].shape[1],
+            n_gaussians=n,
+            blocker_point_stride=blocker.stride(0) if blocker.shape[0] > 1 else 0,
+            blocker_direction_stride=blocker.stride(1) if blocker.shape[1] > 1 else 0,
+            levels=stack.shape[0],
+            map_height=stack.shape[1],
+            map_width=stack.shape[2],
+            table_size=len(named["table"]),
+            threads=shares,
+            cell=d**-0.25,
+            roughness_min=ROUGHNESS_MIN,
+            narrow_from=NARROW_ROUGHNESS[0],
+            narrow_to=NARROW_ROUGHNESS[1],
+            saturated=SATURATED,
+            knee=KNEE,
+        )
+        size = 43 * p + 14 * (d + p) + 3 * (2 + shares) * (stride + n) + 3 * d + POINT_SUMS * shares
+        term, of_points = torch.empty(()), torch.empty(p, dtype=torch.int64)
+        kept = set_pointers(struct, named, direction_rows=rows, rows=of_points, scratch=scratch(size), term=term)
+        kept += set_pointers(struct, dict(zip((f"g_{x}" for x in _SHADING_MOVING), gradients, strict=True)))
+        _native.library().shading_loss(ctypes.byref(struct))
+        del kept
+        ctx.save_for_backward(*gradients)
+        return term
+
+    @staticmethod
+    def backward(ctx: Any, v_term: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return _scaled(ctx, v_term[None], (0,) * len(_SHADING_MOVING))
 
 
 def activate(

@@ -142,7 +142,7 @@ class Indirect(ctypes.Structure):
 
     _fields_ = [
         *_pointers("albedo transfer directions radiance"),
-        *_ints("n n_directions"),
+        *_ints("n n_directions threads"),
         *_pointers("out v_out v_albedo v_radiance"),
     ]
 
@@ -194,9 +194,23 @@ class AdamStep(ctypes.Structure):
     _fields_ = [*_pointers("leaves"), *_ints("n_leaves threads"), *_floats("beta_2 rest_1 rest_2 eps")]
 
 
+class ShadingTerm(ctypes.Structure):
+    """`ShadingTerm` of `native/shading_term.h`: arguments of the photometric term of shaded pixels."""
+
+    _fields_ = [
+        *_pointers("features alpha normal photo pixels dominant R_cam_obj R_env_obj focal stack f0 albedo transfer"),
+        *_pointers("directions direction_rows visibility blocker table"),
+        *_ints("n_points n_features width n_pixels n_directions stride words n_gaussians"),
+        *_ints("blocker_point_stride blocker_direction_stride levels map_height map_width table_size threads"),
+        *_floats("cell roughness_min narrow_from narrow_to saturated knee"),
+        *_pointers("rows scratch term g_features g_alpha g_normal g_R_cam_obj g_R_env_obj g_stack g_f0 g_albedo"),
+    ]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
     *(Lookup, Activation, Indirect, MaterialImage, Relight, GaussianActivation, AdamLeaf, AdamStep),
+    ShadingTerm,
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

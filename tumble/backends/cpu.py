@@ -40,6 +40,7 @@ from tumble.backends._cpu_terms import (
     image_terms,
     material_terms,
     sh_shade,
+    shading_term,
 )
 from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
@@ -59,6 +60,7 @@ __all__ = [
     "relight",
     "sh_shade",
     "shade",
+    "shading_term",
     "trace",
     "visible",
 ]

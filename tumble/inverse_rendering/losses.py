@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy
 
@@ -125,6 +125,35 @@ def light_smoothness(texels: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Mean squared difference of neighbouring texels of an environment map, also across its seam (L_light, eq. 14)."""
     down, across = texels[1:] - texels[:-1], texels.roll(-1, 1) - texels
     return (down**2).mean() + (across**2).mean()
+
+
+def shading_term(
+    view: Buffers,
+    pixels: Int64[Tensor, " p"],
+    photo: UInt8[Tensor, "h w 3"],
+    camera: Camera,
+    T_cam_obj: SE3,
+    R_env_obj: Float[Tensor, "3 3"],
+    light: backends.ShadingLight,
+    f0: Float[Tensor, "3"],
+) -> Float[Tensor, ""]:
+    """Photometric term of stage 3: mean absolute difference between shaded pixels and input image, as in `shade_split`.
+
+    Args:
+        view: View by `rasterize_material`, with the feature "material".
+        pixels: Pixels to shade, counted row by row; negative ones do not count.
+        photo: Input image, sRGB.
+        camera: Intrinsics of the view.
+        T_cam_obj: Pose of the view.
+        R_env_obj: Rotation from the object frame to the env frame.
+        light: Light and occlusion.
+        f0: Reflectance at normal incidence.
+    """
+    shaded = backends.ShadedPixels(
+        view.features["material"], view.alpha, view.normal, view.dominant, photo.contiguous(), pixels
+    )
+    pose = (T_cam_obj.rotation.matrix(), R_env_obj, camera.fx_fy_cx_cy.to(view.alpha))
+    return backends.choose(view.alpha.device, view.alpha.dtype).shading_term(shaded, light, *pose, f0)
 
 
 def material_terms(

@@ -39,6 +39,11 @@ class Prefiltered:
     radiance: Float[Tensor, "H W 3"]
     """Linear radiance of the unfiltered light, which may have a higher resolution than the stack."""
 
+    @property
+    def is_finer(self) -> bool:
+        """Whether the unfiltered light has a higher resolution than the stack."""
+        return self.radiance.shape != self.stack.shape[1:]
+
     def lookup(self, d_env: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]) -> Float[Tensor, "p 3"]:
         """Prefiltered radiance in reflected unit directions: linear between levels, bilinear on the map.
 
@@ -46,7 +51,7 @@ class Prefiltered:
         """
         backend = backends.choose(d_env.device, d_env.dtype)
         values = backend.lookup(self.stack, d_env, roughness[:, 0])
-        if self.radiance.shape == self.stack.shape[1:]:
+        if not self.is_finer:
             return values
         uv = equirect_from_direction(d_env)
         weight = (1 - roughness.clamp(0, 1) * (len(self.stack) - 1)).clamp(min=0)

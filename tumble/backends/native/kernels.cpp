@@ -12,6 +12,7 @@
 #include "relight.h"
 #include "sh_shade.h"
 #include "shade.h"
+#include "shading_term.h"
 
 #define API extern "C" __attribute__((visibility("default")))
 
@@ -21,7 +22,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep), sizeof(ShadingTerm), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -126,7 +127,7 @@ API int adam(const AdamStep* s) { return adam_step(*s); }
 API void image_loss(const Image* m) { image_terms(*m); }
 API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
 
-API void lookup_forward(const Lookup* s) { lookup_values(*s); }
+API void lookup_forward(const Lookup* s) { lookup_values(*s, 0, 1); }
 API void lookup_backward(const Lookup* s) { lookup_adjoint(*s); }
 
 API void material_forward(const Activation* m) {
@@ -138,6 +139,8 @@ API void material_adjoint(const Activation* m) {
 API void bounce_forward(const Indirect* s) { bounce_values(*s, false); }
 API void bounce_adjoint(const Indirect* s) { bounce_values(*s, true); }
 API void material_loss(const MaterialImage* m) { material_terms(*m); }
+
+API void shading_loss(const ShadingTerm* s) { shading_term(*s); }
 
 API void relight_points(const Relight* s) {
     parallel(s->threads, [=](int share) { relight_share(*s, share); });

@@ -55,15 +55,18 @@ static void activate_adjoint_share(const Activation& m, int share) {
 
 struct Indirect {
     const float *albedo, *transfer, *directions, *radiance;
-    int n, n_directions;
+    int n, n_directions, threads;
     float* out;
     const float* v_out;
     float *v_albedo, *v_radiance;
 };
 
-static void bounce_values(const Indirect& s, bool adjoint) {
-    float coefficients[9][3], per_direction = 12.566370614f / s.n_directions;
-    vf sums[9][3] = {}, projected[9][3] = {};
+enum { MAX_SHARES = 64 };
+
+// Coefficients of the radiance that arrives from all directions.
+static void project_radiance(const Indirect& s, float (*coefficients)[3]) {
+    float per_direction = 12.566370614f / s.n_directions;
+    vf projected[9][3] = {};
     for (int first = 0; first < s.n_directions; first += LANES) {
         int count = imin2(LANES, s.n_directions - first);
         vf Y[16];
@@ -75,8 +78,15 @@ static void bounce_values(const Indirect& s, bool adjoint) {
     }
     for (int k = 0; k < 9; k++)
         for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(projected[k][ch]);
-    for (int first = 0; first < s.n; first += LANES) {
-        int count = imin2(LANES, s.n - first);
+}
+
+// Radiance of a share of the Gaussians, or its adjoint, with the gradient of the coefficients in `totals`.
+static void bounce_share(const Indirect& s, const float (*coefficients)[3], bool adjoint, int share, int shares,
+                         float (*totals)[3]) {
+    vf sums[9][3] = {};
+    int end = share_start(s.n, share + 1, shares);
+    for (int first = share_start(s.n, share, shares); first < end; first += LANES) {
+        int count = imin2(LANES, end - first);
         vi inside = lane_index() < count;
         vf t[9];
         for (int k = 0; k < 9; k++) t[k] = gather(s.transfer, 9, k, first, count);
@@ -96,9 +106,21 @@ static void bounce_values(const Indirect& s, bool adjoint) {
             for (int k = 0; k < 9; k++) sums[k][ch] += v_lit * t[k];
         }
     }
+    for (int k = 0; k < 9; k++)
+        for (int ch = 0; ch < 3; ch++) totals[k][ch] = sum_of(sums[k][ch]);
+}
+
+static void bounce_values(const Indirect& s, bool adjoint) {
+    float coefficients[9][3], totals[MAX_SHARES][9][3], per_direction = 12.566370614f / s.n_directions;
+    int shares = imin2(s.threads, MAX_SHARES);
+    project_radiance(s, coefficients);
+    parallel(shares, [&](int share) { bounce_share(s, coefficients, adjoint, share, shares, totals[share]); });
     if (!adjoint) return;
     for (int k = 0; k < 9; k++)
-        for (int ch = 0; ch < 3; ch++) coefficients[k][ch] = per_direction * sum_of(sums[k][ch]);
+        for (int ch = 0; ch < 3; ch++) {
+            coefficients[k][ch] = 0;
+            for (int share = 0; share < shares; share++) coefficients[k][ch] += per_direction * totals[share][k][ch];
+        }
     for (int first = 0; first < s.n_directions; first += LANES) {
         int count = imin2(LANES, s.n_directions - first);
         vf Y[16];
