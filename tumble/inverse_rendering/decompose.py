@@ -413,10 +413,11 @@ def _sample_pixels(
     Systematic sampling: every n-th part of the list of these pixels gives one, all at the same place of their part. The
     host asks the device for nothing.
     """
-    count = ((alpha > 0.5) & mask).flatten().cumsum(0)
+    count = ((alpha > 0.5) & mask).flatten().cumsum(0, dtype=torch.int32)
     place = torch.arange(n, device=alpha.device) + float(torch.rand((), generator=rng))
-    rank = torch.minimum((place * (count[-1] / n)).long(), count[-1] - 1)
-    return torch.where(count[-1] > 0, torch.searchsorted(count, rank + 1), -1)
+    total = count[-1]
+    rank = torch.minimum((place * (total / n)).int(), total - 1)
+    return torch.where(total > 0, torch.searchsorted(count, rank + 1), -1)
 
 
 @dataclass(frozen=True)
