@@ -44,6 +44,8 @@ from tumble.backends._structs import (
 
 PLANES = 11
 """Planes of scratch memory in `native/image.h` (per channel) and `native/material.h`."""
+MAX_SHARES = 64
+"""Maximum number of threads of some kernels in `native/material.h`."""
 POINT_SUMS = 22
 """Numbers of a share of the points in `native/shading_term.h`."""
 LIGHT_SUMS = 109
@@ -343,7 +345,8 @@ class _MaterialTermsFunction(torch.autograd.Function):
         features, alpha = tensors[:2]
         height, width, n_features = features.shape
         plane_size = (height + 1) * (width + 2 * _native.library().lanes())
-        struct = MaterialImage(height=height, width=width, n_features=n_features, plane_size=plane_size)
+        sizes = {"height": height, "width": width, "n_features": n_features, "plane_size": plane_size}
+        struct = MaterialImage(**sizes, threads=min(threads(), MAX_SHARES))
         terms, g_features, g_alpha = torch.empty(2), torch.empty_like(features), torch.empty_like(alpha)
         kept = set_pointers(struct, dict(zip(("features", "alpha", "photo", "mask"), tensors, strict=True)))
         kept += set_pointers(struct, scratch=scratch(PLANES * plane_size), terms=terms)

@@ -152,7 +152,7 @@ class MaterialImage(ctypes.Structure):
 
     _fields_ = [
         *_pointers("features alpha photo mask"),
-        *_ints("height width n_features plane_size"),
+        *_ints("height width n_features plane_size threads"),
         *_pointers("scratch terms g_features g_alpha"),
     ]
 
