@@ -773,3 +773,22 @@ def test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference(
         return [term[None], *torch.autograd.grad(3 * term, x, materialize_grads=True)]
 
     _compare(backend, run)
+
+
+@pytest.mark.parametrize(("height", "rows"), [(8, 24), (16, 128), (6, 30), (64, 80)])
+def test_convolutions_of_maps_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, height: int, rows: int
+) -> None:
+    rng = torch.Generator().manual_seed(height)
+    radiance, lobes = (
+        torch.rand(height, 2 * height, 3, generator=rng),
+        torch.rand(height + 1, rows, height, generator=rng),
+    )
+    seed = torch.randn(height + rows, 2 * height, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = radiance.to(dtype).requires_grad_()
+        out = by.prefilter(x, lobes.to(dtype))
+        return [out, *torch.autograd.grad(out, x, seed.to(dtype))]
+
+    _compare(backend, run)

@@ -487,6 +487,13 @@ class Backend(Protocol):
         """
         ...
 
+    def prefilter(self, radiance: Float[Tensor, "h w 3"], lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "out w 3"]:
+        """A map, and below it `rows` convolutions along its columns; differentiable in radiance.
+
+        lobes[:, i, j] is the real Fourier transform, f = w / 2 + 1 numbers, of the lobe from row j to row i; w is even.
+        """
+        ...
+
     def material_terms(
         self,
         features: Float[Tensor, "h w c"],

@@ -25,6 +25,7 @@ from tumble.backends import (
     ShadedPixels,
     ShadingLight,
     _native,
+    reference,
     threads,
 )
 from tumble.backends._structs import (
@@ -36,6 +37,7 @@ from tumble.backends._structs import (
     Image,
     Indirect,
     MaterialImage,
+    Prefilter,
     ShadingTerm,
     ShShade,
     scratch,
@@ -44,6 +46,8 @@ from tumble.backends._structs import (
 
 PLANES = 11
 """Planes of scratch memory in `native/image.h` (per channel) and `native/material.h`."""
+MAX_COLUMNS = 64
+"""Maximum number of columns of a map in `native/prefilter.h`."""
 MAX_SHARES = 64
 """Maximum number of threads of some kernels in `native/material.h`."""
 POINT_SUMS = 22
@@ -427,6 +431,55 @@ class _ShadingTermFunction(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_term: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         return _scaled(ctx, v_term[None], (0,) * len(_SHADING_MOVING))
+
+
+def prefilter(radiance: Float[Tensor, "h w 3"], lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "out w 3"]:
+    """See `Backend.prefilter`. With more columns fast Fourier transforms are faster than the kernel's sums."""
+    if radiance.shape[1] > MAX_COLUMNS:
+        return reference.prefilter(radiance, lobes)
+    return _PrefilterFunction.apply(radiance, lobes)
+
+
+class _PrefilterFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        radiance, ctx.lobes = (x.contiguous() for x in args)
+        height, width, _ = ctx.shape = radiance.shape
+        out = torch.empty(height + ctx.lobes.shape[1], width, 3)
+        struct, kept = _prefilter_launch(ctx, radiance=radiance, out=out)
+        _native.library().prefilter_forward(ctypes.byref(struct))
+        del kept
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        v_radiance = torch.empty(ctx.shape)
+        struct, kept = _prefilter_launch(ctx, v_out=v_out.contiguous(), v_radiance=v_radiance)
+        _native.library().prefilter_backward(ctypes.byref(struct))
+        del kept
+        return v_radiance, None
+
+
+def _prefilter_launch(ctx: Any, **more: Tensor) -> tuple[Prefilter, list[Tensor]]:
+    """Arguments of the convolution of maps, and the tensors that they point to."""
+    (height, width, _), (frequencies, rows, _) = ctx.shape, ctx.lobes.shape
+    lanes = _native.library().lanes()
+    size = (width + 2 * frequencies) * (3 * height + lanes) + 6 * frequencies * (rows + lanes)
+    struct = Prefilter(height=height, width=width, frequencies=frequencies, rows=rows, threads=threads())
+    named = {"lobes": ctx.lobes, "lobes_by_input": _transposed(ctx.lobes), "waves": _waves(width)}
+    return struct, set_pointers(struct, named, scratch=scratch(size), **more)
+
+
+@cache
+def _transposed(lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "f h rows"]:
+    return lobes.mT.contiguous()
+
+
+@cache
+def _waves(width: int) -> Float[Tensor, "2 f {width}"]:
+    """Cosines and sines of all frequencies at all columns."""
+    turns = torch.arange(width // 2 + 1, dtype=torch.float64)[:, None] * torch.arange(width) / width
+    return torch.stack([(2 * math.pi * turns).cos(), (2 * math.pi * turns).sin()]).float()
 
 
 def activate(

@@ -207,10 +207,20 @@ class ShadingTerm(ctypes.Structure):
     ]
 
 
+class Prefilter(ctypes.Structure):
+    """`Prefilter` of `native/prefilter.h`: arguments of the convolution of maps."""
+
+    _fields_ = [
+        *_pointers("radiance lobes lobes_by_input waves"),
+        *_ints("height width frequencies rows threads"),
+        *_pointers("scratch out v_out v_radiance"),
+    ]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
     *(Lookup, Activation, Indirect, MaterialImage, Relight, GaussianActivation, AdamLeaf, AdamStep),
-    ShadingTerm,
+    *(ShadingTerm, Prefilter),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

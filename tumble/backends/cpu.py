@@ -39,6 +39,7 @@ from tumble.backends._cpu_terms import (
     gaussian_terms,
     image_terms,
     material_terms,
+    prefilter,
     sh_shade,
     shading_term,
 )
@@ -55,6 +56,7 @@ __all__ = [
     "image_terms",
     "lookup",
     "material_terms",
+    "prefilter",
     "rasterize",
     "ready",
     "relight",

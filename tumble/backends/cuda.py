@@ -24,6 +24,7 @@ from tumble.backends.reference import (
     image_terms,
     lookup,
     material_terms,
+    prefilter,
     sh_shade,
     shading_term_by,
 )
@@ -39,6 +40,7 @@ __all__ = [
     "image_terms",
     "lookup",
     "material_terms",
+    "prefilter",
     "rasterize",
     "ready",
     "sh_shade",

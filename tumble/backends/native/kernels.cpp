@@ -8,6 +8,7 @@
 #include "material.h"
 #include "parallel.h"
 #include "parameters.h"
+#include "prefilter.h"
 #include "project.h"
 #include "relight.h"
 #include "sh_shade.h"
@@ -22,7 +23,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep), sizeof(ShadingTerm), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep), sizeof(ShadingTerm), sizeof(Prefilter), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -139,6 +140,9 @@ API void material_adjoint(const Activation* m) {
 API void bounce_forward(const Indirect* s) { bounce_values(*s, false); }
 API void bounce_adjoint(const Indirect* s) { bounce_values(*s, true); }
 API void material_loss(const MaterialImage* m) { material_terms(*m); }
+
+API void prefilter_forward(const Prefilter* s) { prefilter_map(*s); }
+API void prefilter_backward(const Prefilter* s) { prefilter_adjoint(*s); }
 
 API void shading_loss(const ShadingTerm* s) { shading_term(*s); }
 
