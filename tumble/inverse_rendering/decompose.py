@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from tumble.engine import State, optim
+from tumble.engine import CACHE, State, optim
 from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
@@ -68,6 +68,9 @@ FIT_FRAMES = 64
 """Maximum number of frames in the grid search of the specular lobe."""
 FIT_PIXELS = 2
 """Pixels per frame in the grid search of the specular lobe, as a multiple of the pixels of a step."""
+BLOCKERS = f"{CACHE}blocker"
+"""Name of the blockers of all sets in the state's memory: gigabytes at 100,000 Gaussians, so that no checkpoint has
+them."""
 MAX_DISPLACEMENT = 0.3
 """Displacement of the Gaussians (`trace.displacement`) above which visibility is traced again."""
 
@@ -320,25 +323,32 @@ def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
         return
     params, gaussians = state.params, state.params.gaussians
     poses = [pose(params, inputs, frame) for frame in range(len(inputs.capture))]
-    points = surface_points(gaussians, params.gamma, poses, inputs.capture.camera)
-    tracer = build_tracer(gaussians, params.gamma)
-    traced = [
-        visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce != "none")
-        for directions in state.memory["directions"]
-    ]
-    state.memory["bits"] = torch.stack([v.bits for v in traced])
     state.memory |= {f"traced.{name}": x.detach().clone() for name, x in tree.named_tensors(gaussians).items()}
+    state.memory["traced.points"] = surface_points(gaussians, params.gamma, poses, inputs.capture.camera)
+    traced = _visibility_of_traced(cfg, state)
+    state.memory["bits"] = torch.stack([v.bits for v in traced])
     if cfg.bounce != "none":
         state.memory["transfer"] = transfer(traced, gaussians.normals)
-        state.memory["blocker"] = torch.stack([v.blocker for v in traced if v.blocker is not None])
+        state.memory[BLOCKERS] = torch.stack([v.blocker for v in traced if v.blocker is not None])
+
+
+def _traced_gaussians(state: State) -> Gaussians:
+    """The geometry of which visibility was last traced."""
+    return Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
+
+
+def _visibility_of_traced(cfg: Config, state: State) -> list[Visibility]:
+    """Visibility of the traced geometry, for each set of directions."""
+    gaussians, points = _traced_gaussians(state), state.memory["traced.points"]
+    tracer, blockers = build_tracer(gaussians, state.params.gamma), cfg.bounce != "none"
+    return [visibility(tracer, points, gaussians.normals, x, blockers=blockers) for x in state.memory["directions"]]
 
 
 def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace visibility again when geometry has moved by about the width of a shadow's edge since the last time."""
     if not _caches_visibility(cfg) or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
         return
-    traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
-    if displacement(traced, state.params.gaussians) > MAX_DISPLACEMENT:
+    if displacement(_traced_gaussians(state), state.params.gaussians) > MAX_DISPLACEMENT:
         _trace_visibility(cfg, inputs, state)
 
 
@@ -508,8 +518,11 @@ def _pixel_visibility(cfg: Config, state: State, params: Params, points: Surface
 def _cached_visibility(cfg: Config, state: State) -> Visibility:
     """Visibility of all Gaussians for this step's set of directions, as it was last traced."""
     memory, current = state.memory, state.step % cfg.sets
-    blocker = memory["blocker"][current] if cfg.bounce != "none" else None
-    return Visibility(memory["directions"][current], memory["bits"][current], blocker)
+    if cfg.bounce == "none":
+        return Visibility(memory["directions"][current], memory["bits"][current], None)
+    if BLOCKERS not in memory:  # after a checkpoint was read
+        memory[BLOCKERS] = torch.stack([v.blocker for v in _visibility_of_traced(cfg, state) if v.blocker is not None])
+    return Visibility(memory["directions"][current], memory["bits"][current], memory[BLOCKERS][current])
 
 
 def _upsample_light(cfg: Config, state: State) -> None:
