@@ -37,15 +37,15 @@ PARTS: dict[str, dict[str, list[tuple[Any, str]]]] = {
         "render": [(refine, "render")],
         "colour": [(sh_lighting, "radiance")],
         "losses": [(refine, "_terms")],
-        "backward": [(torch.Tensor, "backward")],
-        "optimizer": [(optim.Adam, "step"), (optim.Adam, "zero_grad")],
+        "backward": [(torch.autograd, "grad")],
+        "optimizer": [(optim.Adam, "step")],
     },
     "decompose": {
         "render": [(decompose, "corner_features"), (decompose, "rasterize_material")],
-        "colour": [(decompose, "_bounce"), (decompose, "_shade")],
+        "colour": [(decompose, "_render_term")],
         "losses": [(losses, "light_smoothness"), (losses, "material_terms")],
-        "backward": [(torch.Tensor, "backward")],
-        "optimizer": [(optim.Adam, "step"), (optim.Adam, "zero_grad")],
+        "backward": [(torch.autograd, "grad")],
+        "optimizer": [(optim.Adam, "step")],
     },
 }
 """Functions of each part; everything else is bookkeeping."""

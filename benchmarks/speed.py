@@ -45,7 +45,7 @@ PARTS = {
     "decompose": {
         "visibility": (decompose, "_trace_visibility"),
         "rendering": (decompose, "rasterize_material"),
-        "shading": (decompose, "_shade"),
+        "shading": (decompose, "_render_term"),
         "backward pass and Adam": (optim, "descend"),
     },
 }

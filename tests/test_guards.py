@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "maths": set(),
     "backends": set(),
     "scene": {"io", "maths"},
-    "engine": {"io"},
+    "engine": {"io", "backends"},
     "rendering": {"maths", "backends", "scene"},
     "matching": {"io", "scene"},
     "datasets": {"io", "maths", "scene"},
@@ -62,7 +62,7 @@ INNER_ROOMS = {
 """Rooms within a room, with the one that they do not know."""
 PLUGINS = ("backends", "matching")
 """Rooms of plugins: their `__init__` is the contract, and files of them are found by name."""
-MANY_PARAMETERS = {"rasterize", "gaussian_terms"}
+MANY_PARAMETERS = {"rasterize", "gaussian_terms", "image_terms"}
 """Functions over 12 parameters: the backends' contract hands tensors over one by one."""
 STAGE_WORDS = {"Config", "Inputs", "Params", "Weights", "Rates"}
 """Classes that every stage names alike."""

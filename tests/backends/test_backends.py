@@ -700,3 +700,95 @@ def test_constants_that_the_kernels_repeat_are_those_of_the_package() -> None:
 
 def test_float64_is_rendered_by_the_reference() -> None:
     assert backends.choose(CPU, torch.float64) is reference
+
+
+def test_activations_and_their_gradients_are_those_of_the_reference(backend: backends.Backend) -> None:
+    rng = torch.Generator().manual_seed(0)
+    n = 333
+    inputs = [2 * torch.randn(n, 3, generator=rng) - 3, 0.1 * torch.randn(n, generator=rng), torch.tensor(30.0)]
+    seeds = torch.randn(n, 3, generator=rng), torch.randn(n, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in inputs]
+        results = by.activate(*x)
+        return [*results, *torch.autograd.grad(results, x, [y.to(dtype) for y in seeds])]
+
+    _compare(backend, run)
+    x = [y[:4].double() if y.ndim else y.double() for y in inputs]
+    assert torch.autograd.gradcheck(lambda *y: reference.activate(*y), [y.requires_grad_() for y in x])
+
+
+@pytest.mark.parametrize("count", [1, 50])
+def test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none(
+    backend: backends.Backend, count: int
+) -> None:
+    rng = torch.Generator().manual_seed(count)
+    shapes = (), (7, 3), (40, 4, 3), (0, 3)
+    values = [[torch.rand(shape, generator=rng) for _ in range(4)] for shape in shapes]
+
+    def run(by: backends.Backend, dtype: torch.dtype, broken: float = 0.0) -> list[torch.Tensor]:
+        leaves = [backends.Leaf(*(x.to(dtype, copy=True) for x in each), 0.1, count) for each in values]
+        leaves[2].gradient[3, 1, 2] += broken
+        assert by.adam(leaves, 0.9, 0.999, 1e-15) == math.isfinite(broken)
+        return [x for leaf in leaves for x in (leaf.value, leaf.first, leaf.second)]
+
+    _compare(backend, run)
+    for broken in (math.nan, math.inf, -math.inf):
+        unchanged = run(backend, torch.float32, broken)
+        assert all(
+            torch.equal(a, b) for a, b in zip(unchanged, [x for v in values for x in (v[0], *v[2:])], strict=True)
+        )
+
+
+@pytest.mark.parametrize(("n", "d", "p"), [(60, 100, 70), (0, 48, 17)])
+def test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference(
+    backend: backends.Backend, n: int, d: int, p: int
+) -> None:
+    rng = torch.Generator().manual_seed(p)
+    height, width = 12, 15
+    R, _, focal = (x.float() for x in cases.camera(height, width))
+    R_env = cases.camera(9, 9)[0].float().T
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=rng)
+
+    # Normals towards the camera, but for some at the rim; a roughness on both sides of every limit.
+    normal = -R[2] + 0.8 * (rand(height, width, 3) - 0.5)
+    features = torch.cat([rand(height, width, 3), 0.7 * rand(height, width, 1), 0.2 * rand(height, width, 3)], -1)
+    stack = _stack(5, 8, 1)[0] ** 3
+    moving = [features, 0.5 + 0.5 * rand(height, width), normal, stack, rand(n, 3), rand(3), R, R_env]
+    dominant = torch.randint(-1, 60, (height, width), generator=rng).int()
+    photo = torch.randint(0, 256, (height, width, 3), generator=rng).to(torch.uint8)
+    pixels = torch.randint(-20, height * width, (p,), generator=rng)
+    visibility = _brute.pack(rand(60, d) > 0.3)
+    blocker = torch.randint(-1, n, (60, d), generator=rng).int() if n else torch.full((1, 1), -1).int()
+    directions, transfer, table = cases.fibonacci(d).float(), 0.3 + 0.2 * rand(n, 9), rand(16, 16)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = [y.to(dtype).requires_grad_() for y in moving]
+        constant = [y.to(dtype) for y in (directions, transfer, table, focal)]
+        view = backends.ShadedPixels(*x[:3], dominant, photo, pixels)
+        light = backends.ShadingLight(x[3], constant[0], visibility, blocker, x[4], *constant[1:3])
+        term = by.shading_term(view, light, x[6], x[7], constant[3], x[5])
+        return [term[None], *torch.autograd.grad(3 * term, x, materialize_grads=True)]
+
+    _compare(backend, run)
+
+
+@pytest.mark.parametrize(("height", "rows"), [(8, 24), (16, 128), (6, 30), (64, 80)])
+def test_convolutions_of_maps_and_their_gradients_are_those_of_the_reference(
+    backend: backends.Backend, height: int, rows: int
+) -> None:
+    rng = torch.Generator().manual_seed(height)
+    radiance, lobes = (
+        torch.rand(height, 2 * height, 3, generator=rng),
+        torch.rand(height + 1, rows, height, generator=rng),
+    )
+    seed = torch.randn(height + rows, 2 * height, 3, generator=rng)
+
+    def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = radiance.to(dtype).requires_grad_()
+        out = by.prefilter(x, lobes.to(dtype))
+        return [out, *torch.autograd.grad(out, x, seed.to(dtype))]
+
+    _compare(backend, run)

@@ -2,18 +2,22 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
+from tests.inverse_rendering.test_refine import textured_sphere
 from tests.surfaces import GAMMA, MAJOR, MINOR, sphere, torus
 from tumble import recipes
+from tumble.engine import loop
 from tumble.engine.loop import State
-from tumble.inverse_rendering import decompose
+from tumble.inverse_rendering import decompose, refine
 from tumble.rendering.shading import Surface
 from tumble.scene.environment import Environment
 from tumble.scene.material import DIELECTRIC, Material
+from tumble.scene.trajectory import Trajectory
 
 
 def params(log_specular_scale: Tensor) -> decompose.Params:
@@ -74,3 +78,24 @@ def test_traced_shadows_are_those_of_the_shaded_points() -> None:
     blocker = seen.blocker
     assert blocker is not None
     assert gaussians.means[int(blocker[0, 0])][0] < -0.3
+
+
+def test_checkpoints_have_no_blockers_which_are_computed_again_from_the_traced_geometry(tmp_path: Path) -> None:
+    _, true, taken = textured_sphere()
+    second, generator = refine.Inputs(taken, Trajectory(true, "camera")), torch.Generator().manual_seed(0)
+    recipe = recipes.known_poses(recipes.SMOKE)
+    start = refine.init(recipe.refine, second, generator)
+    inputs = decompose.Inputs(taken, refine.finish(recipe.refine, second, start))
+    cfg = replace(recipe.decompose, fit_specular=False)
+    state = decompose.init(cfg, inputs, generator)
+    loop._save(state, tmp_path / "checkpoint", "", 0.0)
+    names = {name.rpartition("/")[2] for name in loop._read(tmp_path / "checkpoint")[1]}
+    blocked = state.memory.pop(decompose.BLOCKERS)
+    assert names >= state.memory.keys()
+    assert decompose.BLOCKERS not in names
+    with torch.no_grad():
+        state.params.gaussians.means.add_(0.1)  # as training does after visibility was traced
+    found = decompose._cached_visibility(cfg, state).blocker
+    assert found is not None
+    assert torch.equal(found, blocked[0])
+    assert (blocked >= 0).any()

@@ -3,15 +3,13 @@
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from tumble.engine.loop import State
-from tumble.inverse_rendering import decompose, densify, refine
+from tumble.inverse_rendering import densify, refine
 from tumble.inverse_rendering.refine import Params, Points
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.maths.directions import fibonacci_sphere
@@ -58,38 +56,6 @@ def test_alignment_corrects_wrong_poses_and_keeps_correct_ones() -> None:
     degrees = np.degrees(angle_between(SO3(aligned), true.rotation).numpy())
     # A tenth of a pixel, since the images are quantized and the masks binary.
     assert degrees.max() < 0.25, degrees
-
-
-class Waits(TorchDispatchMode):
-    """Counts the operations for which a step on a GPU would wait: values or shapes that Python asks for."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name = function.__name__.partition(".")[0]
-        if name in ("_local_scalar_dense", "nonzero"):
-            self.names.append(name)
-        return function(*args, **(kwargs or {}))
-
-
-def test_steps_hardly_ever_wait_for_the_device() -> None:
-    """On the CPU, stage 2 asks whether all is finite, stage 3 also which pixels show the object; besides, the number of
-    the frame is drawn on the CPU. `tests/test_device.py` has the same for a device."""
-    _, true, capture = textured_sphere()
-    inputs = refine.Inputs(capture, Trajectory(true, "camera"))
-    cfg = replace(SMOKE.refine, points=600)
-    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
-    state.step = 1
-    with Waits() as waits:
-        refine.step(cfg, inputs, state)
-    assert waits.names == ["_local_scalar_dense"] * 2
-    third = decompose.Inputs(capture, refine.finish(cfg, inputs, state))
-    state = decompose.init(replace(SMOKE.decompose, fit_specular=False), third, torch.Generator().manual_seed(0))
-    with Waits() as waits:
-        decompose.step(SMOKE.decompose, third, state)
-    assert sorted(waits.names) == ["_local_scalar_dense"] * 2 + ["nonzero"]
 
 
 def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_pruned() -> None:

@@ -35,6 +35,7 @@ from tumble import pipeline, recipes
 from tumble.datasets import folder
 from tumble.evaluation import align_views, metrics
 from tumble.inverse_rendering import decompose, losses, refine, self_shadowing
+from tumble.maths.images import to_srgb8
 
 BAR = Errors(albedo=24.4, normal=7.6, roughness=0.21, contrast=0.05, light=0.47, lamp=4.3)
 """Least albedo and contrast, and largest of the other errors, of `SHORT`."""
@@ -70,8 +71,11 @@ def test_a_short_run_finds_albedo_normals_roughness_and_light() -> None:
 
 
 def linear_loss(patch: pytest.MonkeyPatch) -> None:
-    """Stage 3 compares linear radiance with sRGB values."""
-    patch.setattr(losses, "srgb_as_captured", lambda radiance, photo: radiance)
+    """Stage 3 takes sRGB values for linear radiance."""
+    right = losses.shading_term
+    patch.setattr(
+        losses, "shading_term", lambda view, pixels, photo, *x: right(view, pixels, to_srgb8(photo / 255), *x)
+    )
 
 
 def transposed_rotation(patch: pytest.MonkeyPatch) -> None:

@@ -41,10 +41,13 @@ from tumble.backends._contract import (
     FuseKernel,
     GlossyGaussians,
     Hits,
+    Leaf,
     LightTables,
     Lobes,
     RelightKernel,
     Rendering,
+    ShadedPixels,
+    ShadingLight,
     SurfaceSamples,
 )
 
@@ -60,9 +63,11 @@ __all__ = [
     "FuseKernel",
     "GlossyGaussians",
     "Hits",
+    "NARROW_ROUGHNESS",
     "NEAR",
     "IRRADIANCE_FLOOR",
     "KNEE",
+    "Leaf",
     "LightTables",
     "Lobes",
     "NEAR_SIGMAS",
@@ -76,6 +81,8 @@ __all__ = [
     "SSIM_SIGMA",
     "SSIM_STABILISERS",
     "SSIM_WINDOW",
+    "ShadedPixels",
+    "ShadingLight",
     "SurfaceSamples",
     "TRACE_SIGMAS",
     "TRACE_T_MIN",
@@ -119,6 +126,9 @@ VISIBLE = 0.5
 """Minimum transmittance at which a direction is visible from a point."""
 ROUGHNESS_MIN = 0.05
 """Lower limit of the roughness used for shading; narrower lobes would fall between the sampled directions."""
+NARROW_ROUGHNESS = (0.3, 0.45)
+"""Range of roughness over which shading blends from the prefiltered lobe to the sum over directions; below it, a few
+hundred directions cannot resolve the lobe."""
 NORMAL_GRADIENT = 0.3
 """Factor of the gradient from `sh_shade` to the normals: the low-order light causes errors in the full gradient."""
 IRRADIANCE_FLOOR = 0.03
@@ -203,6 +213,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")))
 
 
+@cache
 def load(name: str) -> Backend:
     """The backend with the given name, imported."""
     return cast(Backend, importlib.import_module(f"{__name__}.{name}"))

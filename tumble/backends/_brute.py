@@ -1,14 +1,17 @@
-"""Brute-force tracer of the reference backend: every ray against every Gaussian, in torch on any device and dtype."""
+"""Tracer and shading of the reference backend, in torch on any device and dtype.
+
+By brute force: every ray against every Gaussian, every point under every direction.
+"""
 
 import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tumble.backends import ALPHA_MAX, ALPHA_MIN, TRACE_SIGMAS, TRACE_T_MIN, VISIBLE, Hits
+from tumble.backends import ALPHA_MAX, ALPHA_MIN, ROUGHNESS_MIN, TRACE_SIGMAS, TRACE_T_MIN, VISIBLE, Hits, Lobes
 
 MAX_PAIRS = 1 << 22
 """Ray-Gaussian pairs that are computed at once; limits memory and does not affect results."""
@@ -108,6 +111,79 @@ def _around(
     p, d = len(points), len(directions)
     hits = trace(bvh, points.repeat_interleave(d, 0), directions.repeat(p, 1), points.new_zeros(0, 3))
     return normals @ directions.T > 0, hits
+
+
+def shade(
+    normal: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+    view: Float[Tensor, "p 3"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
+    visibility: Int32[Tensor, "q words"],
+    blocker: Int32[Tensor, "#q #d"],
+    rows: Int64[Tensor, " p"],
+    blocker_radiance: Float[Tensor, "m 3"],
+) -> Lobes:
+    """See `Backend.shade`."""
+    d = directions.shape[0]
+    visible = unpack(visibility, d)[rows]
+    arriving = torch.where(visible[..., None], radiance, 0)
+    if blocker_radiance.shape[0]:
+        blocker = blocker.expand(len(visibility), d)[rows]
+        is_blocked = ~visible & (blocker >= 0)
+        arriving = torch.where(is_blocked[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
+    a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
+    n_w = normal @ directions.T
+    n_v = (normal * view).sum(-1, keepdim=True)
+    HH = 2 * (1 + view @ directions.T)
+    exists = (HH > 1e-6) & (n_v > 0)
+    HH = torch.where(exists, HH, 1)
+    H = view[:, None] + directions
+    t = (torch.linalg.cross(normal[:, None], H).square().sum(-1) + a * a * (n_v + n_w) ** 2) / HH
+    m = 1 - 0.5 * HH.sqrt()
+    fresnel = 1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303))))
+    g_v, g_w = (0.5 * (x + (a * a + (1 - a * a) * x * x).sqrt()) for x in (n_v.clamp(min=0), n_w.clamp(min=0)))
+    specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
+    lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]
+    with torch.no_grad():
+        c = ((2 * n_v * normal - view) @ directions.T).clamp(min=0)
+        bb = a.clamp(min=math.sqrt(math.pi / d) / 2) ** 2
+        weight = torch.where(n_w > 0, c / (0.5 * (1 - c) + bb * 0.5 * (1 + c)) ** 2, 0)
+        fraction = (weight * visible).sum(-1) / weight.sum(-1).clamp(min=torch.finfo(weight.dtype).tiny)
+    return Lobes(lit.sum(1) / math.pi, torch.einsum("pd,pdc->pc", specular, lit), fraction)
+
+
+def lookup(
+    stack: Float[Tensor, "levels h w 3"],
+    directions: Float[Tensor, "p 3"],
+    roughness: Float[Tensor, " p"],
+) -> Float[Tensor, "p 3"]:
+    """See `Backend.lookup`."""
+    levels, h, w, _ = stack.shape
+    x, y, z = directions.unbind(-1)
+    rho2 = x * x + z * z
+    # The gradient of atan2(0, 0) is infinite.
+    pole = rho2 == 0
+    rho = torch.where(pole, 0.0, torch.where(pole, 1.0, rho2).sqrt())
+    u = torch.atan2(torch.where(pole, 0.0, x), torch.where(pole, 1.0, -z)) / (2 * math.pi) + 0.5
+    column, row = u * w - 0.5, torch.atan2(rho, y) / math.pi * h - 0.5
+    level = roughness.clamp(0, 1) * (levels - 1)
+    left, top, low = (position.detach().floor() for position in (column, row, level))
+    values = torch.zeros_like(directions)
+    for k in range(8):
+        right, down, up = k & 1, k >> 1 & 1, k >> 2
+        at_level, at_row, at_column = (
+            (low + up).long().clamp(max=levels - 1),
+            (top + down).long(),
+            (left + right).long(),
+        )
+        # The neighbour across a pole is the same row, half a revolution away.
+        beyond = (at_row < 0) | (at_row >= h)
+        at_column = torch.where(beyond, at_column + w // 2, at_column) % w
+        x, y, z = column - left, row - top, level - low
+        weight = (x if right else 1 - x) * (y if down else 1 - y) * (z if up else 1 - z)
+        values = values + weight[:, None] * stack[at_level, at_row.clamp(0, h - 1), at_column]
+    return values
 
 
 def pack(bits: Bool[Tensor, "p d"]) -> Int32[Tensor, "p words"]:

@@ -3,6 +3,7 @@
 Vocabulary and conventions are those of `tumble.backends`, whose constants appear here in capitals.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -54,6 +55,52 @@ class Lobes(NamedTuple):
     """Of the specular lobe with reflectance 1 at normal incidence."""
     specular_visibility: Float[Tensor, " p"]
     """Visible fraction of the specular lobe. Not differentiable."""
+
+
+class ShadedPixels(NamedTuple):
+    """A view with the material of `Backend.corner_features`, and the pixels that `Backend.shading_term` shades."""
+
+    features: Float[Tensor, "h w 7"]
+    """Albedo, roughness and normal offset."""
+    alpha: Float[Tensor, "h w"]
+    normal: Float[Tensor, "h w 3"]
+    """Outward normals of any length, object frame, without the offset."""
+    dominant: Int32[Tensor, "h w"]
+    """Row of visibility and blockers of each pixel; a negative one counts as 0."""
+    photo: UInt8[Tensor, "h w 3"]
+    """Input image, sRGB."""
+    pixels: Int64[Tensor, " p"]
+    """Indices of the pixels, counted row by row; a negative one adds nothing to the sum."""
+
+
+class ShadingLight(NamedTuple):
+    """Light and occlusion of `Backend.shading_term`, with arguments of `lookup`, `shade` and `bounce`."""
+
+    stack: Float[Tensor, "levels map_h map_w 3"]
+    directions: Float[Tensor, "d 3"]
+    """Evenly distributed unit directions, object frame."""
+    visibility: Int32[Tensor, "q words"]
+    blocker: Int32[Tensor, "#q #d"]
+    albedo: Float[Tensor, "n 3"]
+    """Albedo of all Gaussians; none (n = 0) for black blockers."""
+    transfer: Float[Tensor, "n 9"]
+    table: Float[Tensor, "size size"]
+    """Directional albedo of the specular lobe divided by f0, by n.v (0 to 1) and roughness (ROUGHNESS_MIN to 1)."""
+
+
+class Leaf(NamedTuple):
+    """A parameter that `Backend.adam` moves, in place; its tensors are contiguous and have one shape."""
+
+    value: Tensor
+    gradient: Tensor
+    first: Tensor
+    """Running mean of the gradient."""
+    second: Tensor
+    """Running mean of the gradient's square."""
+    rate: float
+    """Learning rate."""
+    count: int
+    """Number of steps, this one included."""
 
 
 @runtime_checkable
@@ -281,8 +328,9 @@ class Backend(Protocol):
         fx_fy_cx_cy: Float[Tensor, "4"],
         ssim_weight: float,
         crease: float,
+        weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
     ) -> Float[Tensor, "4"]:
-        """Loss terms of a rendered view (`Rendering`) against a photo, each a mean over the image.
+        """Weighted loss terms of a rendered view (`Rendering`) against a photo, each a mean over the image.
 
         0. `(1 - w) |x - y| + w (1 - SSIM(x, y))`, w = ssim_weight, with x the rendering in sRGB and y the photo, both
            black where the mask is UNKNOWN; SSIM is averaged over windows within the image. Where the photo is SATURATED
@@ -308,6 +356,7 @@ class Backend(Protocol):
             fx_fy_cx_cy: Focal lengths and principal point [pixels].
             ssim_weight: Weight of SSIM in the first term, 0 to 1.
             crease: Saturation of the third term.
+            weights: Factors of the terms.
         """
         ...
 
@@ -325,8 +374,9 @@ class Backend(Protocol):
         fx_fy_cx_cy: Float[Tensor, "4"],
         floor: float,
         reach: float,
+        weights: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> Float[Tensor, "3"]:
-        """Loss terms of the Gaussians.
+        """Weighted loss terms of the Gaussians.
 
         0. Mean of `max(0, -log(max(1e-4, exp(H) - 1)))`, with H the entropy of the squared scales divided by their sum,
            plus the mean third scale. Differentiable in log_scales.
@@ -350,6 +400,26 @@ class Backend(Protocol):
             fx_fy_cx_cy: Focal lengths and principal point [pixels].
             floor: Lower limit of the median distance.
             reach: Limit of the depth difference.
+            weights: Factors of the terms.
+        """
+        ...
+
+    def activate(
+        self, log_scales: Float[Tensor, "n 3"], sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+        """Standard deviations `exp(log_scales)` and opacities `4 s (1 - s)`, s = sigmoid(-gamma sdf), of Gaussians.
+
+        Differentiable in all arguments.
+        """
+        ...
+
+    def adam(self, leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+        """One step of Adam (Kingma and Ba 2015) on all leaves at once, unless a gradient is not finite.
+
+        With bias-corrected moments m and v, a value moves by -rate m / (sqrt(v) + eps).
+
+        Returns:
+            Whether all gradients were finite; if not, nothing was changed. A host waits for this of a GPU.
         """
         ...
 
@@ -384,6 +454,43 @@ class Backend(Protocol):
             transfer: Transfer vectors from light to shadowed irradiance.
             directions: Evenly distributed unit directions.
             radiance: Light from these directions.
+        """
+        ...
+
+    def shading_term(
+        self,
+        view: ShadedPixels,
+        light: ShadingLight,
+        R_cam_obj: Float[Tensor, "3 3"],
+        R_env_obj: Float[Tensor, "3 3"],
+        fx_fy_cx_cy: Float[Tensor, "4"],
+        f0: Float[Tensor, "3"],
+    ) -> Float[Tensor, ""]:
+        """Mean over pixels and channels of |x - y|, x = sRGB(alpha L), with the reflected radiance L, and y the photo.
+
+            L = albedo diffuse + f0 (s specular + (1 - s) specular_visibility G(n.v, roughness) S(m, roughness))
+
+        The lobes and specular_visibility are those of `shade` with the normal n = normalize(normal + offset), the
+        direction v to the camera, radiance S(w, d^(-1/4)) from the d directions w, and that of `bounce` from blockers.
+        m = 2 (n.v) n - v, S is `lookup` in the direction R_env_obj m, and G is bilinear in the table. s rises from 0 to
+        1 over NARROW_ROUGHNESS. Where the photo is SATURATED and x larger, x = y.
+
+        Differentiable in features, alpha, normal, stack, albedo of the Gaussians, f0, and both rotations.
+
+        Args:
+            view: View, photo and pixels.
+            light: Light and occlusion.
+            R_cam_obj: Rotation from object to camera.
+            R_env_obj: Rotation from the object frame to the env frame.
+            fx_fy_cx_cy: Focal lengths and principal point [pixels].
+            f0: Reflectance at normal incidence.
+        """
+        ...
+
+    def prefilter(self, radiance: Float[Tensor, "h w 3"], lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "out w 3"]:
+        """A map, and below it `rows` convolutions along its columns; differentiable in radiance.
+
+        lobes[:, i, j] is the real Fourier transform, f = w / 2 + 1 numbers, of the lobe from row j to row i; w is even.
         """
         ...
 

@@ -21,6 +21,8 @@ ENTRY_POINTS = (
     *("lookup_forward", "lookup_backward", "material_forward", "material_adjoint"),
     *("bounce_forward", "bounce_adjoint", "material_loss", "relight_points"),
     *("maps_fuse", "maps_blend"),
+    *("activation_forward", "activation_adjoint", "adam", "shading_loss"),
+    *("prefilter_forward", "prefilter_backward"),
 )
 """Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (

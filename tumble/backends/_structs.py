@@ -99,6 +99,7 @@ class Image(ctypes.Structure):
         *_pointers("rgb alpha depth depth_var normal photo mask R focal taps"),
         *_ints("height width plane_size threads"),
         *_floats("ssim_weight crease saturated knee c1 c2"),
+        ("weights", ctypes.c_float * 4),
         *_pointers("scratch terms g_rgb g_alpha g_depth g_depth_var g_normal g_R"),
     ]
 
@@ -110,6 +111,7 @@ class GaussianTerms(ctypes.Structure):
         *_pointers("means quats log_scales sdf gamma weight depth R t focal"),
         *_ints("n height width threads"),
         *_floats("floor reach"),
+        ("weights", ctypes.c_float * 3),
         *_pointers("magnitudes terms g_means g_quats g_log_scales g_sdf g_gamma g_R g_t"),
     ]
 
@@ -140,7 +142,7 @@ class Indirect(ctypes.Structure):
 
     _fields_ = [
         *_pointers("albedo transfer directions radiance"),
-        *_ints("n n_directions"),
+        *_ints("n n_directions threads"),
         *_pointers("out v_out v_albedo v_radiance"),
     ]
 
@@ -150,7 +152,7 @@ class MaterialImage(ctypes.Structure):
 
     _fields_ = [
         *_pointers("features alpha photo mask"),
-        *_ints("height width n_features plane_size"),
+        *_ints("height width n_features plane_size threads"),
         *_pointers("scratch terms g_features g_alpha"),
     ]
 
@@ -192,9 +194,55 @@ class Baking(ctypes.Structure):
     ]
 
 
+class GaussianActivation(ctypes.Structure):
+    """`GaussianActivation` of `native/parameters.h`: arguments of the activation of Gaussians."""
+
+    _fields_ = [
+        *_pointers("log_scales sdf gamma"),
+        *_ints("n threads"),
+        *_pointers("scales opacity v_scales v_opacity v_log_scales v_sdf parts"),
+    ]
+
+
+class AdamLeaf(ctypes.Structure):
+    """`AdamLeaf` of `native/parameters.h`: a leaf of the optimizer."""
+
+    _fields_ = [*_pointers("value gradient first second"), ("n", ctypes.c_longlong), *_floats("rate root_correction")]
+
+
+class AdamStep(ctypes.Structure):
+    """`AdamStep` of `native/parameters.h`: arguments of the optimizer's step."""
+
+    _fields_ = [*_pointers("leaves"), *_ints("n_leaves threads"), *_floats("beta_2 rest_1 rest_2 eps")]
+
+
+class ShadingTerm(ctypes.Structure):
+    """`ShadingTerm` of `native/shading_term.h`: arguments of the photometric term of shaded pixels."""
+
+    _fields_ = [
+        *_pointers("features alpha normal photo pixels dominant R_cam_obj R_env_obj focal stack f0 albedo transfer"),
+        *_pointers("directions direction_rows visibility blocker table"),
+        *_ints("n_points n_features width n_pixels n_directions stride words n_gaussians"),
+        *_ints("blocker_point_stride blocker_direction_stride levels map_height map_width table_size threads"),
+        *_floats("cell roughness_min narrow_from narrow_to saturated knee"),
+        *_pointers("rows scratch term g_features g_alpha g_normal g_R_cam_obj g_R_env_obj g_stack g_f0 g_albedo"),
+    ]
+
+
+class Prefilter(ctypes.Structure):
+    """`Prefilter` of `native/prefilter.h`: arguments of the convolution of maps."""
+
+    _fields_ = [
+        *_pointers("radiance lobes lobes_by_input waves"),
+        *_ints("height width frequencies rows threads"),
+        *_pointers("scratch out v_out v_radiance"),
+    ]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
-    *(Lookup, Activation, Indirect, MaterialImage, Relight, Fusion, Baking),
+    *(Lookup, Activation, Indirect, MaterialImage, Relight, GaussianActivation, AdamLeaf, AdamStep),
+    *(ShadingTerm, Prefilter, Fusion, Baking),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

@@ -34,17 +34,23 @@ from tumble.backends import (
     threads,
 )
 from tumble.backends._cpu_terms import (
+    activate,
+    adam,
     bounce,
     corner_features,
     gaussian_terms,
     image_terms,
     material_terms,
+    prefilter,
     sh_shade,
+    shading_term,
 )
 from tumble.backends._structs import Baking, Bvh, Fusion, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
     "blend",
+    "activate",
+    "adam",
     "blockers",
     "bounce",
     "build",
@@ -54,11 +60,13 @@ __all__ = [
     "image_terms",
     "lookup",
     "material_terms",
+    "prefilter",
     "rasterize",
     "ready",
     "relight",
     "sh_shade",
     "shade",
+    "shading_term",
     "trace",
     "visible",
 ]

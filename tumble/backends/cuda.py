@@ -14,18 +14,24 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tumble.backends import Hits, Lobes, Rendering
+from tumble.backends import Hits, Lobes, Rendering, ShadedPixels, ShadingLight
 from tumble.backends.reference import (
+    activate,
+    adam,
     bounce,
     corner_features,
     gaussian_terms,
     image_terms,
     lookup,
     material_terms,
+    prefilter,
     sh_shade,
+    shading_term_by,
 )
 
 __all__ = [
+    "activate",
+    "adam",
     "blockers",
     "bounce",
     "build",
@@ -34,10 +40,12 @@ __all__ = [
     "image_terms",
     "lookup",
     "material_terms",
+    "prefilter",
     "rasterize",
     "ready",
     "sh_shade",
     "shade",
+    "shading_term",
     "trace",
     "visible",
 ]
@@ -283,6 +291,18 @@ def shade(
     values = _Shade.apply(normal, roughness, view, *rest)
     visible, total = values[:, 6:].detach().unbind(1)
     return Lobes(values[:, :3], values[:, 3:6], visible / total.clamp(min=torch.finfo(total.dtype).tiny))
+
+
+def shading_term(
+    view: ShadedPixels,
+    light: ShadingLight,
+    R_cam_obj: Float[Tensor, "3 3"],
+    R_env_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    f0: Float[Tensor, "3"],
+) -> Float[Tensor, ""]:
+    """See `Backend.shading_term`; only its `shade` is a kernel."""
+    return shading_term_by(shade, view, light, R_cam_obj, R_env_obj, fx_fy_cx_cy, f0)
 
 
 class _Shade(torch.autograd.Function):

@@ -5,6 +5,7 @@ frame, `W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a
 """
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from tumble.backends import (
     FACING,
     IRRADIANCE_FLOOR,
     KNEE,
+    NARROW_ROUGHNESS,
     NEAR,
     NEAR_SIGMAS,
     NORMAL_GRADIENT,
@@ -31,12 +33,17 @@ from tumble.backends import (
     SSIM_WINDOW,
     T_MIN,
     UNKNOWN,
+    Leaf,
     Lobes,
     Rendering,
+    ShadedPixels,
+    ShadingLight,
 )
-from tumble.backends._brute import blockers, build, rotation, trace, unpack, visible
+from tumble.backends._brute import blockers, build, lookup, rotation, shade, trace, visible
 
 __all__ = [
+    "activate",
+    "adam",
     "blockers",
     "bounce",
     "build",
@@ -45,10 +52,12 @@ __all__ = [
     "image_terms",
     "lookup",
     "material_terms",
+    "prefilter",
     "rasterize",
     "ready",
     "sh_shade",
     "shade",
+    "shading_term",
     "trace",
     "visible",
 ]
@@ -288,79 +297,6 @@ def harmonics(d: Float[Tensor, "*b 3"], k: int) -> Float[Tensor, "*b k"]:
     return torch.stack(basis, -1)
 
 
-def shade(
-    normal: Float[Tensor, "p 3"],
-    roughness: Float[Tensor, " p"],
-    view: Float[Tensor, "p 3"],
-    directions: Float[Tensor, "d 3"],
-    radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "q words"],
-    blocker: Int32[Tensor, "#q #d"],
-    rows: Int64[Tensor, " p"],
-    blocker_radiance: Float[Tensor, "m 3"],
-) -> Lobes:
-    """See `Backend.shade`."""
-    d = directions.shape[0]
-    visible = unpack(visibility, d)[rows]
-    arriving = torch.where(visible[..., None], radiance, 0)
-    if blocker_radiance.shape[0]:
-        blocker = blocker.expand(len(visibility), d)[rows]
-        is_blocked = ~visible & (blocker >= 0)
-        arriving = torch.where(is_blocked[..., None], blocker_radiance[blocker.clamp(min=0).long()], arriving)
-    a = roughness.clamp(min=ROUGHNESS_MIN)[:, None] ** 2
-    n_w = normal @ directions.T
-    n_v = (normal * view).sum(-1, keepdim=True)
-    HH = 2 * (1 + view @ directions.T)
-    exists = (HH > 1e-6) & (n_v > 0)
-    HH = torch.where(exists, HH, 1)
-    H = view[:, None] + directions
-    t = (torch.linalg.cross(normal[:, None], H).square().sum(-1) + a * a * (n_v + n_w) ** 2) / HH
-    m = 1 - 0.5 * HH.sqrt()
-    fresnel = 1 + 24 * m**3 * (0.9878 + m * (-3.8886 + m * (9.1922 + m * (-9.6217 + m * 4.3303))))
-    g_v, g_w = (0.5 * (x + (a * a + (1 - a * a) * x * x).sqrt()) for x in (n_v.clamp(min=0), n_w.clamp(min=0)))
-    specular = torch.where(exists, fresnel * a * a / (4 * math.pi * t * t * g_v * g_w), 0)
-    lit = arriving * (n_w.clamp(min=0) * (4 * math.pi / d))[..., None]
-    with torch.no_grad():
-        c = ((2 * n_v * normal - view) @ directions.T).clamp(min=0)
-        bb = a.clamp(min=math.sqrt(math.pi / d) / 2) ** 2
-        weight = torch.where(n_w > 0, c / (0.5 * (1 - c) + bb * 0.5 * (1 + c)) ** 2, 0)
-        fraction = (weight * visible).sum(-1) / weight.sum(-1).clamp(min=torch.finfo(weight.dtype).tiny)
-    return Lobes(lit.sum(1) / math.pi, torch.einsum("pd,pdc->pc", specular, lit), fraction)
-
-
-def lookup(
-    stack: Float[Tensor, "levels h w 3"],
-    directions: Float[Tensor, "p 3"],
-    roughness: Float[Tensor, " p"],
-) -> Float[Tensor, "p 3"]:
-    """See `Backend.lookup`."""
-    levels, h, w, _ = stack.shape
-    x, y, z = directions.unbind(-1)
-    rho2 = x * x + z * z
-    # The gradient of atan2(0, 0) is infinite.
-    pole = rho2 == 0
-    rho = torch.where(pole, 0.0, torch.where(pole, 1.0, rho2).sqrt())
-    u = torch.atan2(torch.where(pole, 0.0, x), torch.where(pole, 1.0, -z)) / (2 * math.pi) + 0.5
-    column, row = u * w - 0.5, torch.atan2(rho, y) / math.pi * h - 0.5
-    level = roughness.clamp(0, 1) * (levels - 1)
-    left, top, low = (position.detach().floor() for position in (column, row, level))
-    values = torch.zeros_like(directions)
-    for k in range(8):
-        right, down, up = k & 1, k >> 1 & 1, k >> 2
-        at_level, at_row, at_column = (
-            (low + up).long().clamp(max=levels - 1),
-            (top + down).long(),
-            (left + right).long(),
-        )
-        # The neighbour across a pole is the same row, half a revolution away.
-        beyond = (at_row < 0) | (at_row >= h)
-        at_column = torch.where(beyond, at_column + w // 2, at_column) % w
-        x, y, z = column - left, row - top, level - low
-        weight = (x if right else 1 - x) * (y if down else 1 - y) * (z if up else 1 - z)
-        values = values + weight[:, None] * stack[at_level, at_row.clamp(0, h - 1), at_column]
-    return values
-
-
 def sh_shade(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
@@ -416,19 +352,19 @@ def image_terms(
     fx_fy_cx_cy: Float[Tensor, "4"],
     ssim_weight: float,
     crease: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
 ) -> Float[Tensor, "4"]:
     """See `Backend.image_terms`."""
     known, image = (mask != UNKNOWN).to(rgb), photo.to(rgb) / 255
-    power = 1.055 * rgb.clamp(min=KNEE) ** (1 / 2.4) - 0.055
-    srgb = torch.where(rgb <= KNEE, 12.92 * rgb.clamp(min=0), power)
+    srgb = _srgb(rgb)
     srgb = torch.where((photo >= SATURATED) & (srgb > image), image, srgb)
     x, y = srgb * known[..., None], image * known[..., None]
     photometric = (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - similarity(x, y)).mean()
     silhouette = ((alpha - (mask == OBJECT).to(rgb)) ** 2 * known).mean()
     deviation = torch.where(alpha > 0, (depth_var.clamp(min=0) + 1e-6).sqrt() - 1e-3, 0).mean()
-    return torch.stack(
-        [photometric, silhouette, _normal_term(depth, alpha, normal, R_cam_obj, fx_fy_cx_cy, crease), deviation]
-    )
+    consistency = _normal_term(depth, alpha, normal, R_cam_obj, fx_fy_cx_cy, crease)
+    terms = (photometric, silhouette, consistency, deviation)
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
 
 
 def similarity(x: Float[Tensor, "h w 3"], y: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 h-10 w-10"]:
@@ -486,6 +422,7 @@ def gaussian_terms(
     fx_fy_cx_cy: Float[Tensor, "4"],
     floor: float,
     reach: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Float[Tensor, "3"]:
     """See `Backend.gaussian_terms`."""
     if not len(means):
@@ -504,7 +441,29 @@ def gaussian_terms(
         inlier = visible & ((surface - z).abs() < reach) & (surface > 0)
         surface = torch.where(inlier, surface, 0)  # NaN behind the camera would reach the gradients
     difference = torch.where(inlier, (z - surface).abs(), 0).sum() / visible.sum().clamp(min=1)
-    return torch.stack([needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference])
+    terms = (needle.mean() + log_scales[:, 2].exp().mean(), sharpness, difference)
+    return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)])
+
+
+def activate(
+    log_scales: Float[Tensor, "n 3"], sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """See `Backend.activate`."""
+    inside = torch.sigmoid(-gamma * sdf)
+    return log_scales.exp(), 4 * inside * (1 - inside)
+
+
+@torch.no_grad()
+def adam(leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+    """See `Backend.adam`."""
+    if not all(bool(leaf.gradient.isfinite().all()) for leaf in leaves):
+        return False
+    for leaf in leaves:
+        leaf.first.lerp_(leaf.gradient, 1 - beta_1)
+        leaf.second.mul_(beta_2).addcmul_(leaf.gradient, leaf.gradient, value=1 - beta_2)
+        root = leaf.second.sqrt() / math.sqrt(1 - beta_2**leaf.count) + eps
+        leaf.value.addcdiv_(leaf.first, root, value=-leaf.rate / (1 - beta_1**leaf.count))
+    return True
 
 
 def corner_features(
@@ -527,6 +486,72 @@ def bounce(
     """See `Backend.bounce`."""
     coefficients = 4 * math.pi / len(directions) * harmonics(directions, 9).T @ radiance
     return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
+
+
+def shading_term(
+    view: ShadedPixels,
+    light: ShadingLight,
+    R_cam_obj: Float[Tensor, "3 3"],
+    R_env_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    f0: Float[Tensor, "3"],
+) -> Float[Tensor, ""]:
+    """See `Backend.shading_term`."""
+    return shading_term_by(shade, view, light, R_cam_obj, R_env_obj, fx_fy_cx_cy, f0)
+
+
+def shading_term_by(
+    shade_by: Callable[..., Lobes],
+    view: ShadedPixels,
+    light: ShadingLight,
+    R_cam_obj: Float[Tensor, "3 3"],
+    R_env_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    f0: Float[Tensor, "3"],
+) -> Float[Tensor, ""]:
+    """`Backend.shading_term` with the function `shade` of a backend."""
+    counted, pixels, width = (view.pixels >= 0)[:, None], view.pixels.clamp(min=0), view.alpha.shape[1]
+    albedo, roughness, offset = view.features.flatten(0, 1)[pixels].split([3, 1, 3], -1)
+    normal = normalize(view.normal.flatten(0, 1)[pixels] + offset, dim=-1)
+    fx, fy, cx, cy = fx_fy_cx_cy
+    x, y = ((pixels % width + 0.5 - cx) / fx, (pixels // width + 0.5 - cy) / fy)
+    towards = normalize(-torch.stack([x, y, torch.ones_like(x)], -1).to(normal) @ R_cam_obj, dim=-1)
+    n_v, d = (normal * towards).sum(-1, keepdim=True), len(light.directions)
+    looked = torch.cat([light.directions, 2 * n_v * normal - towards]) @ R_env_obj.T
+    cell = torch.full_like(light.directions[:, 0], d**-0.25)
+    arriving = lookup(light.stack, looked, torch.cat([cell, roughness[:, 0]]))
+    sky, mirrored = arriving.split([d, len(pixels)])
+    bounced = bounce(light.albedo, light.transfer, light.directions, sky) if len(light.albedo) else sky[:0]
+    rows = view.dominant.flatten()[pixels].clamp(min=0).long()
+    seen = light.visibility, light.blocker, rows, bounced
+    lobes = shade_by(normal, roughness[:, 0], towards, light.directions, sky, *seen)
+    at = torch.cat(
+        [2 * (roughness.clamp(min=ROUGHNESS_MIN) - ROUGHNESS_MIN) / (1 - ROUGHNESS_MIN), 2 * n_v.clamp(0, 1)], -1
+    )
+    options = {"padding_mode": "border", "align_corners": True}
+    reflectance = grid_sample(light.table[None, None], at[None, None] - 1, **options)[0, 0, 0, :, None]
+    narrow = mirrored * lobes.specular_visibility[:, None] * reflectance
+    wide = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
+    reflected = albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wide)
+    linear, photo = reflected * view.alpha.flatten()[pixels, None], view.photo.flatten(0, 1)[pixels]
+    srgb, image = _srgb(linear), photo.to(linear) / 255
+    srgb = torch.where((photo >= SATURATED) & (srgb > image), image, srgb)
+    return ((srgb - image).abs() * counted).mean()
+
+
+def _srgb(linear: Tensor) -> Tensor:
+    power = 1.055 * linear.clamp(min=KNEE) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= KNEE, 12.92 * linear.clamp(min=0), power)
+
+
+def prefilter(radiance: Float[Tensor, "h w 3"], lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "out w 3"]:
+    """See `Backend.prefilter`."""
+    width, rows = radiance.shape[1], lobes.shape[1]
+    spectrum = torch.view_as_real(torch.fft.rfft(radiance.permute(2, 0, 1)))  # colour, row, frequency, part
+    # The product in this order takes a quarter of the time of its transpose.
+    filtered = spectrum.permute(2, 0, 3, 1).flatten(1, 2) @ lobes.mT
+    filtered = filtered.view(-1, 3, 2, rows).permute(3, 1, 0, 2).contiguous()
+    return torch.cat([radiance, torch.fft.irfft(torch.view_as_complex(filtered), n=width).mT])
 
 
 def material_terms(

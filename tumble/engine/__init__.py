@@ -4,9 +4,10 @@ It works on generic stages, configurations and trees of tensors.
 """
 
 from tumble.engine import loop, optim, run
-from tumble.engine.loop import Progress, Stage, State, drive
+from tumble.engine.loop import CACHE, Progress, Stage, State, drive
 
 __all__ = [
+    "CACHE",
     "Progress",
     "Stage",
     "State",

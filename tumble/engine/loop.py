@@ -32,6 +32,8 @@ from tumble.io import BadFile, files, progress, read_tensors, tree, write_tensor
 
 REPORT_SECONDS = 5.0
 """Minimum time between two reports [s]."""
+CACHE = "cache."
+"""Prefix of the names of tensors in `State.memory` that checkpoints do not contain."""
 PREVIEW = "preview.png"
 """Name of the preview image in the folder of the checkpoint."""
 RESTART = "the stage starts again from its first step"
@@ -55,7 +57,8 @@ class State:
     rng: torch.Generator
     """Random generator of the stage, always on the CPU; samples are moved to the device after drawing."""
     memory: dict[str, Tensor] = field(default_factory=dict)
-    """Further tensors of the state, such as accumulators and caches."""
+    """Further tensors of the state, such as accumulators. Those whose names begin with `CACHE` are left out of
+    checkpoints: the stage computes them again, from the others, if they are missing."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +240,8 @@ class _SavedState(msgspec.Struct, frozen=True):
 def _parts(state: State) -> dict[str, dict[str, Tensor]]:
     """The tensors of a state, by part and by name."""
     moments = optim.pack(state.optimizer) if state.optimizer else {}
-    return {"params": tree.named_tensors(state.params), "optimizer": moments, "memory": state.memory}
+    memory = {name: x for name, x in state.memory.items() if not name.startswith(CACHE)}
+    return {"params": tree.named_tensors(state.params), "optimizer": moments, "memory": memory}
 
 
 def _check(state: State, checkpoint: Path | None) -> None:

@@ -8,7 +8,8 @@ The *moments* are Adam's running means of the gradient and of its square. *Regro
 transfer the moments and return a new tree, whose leaves replace the old ones in the optimizer.
 """
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from tumble import backends
 from tumble.io import tree as trees
 
 T = TypeVar("T")
@@ -39,9 +41,9 @@ class NotFinite(ValueError):
 
 @dataclass
 class Adam:
-    """Adam (Kingma and Ba 2015) with the fields of `torch.optim.Adam`, and with the kernel that its fused step calls.
+    """Adam (Kingma and Ba 2015) with the fields of `torch.optim.Adam`.
 
-    The class of torch itself imports its compiler, which takes two seconds, and spends more time around the kernel than
+    The class of torch itself imports its compiler, which takes two seconds, and spends more time around its kernel than
     the kernel takes.
     """
 
@@ -56,31 +58,49 @@ class Adam:
     found_inf: Tensor | None = None
     """On a GPU: 1 since the first loss or gradient that was not finite, from which on no leaf moves; else 0."""
 
-    def zero_grad(self) -> None:
-        """Forget the gradients of all leaves."""
-        for group in self.param_groups:
-            group["params"][0].grad = None
+    def state_of(self, leaf: Tensor) -> dict[str, Tensor]:
+        """State of a leaf, which begins with zeros."""
+        if leaf not in self.state:
+            first, second = (torch.zeros_like(leaf, memory_format=torch.preserve_format) for _ in MOMENTS)
+            count = torch.zeros((), dtype=torch.float32, device=leaf.device)
+            self.state[leaf] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
+        return self.state[leaf]
 
     @torch.no_grad()
-    def step(self) -> None:
-        """Move every leaf that has a gradient.
+    def step(self, gradients: Sequence[Tensor | None]) -> bool:
+        """Move every leaf that has a gradient, unless one is not finite; whether all were."""
+        moved = [(g, x) for g, x in zip(self.param_groups, gradients, strict=True) if x is not None]
+        states = [self.state_of(group["params"][0]) for group, _ in moved]
+        leaves = [
+            backends.Leaf(group["params"][0], x, *(state[key] for key in MOMENTS), group["lr"], int(state["step"]) + 1)
+            for (group, x), state in zip(moved, states, strict=True)
+        ]
+        if not leaves:
+            return True
+        backend = backends.choose(leaves[0].value.device, leaves[0].value.dtype)
+        if not backend.adam(leaves, *self.betas, self.eps):
+            return False
+        for state in states:
+            state["step"] += 1
+        return True
+
+    @torch.no_grad()
+    def step_without_waiting(self, gradients: Sequence[Tensor | None]) -> None:
+        """`step` on a device, which moves nothing if `found_inf` is set.
 
         Raises:
             RuntimeError: torch has no fused kernel for the device.
         """
-        for group in self.param_groups:
-            leaf = group["params"][0]
-            if leaf.grad is None:
+        assert self.found_inf is not None, "a GPU is told whether the gradients are finite"
+        for group, gradient in zip(self.param_groups, gradients, strict=True):
+            if gradient is None:
                 continue
-            if leaf not in self.state:
-                first, second = (torch.zeros_like(leaf, memory_format=torch.preserve_format) for _ in MOMENTS)
-                count = torch.zeros((), dtype=torch.float32, device=leaf.device)
-                self.state[leaf] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
-            state = self.state[leaf]
-            state["step"] += 1 if self.found_inf is None else 1 - self.found_inf
+            leaf = group["params"][0]
+            state = self.state_of(leaf)
+            state["step"] += 1 - self.found_inf
             torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
                 [leaf],
-                [leaf.grad],
+                [gradient],
                 [state["exp_avg"]],
                 [state["exp_avg_sq"]],
                 [],
@@ -159,29 +179,26 @@ def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     Raises:
         NotFinite: The loss or a gradient holds NaN or infinity; no leaf was changed since.
     """
-    optimizer.zero_grad()
-    loss.backward()
-    gradients = {name: x.grad for name, x in _named_leaves(optimizer) if x.grad is not None}
+    leaves = [group["params"][0] for group in optimizer.param_groups]
+    found = torch.autograd.grad(loss, leaves, allow_unused=True)
+    gradients = [None if x is None else x.contiguous() for x in found]
     if loss.device.type != "cpu":
         _step_without_waiting(loss.detach(), gradients, optimizer, step)
-        return
-    # One scalar covers all gradients, so that each step waits for the device only once.
-    norm = torch.nn.utils.get_total_norm(list(gradients.values()))
-    if not bool(torch.isfinite(norm + loss.detach())):
-        _raise_if_not_finite(loss, gradients, step)
-    optimizer.step()
+    elif not (math.isfinite(loss.item()) and optimizer.step(gradients)):
+        _raise_if_not_finite(loss, gradients, optimizer, step)
 
 
-def _step_without_waiting(loss: Tensor, gradients: dict[str, Tensor], optimizer: Adam, step: int) -> None:
+def _step_without_waiting(loss: Tensor, gradients: Sequence[Tensor | None], optimizer: Adam, step: int) -> None:
     """One optimizer step on a device, which changes nothing from the first loss or gradient that is not finite."""
-    largest = torch.nn.utils.get_total_norm(list(gradients.values()), norm_type=float("inf"))
+    found = [x for x in gradients if x is not None]
+    largest = torch.nn.utils.get_total_norm(found, norm_type=float("inf"))
     bad = (~torch.isfinite(torch.stack([largest, loss])).all()).float()
     if optimizer.found_inf is not None:
         bad = torch.maximum(bad, optimizer.found_inf)
     optimizer.found_inf = bad
-    optimizer.step()
+    optimizer.step_without_waiting(gradients)
     if (step + 1) % CHECK_EVERY == 0 and bool(bad):
-        _raise_if_not_finite(loss, gradients, step)
+        _raise_if_not_finite(loss, gradients, optimizer, step)
         check_steps(optimizer, step)
 
 
@@ -191,11 +208,12 @@ def check_steps(optimizer: Adam, step: int) -> None:
         raise NotFinite(f"the loss or a gradient in one of the last {CHECK_EVERY} steps", step)
 
 
-def _raise_if_not_finite(loss: Tensor, gradients: dict[str, Tensor], step: int) -> None:
-    """Raise `NotFinite` for the first tensor that is not finite; there is none if only the norm overflowed."""
+def _raise_if_not_finite(loss: Tensor, gradients: Sequence[Tensor | None], optimizer: Adam, step: int) -> None:
+    """Raise `NotFinite` for the first tensor that is not finite, if there is one."""
     if not torch.isfinite(loss):
         raise NotFinite("the loss", step)
-    if name := first_not_finite(gradients.items()):
+    named = zip((group["name"] for group in optimizer.param_groups), gradients, strict=True)
+    if name := first_not_finite((name, x) for name, x in named if x is not None):
         raise NotFinite(name, step, part="the gradient")
 
 
@@ -348,10 +366,6 @@ def unpack(optimizer: Adam, tensors: dict[str, Tensor]) -> None:
         optimizer.state.pop(leaf, None)
         if state:
             optimizer.state[leaf] = {key: x.to(leaf.device, copy=True) for key, x in state.items()}
-
-
-def _named_leaves(optimizer: Adam) -> list[tuple[str, Tensor]]:
-    return [(group["name"], group["params"][0]) for group in optimizer.param_groups]
 
 
 def _matches(key: str, name: str) -> bool:

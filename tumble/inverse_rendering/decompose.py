@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from tumble.engine import State, optim
+from tumble.engine import CACHE, State, optim
 from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
@@ -34,18 +34,22 @@ from tumble.rendering import (
     render_gbuffer,
     shade,
     shade_split,
+    shading_light,
+    split_lobes,
     surface,
     surface_points,
     threads_for_kernels,
     transfer,
     unoccluded,
     visibility,
+    with_offset,
 )
 from tumble.scene import (
     DIELECTRIC,
     OBJECT,
     TEMPERATURE,
     Asset,
+    Camera,
     Capture,
     Environment,
     Gaussians,
@@ -53,7 +57,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 17
+VERSION = 18
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -64,6 +68,9 @@ FIT_FRAMES = 64
 """Maximum number of frames in the grid search of the specular lobe."""
 FIT_PIXELS = 2
 """Pixels per frame in the grid search of the specular lobe, as a multiple of the pixels of a step."""
+BLOCKERS = f"{CACHE}blocker"
+"""Name of the blockers of all sets in the state's memory: gigabytes at 100,000 Gaussians, so that no checkpoint has
+them."""
 MAX_DISPLACEMENT = 0.3
 """Displacement of the Gaussians (`trace.displacement`) above which visibility is traced again."""
 
@@ -234,20 +241,21 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
     """
     params, capture, parts = state.params, inputs.capture, []
     roughnesses = sorted({cfg.roughness, *specular_fit.ROUGHNESSES})
-    bounce = _bounce(cfg, state, params, corner_features(params.material)[1])
+    bounce, light = _bounce(cfg, state, params, corner_features(params.material)[1]), prefilter(params.environment)
     for frame in range(0, len(capture), -(-len(capture) // FIT_FRAMES)):
         T_cam_obj = pose(params, inputs, frame)
         view = render_gbuffer(params, T_cam_obj, capture.camera)
         truth = target_view(capture, frame, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
-        pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view, inner > 0.5, state.rng)
-        points = surface(view, T_cam_obj, capture.camera, pixels=pixels)
+        pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view.alpha, inner > 0.5, state.rng)
+        points = surface(view, T_cam_obj, capture.camera, pixels=pixels[pixels >= 0])
         R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
-        white = torch.ones_like(points.normals)
-        gaussian, rough = _dominant_gaussian(view, points), points.sample(view.features["roughness"])
-        lobes = [(white, rough, 0.0), *((0 * white, torch.full_like(rough, r), DIELECTRIC) for r in roughnesses)]
-        diffuse, *specular = (_shade(cfg, state, params, points, gaussian, R_env_obj, *x, bounce) for x in lobes)
-        parts.append((gaussian, diffuse, torch.stack(specular), points.sample(truth.image)))
+        gaussian, like = _dominant_gaussian(view, points), points.normals[:, :1]
+        visible = _pixel_visibility(cfg, state, params, points, gaussian)
+        rough = [torch.full_like(like, r) for r in roughnesses]
+        lobes = [split_lobes(points, r, light, R_env_obj, visible, bounce=bounce) for r in rough]
+        specular = DIELECTRIC * torch.stack([specular for _, specular in lobes])
+        parts.append((gaussian, lobes[0][0], specular, points.sample(truth.image)))
     gaussian, diffuse, specular, photo = zip(*parts, strict=True)
     samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photo)))
     scale, initial, n = params.log_specular_scale.exp(), roughnesses.index(cfg.roughness), len(params.gaussians.means)
@@ -315,25 +323,32 @@ def _trace_visibility(cfg: Config, inputs: Inputs, state: State) -> None:
         return
     params, gaussians = state.params, state.params.gaussians
     poses = [pose(params, inputs, frame) for frame in range(len(inputs.capture))]
-    points = surface_points(gaussians, params.gamma, poses, inputs.capture.camera)
-    tracer = build_tracer(gaussians, params.gamma)
-    traced = [
-        visibility(tracer, points, gaussians.normals, directions, blockers=cfg.bounce != "none")
-        for directions in state.memory["directions"]
-    ]
-    state.memory["bits"] = torch.stack([v.bits for v in traced])
     state.memory |= {f"traced.{name}": x.detach().clone() for name, x in tree.named_tensors(gaussians).items()}
+    state.memory["traced.points"] = surface_points(gaussians, params.gamma, poses, inputs.capture.camera)
+    traced = _visibility_of_traced(cfg, state)
+    state.memory["bits"] = torch.stack([v.bits for v in traced])
     if cfg.bounce != "none":
         state.memory["transfer"] = transfer(traced, gaussians.normals)
-        state.memory["blocker"] = torch.stack([v.blocker for v in traced if v.blocker is not None])
+        state.memory[BLOCKERS] = torch.stack([v.blocker for v in traced if v.blocker is not None])
+
+
+def _traced_gaussians(state: State) -> Gaussians:
+    """The geometry of which visibility was last traced."""
+    return Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
+
+
+def _visibility_of_traced(cfg: Config, state: State) -> list[Visibility]:
+    """Visibility of the traced geometry, for each set of directions."""
+    gaussians, points = _traced_gaussians(state), state.memory["traced.points"]
+    tracer, blockers = build_tracer(gaussians, state.params.gamma), cfg.bounce != "none"
+    return [visibility(tracer, points, gaussians.normals, x, blockers=blockers) for x in state.memory["directions"]]
 
 
 def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
     """Trace visibility again when geometry has moved by about the width of a shadow's edge since the last time."""
     if not _caches_visibility(cfg) or state.step < cfg.warmup or state.step % DISPLACEMENT_CHECK_EVERY:
         return
-    traced = Gaussians(*(state.memory[f"traced.{name}"] for name in tree.named_tensors(state.params.gaussians)))
-    if displacement(traced, state.params.gaussians) > MAX_DISPLACEMENT:
+    if displacement(_traced_gaussians(state), state.params.gaussians) > MAX_DISPLACEMENT:
         _trace_visibility(cfg, inputs, state)
 
 
@@ -372,23 +387,16 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     corners, mean_albedo = corner_features((params if cfg.corners else without_corners(params)).material)
     view = rasterize_material(params, corners, T_cam_obj, capture.camera)
     photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
-    points = surface(
-        view, T_cam_obj, capture.camera, pixels=_sample_pixels(cfg.pixels, view, mask == OBJECT, state.rng)
+    shown = _Shown(
+        view,
+        _sample_pixels(cfg.pixels, view.alpha, mask == OBJECT, state.rng),
+        photo,
+        T_cam_obj,
+        inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj),
     )
-    R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
-    f0 = params.material.f0 * params.log_specular_scale.exp()
-    albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
-    gaussian, bounce = _dominant_gaussian(view, points), _bounce(cfg, state, params, mean_albedo)
-    shaded = _shade(cfg, state, params, points, gaussian, R_env_obj, albedo, rough, f0, bounce)
-    rendered, wanted = (
-        (shaded * points.sample(view.alpha[..., None]))[None],
-        points.sample(photo)[None].to(albedo) / 255,
-    )
-    difference = (losses.srgb_as_captured(rendered, wanted) - wanted).abs().sum()
     of_view = losses.material_terms(view, photo, mask)
     terms = {
-        # A frame may have no pixel that certainly shows the object.
-        "render": difference / (3 * max(1, len(points.pixels))),
+        "render": _render_term(cfg, state, params, shown, capture.camera, mean_albedo),
         "light": cfg.weights.light * _light_smoothness(cfg, params.environment),
         "mask": cfg.weights.mask * of_view["mask"],
         "material": cfg.weights.material * of_view["material"],
@@ -407,12 +415,58 @@ def _light_smoothness(cfg: Config, light: Environment) -> Float[Tensor, ""]:
     return losses.light_smoothness(light.log_radiance if cfg.smooth_light == "log radiance" else light.radiance)
 
 
-def _sample_pixels(n: int, view: Buffers, mask: Bool[Tensor, "h w"], rng: torch.Generator) -> Tensor:
-    """`n` random pixels that certainly show the object, counted row by row; none if there are no such pixels."""
-    solid = torch.where(((view.alpha > 0.5) & mask).flatten())[0]
-    if not len(solid):
-        return solid
-    return solid[torch.randint(len(solid), (n,), generator=rng).to(solid.device)]
+def _sample_pixels(
+    n: int, alpha: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"], rng: torch.Generator
+) -> Int64[Tensor, "{n}"]:
+    """`n` pixels that certainly show the object, counted row by row; -1 if there are no such pixels.
+
+    Systematic sampling: every n-th part of the list of these pixels gives one, all at the same place of their part. The
+    host asks the device for nothing.
+    """
+    count = ((alpha > 0.5) & mask).flatten().cumsum(0, dtype=torch.int32)
+    place = torch.arange(n, device=alpha.device) + float(torch.rand((), generator=rng))
+    total = count[-1]
+    rank = torch.minimum((place * (total / n)).int(), total - 1)
+    return torch.where(total > 0, torch.searchsorted(count, rank + 1), -1)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A view of a step and the pixels that it compares with the input image."""
+
+    view: Buffers
+    """View by `rasterize_material`."""
+    pixels: Int64[Tensor, " p"]
+    """Pixels, counted row by row; negative ones do not count."""
+    photo: UInt8[Tensor, "h w 3"]
+    """Input image, sRGB."""
+    T_cam_obj: SE3
+    R_env_obj: Float[Tensor, "3 3"]
+
+
+def _render_term(
+    cfg: Config, state: State, params: Params, shown: _Shown, camera: Camera, mean_albedo: Float[Tensor, "n 3"]
+) -> Float[Tensor, ""]:
+    """The photometric term: mean absolute difference between shaded pixels and the input image.
+
+    A kernel computes it for lobes, shadows and indirect light as in our recipes (`losses.shading_term`).
+    """
+    f0 = params.material.f0 * params.log_specular_scale.exp()
+    bounce = _bounce(cfg, state, params, mean_albedo)
+    light = prefilter(params.environment) if cfg.lobes == "split" else None
+    cached = _caches_visibility(cfg) and cfg.shadows == "cached" and not isinstance(bounce, AveragedBounce)
+    if cached and light is not None and not light.is_finer:
+        shading = shading_light(light, _cached_visibility(cfg, state), bounce)
+        pose = (shown.T_cam_obj, shown.R_env_obj)
+        return losses.shading_term(shown.view, shown.pixels, shown.photo, camera, *pose, shading, f0)
+    view, pixels = with_offset(shown.view), shown.pixels.clamp_min(0)
+    points = surface(view, shown.T_cam_obj, camera, pixels=pixels)
+    albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
+    gaussian = _dominant_gaussian(view, points)
+    shaded = _shade(cfg, state, params, points, gaussian, shown.R_env_obj, albedo, rough, f0, bounce)
+    rendered, wanted = (shaded * points.sample(view.alpha[..., None])), points.sample(shown.photo).to(albedo) / 255
+    error = (losses.srgb_as_captured(rendered[None], wanted[None]) - wanted).abs()[0]
+    return (error * (shown.pixels >= 0)[:, None]).mean()
 
 
 def _shade(
@@ -451,15 +505,24 @@ def _bounce(cfg: Config, state: State, params: Params, albedo: Float[Tensor, "n 
 
 def _pixel_visibility(cfg: Config, state: State, params: Params, points: Surface, index: Tensor) -> Visibility:
     """Visibility of pixels for this step's set of directions: of their points, or of the Gaussians `index`."""
-    memory, current, blockers = state.memory, state.step % cfg.sets, cfg.bounce != "none"
-    directions = memory["directions"][current]
+    directions = state.memory["directions"][state.step % cfg.sets]
     if not cfg.visibility:
         return unoccluded(directions, len(index))
     if cfg.shadows == "traced":
         tracer = build_tracer(params.gaussians, params.gamma)
-        return visibility(tracer, points.points.detach(), points.normals.detach(), directions, blockers=blockers)
-    blocker = memory["blocker"][current] if blockers else None
-    return Visibility(directions, memory["bits"][current], blocker).gather(index)
+        at = (points.points.detach(), points.normals.detach(), directions)
+        return visibility(tracer, *at, blockers=cfg.bounce != "none")
+    return _cached_visibility(cfg, state).gather(index)
+
+
+def _cached_visibility(cfg: Config, state: State) -> Visibility:
+    """Visibility of all Gaussians for this step's set of directions, as it was last traced."""
+    memory, current = state.memory, state.step % cfg.sets
+    if cfg.bounce == "none":
+        return Visibility(memory["directions"][current], memory["bits"][current], None)
+    if BLOCKERS not in memory:  # after a checkpoint was read
+        memory[BLOCKERS] = torch.stack([v.blocker for v in _visibility_of_traced(cfg, state) if v.blocker is not None])
+    return Visibility(memory["directions"][current], memory["bits"][current], memory[BLOCKERS][current])
 
 
 def _upsample_light(cfg: Config, state: State) -> None:

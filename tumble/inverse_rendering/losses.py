@@ -4,8 +4,11 @@ Images are sRGB, channels last. `photo` is the input image. Pixels with an unkno
 are computed together are kernels of the backends.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy
 
@@ -13,6 +16,11 @@ from tumble import backends
 from tumble.maths import SE3, srgb_from_linear
 from tumble.rendering import Buffers
 from tumble.scene import OBJECT, UNKNOWN, Camera, Gaussians
+
+IMAGE_TERMS = ("render", "mask", "normal", "variance")
+"""Names of the terms of `image_terms`, in the order of the backends."""
+GAUSSIAN_TERMS = ("rank", "gamma", "proj")
+"""Names of the terms of `gaussian_terms`, in the order of the backends."""
 
 
 def srgb_as_captured(linear: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -33,8 +41,9 @@ def image_terms(
     *,
     ssim_weight: float,
     crease: float = 0.0,
+    weights: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Float[Tensor, ""]]:
-    """Terms of a view of stage 2 by name, averaged over the image (eq. 11; exact in `Backend.image_terms`).
+    """Weighted terms of a view of stage 2 by name, averaged over the image (eq. 11; exact in `Backend.image_terms`).
 
     render: `(1 - ssim_weight) L1 + ssim_weight (1 - SSIM)` between rendering and input image (L_render).
     mask: mean squared difference between coverage and mask. Related methods use binary cross entropy (`mask_entropy`),
@@ -51,6 +60,7 @@ def image_terms(
         ssim_weight: Weight of the SSIM term, 0 to 1.
         crease: If c > 0, the difference x of normals becomes x / (1 + c x), which saturates beyond 1 / c: large
             differences are edges or grooves, which the term would otherwise round off or fill.
+        weights: Factors of the terms; 1 for those that are not named.
 
     Raises:
         ValueError: The image is smaller than the window of SSIM.
@@ -60,8 +70,10 @@ def image_terms(
         raise ValueError(f"an image of {size} is smaller than the window of {backends.SSIM_WINDOW} pixels")
     images = (view.rgb, view.alpha, view.depth, view.depth_var, view.normal, photo, mask)
     pose = (T_cam_obj.rotation.matrix(), camera.fx_fy_cx_cy.to(view.alpha))
-    terms = backends.choose(view.alpha.device, view.alpha.dtype).image_terms(*images, *pose, ssim_weight, crease)
-    return dict(zip(("render", "mask", "normal", "variance"), terms.unbind(), strict=True))
+    factors = [weights.get(name, 1.0) for name in IMAGE_TERMS]
+    backend = backends.choose(view.alpha.device, view.alpha.dtype)
+    terms = backend.image_terms(*images, *pose, ssim_weight, crease, factors)
+    return dict(zip(IMAGE_TERMS, terms.unbind(), strict=True))
 
 
 def mask_entropy(alpha: Float[Tensor, "h w"], mask: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:
@@ -82,8 +94,9 @@ def gaussian_terms(
     *,
     floor: float,
     reach: float,
+    weights: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Float[Tensor, ""]]:
-    """Terms of the Gaussians in stage 2 by name (eq. 11; exact in `Backend.gaussian_terms`).
+    """Weighted terms of the Gaussians in stage 2 by name (eq. 11; exact in `Backend.gaussian_terms`).
 
     rank: penalty on needle-shaped Gaussians, which is 0 for discs and spheres, plus the mean thickness (L_rank).
     gamma: difference by which gamma is below the value at which the median Gaussian has an opacity of 1/2 (L_gamma).
@@ -98,18 +111,49 @@ def gaussian_terms(
         T_cam_obj: Pose of the view.
         floor: Lower limit of the median distance, which limits gamma [object radius].
         reach: Differences of depth above this belong to another surface and count as 0 [object radius].
+        weights: Factors of the terms; 1 for those that are not named.
     """
     own = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sdf, gamma)
     pose = (T_cam_obj.rotation.matrix(), T_cam_obj.translation, camera.fx_fy_cx_cy.to(gamma))
     backend = backends.choose(gamma.device, gamma.dtype)
-    terms = backend.gaussian_terms(*own, view.weight, view.depth.detach(), *pose, floor, reach)
-    return dict(zip(("rank", "gamma", "proj"), terms.unbind(), strict=True))
+    factors = [weights.get(name, 1.0) for name in GAUSSIAN_TERMS]
+    terms = backend.gaussian_terms(*own, view.weight, view.depth.detach(), *pose, floor, reach, factors)
+    return dict(zip(GAUSSIAN_TERMS, terms.unbind(), strict=True))
 
 
 def light_smoothness(texels: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Mean squared difference of neighbouring texels of an environment map, also across its seam (L_light, eq. 14)."""
     down, across = texels[1:] - texels[:-1], texels.roll(-1, 1) - texels
     return (down**2).mean() + (across**2).mean()
+
+
+def shading_term(
+    view: Buffers,
+    pixels: Int64[Tensor, " p"],
+    photo: UInt8[Tensor, "h w 3"],
+    camera: Camera,
+    T_cam_obj: SE3,
+    R_env_obj: Float[Tensor, "3 3"],
+    light: backends.ShadingLight,
+    f0: Float[Tensor, "3"],
+) -> Float[Tensor, ""]:
+    """Photometric term of stage 3: mean absolute difference between shaded pixels and input image, as in `shade_split`.
+
+    Args:
+        view: View by `rasterize_material`, with the feature "material".
+        pixels: Pixels to shade, counted row by row; negative ones do not count.
+        photo: Input image, sRGB.
+        camera: Intrinsics of the view.
+        T_cam_obj: Pose of the view.
+        R_env_obj: Rotation from the object frame to the env frame.
+        light: Light and occlusion.
+        f0: Reflectance at normal incidence.
+    """
+    shaded = backends.ShadedPixels(
+        view.features["material"], view.alpha, view.normal, view.dominant, photo.contiguous(), pixels
+    )
+    pose = (T_cam_obj.rotation.matrix(), R_env_obj, camera.fx_fy_cx_cy.to(view.alpha))
+    return backends.choose(view.alpha.device, view.alpha.dtype).shading_term(shaded, light, *pose, f0)
 
 
 def material_terms(

@@ -369,11 +369,6 @@ def _terms(
     weights, camera = cfg.weights, capture.camera
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
     photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
-    terms = losses.image_terms(view, photo, mask, camera, T_cam_obj, ssim_weight=cfg.ssim, crease=cfg.crease)
-    if cfg.mask_loss == "entropy":
-        terms |= {"mask": losses.mask_entropy(view.alpha, mask)}
-    own = (params.points.gaussians, params.gamma, view, camera, T_cam_obj)
-    terms |= losses.gaussian_terms(*own, floor=cfg.gamma_floor, reach=0.1)
     factors = {
         "mask": weights.mask,
         "normal": ramp * weights.normal,
@@ -382,8 +377,13 @@ def _terms(
         "gamma": weights.gamma,
         "proj": weights.proj,
     }
-    weighted = {name: factors.get(name, 1.0) * term for name, term in terms.items()}
-    return weighted | {"specular": weights.specular * -torch.expm1(-params.light.log_specular_scale.square())}
+    image = {"ssim_weight": cfg.ssim, "crease": cfg.crease, "weights": factors}
+    terms = losses.image_terms(view, photo, mask, camera, T_cam_obj, **image)
+    if cfg.mask_loss == "entropy":
+        terms |= {"mask": weights.mask * losses.mask_entropy(view.alpha, mask)}
+    own = (params.points.gaussians, params.gamma, view, camera, T_cam_obj)
+    terms |= losses.gaussian_terms(*own, floor=cfg.gamma_floor, reach=0.1, weights=factors)
+    return terms | {"specular": weights.specular * -torch.expm1(-params.light.log_specular_scale.square())}
 
 
 @torch.no_grad()

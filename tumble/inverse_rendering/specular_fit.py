@@ -81,16 +81,19 @@ def fit(samples: Samples, n: int, roughness_index: int, specular_scale: float) -
         specular_scale: Initial specular scale.
     """
 
-    # Sums by Gaussian take half the time if its pixels are neighbours in memory.
+    # Sums by Gaussian are faster if its pixels are neighbours in memory.
     order = samples.gaussian.argsort(stable=True)
     gaussian, diffuse, photo = (x[order] for x in (samples.gaussian, samples.diffuse, samples.photo))
-    samples = Samples(gaussian, diffuse, samples.specular[:, order], photo)
+    samples, counts = (
+        Samples(gaussian, diffuse, samples.specular[:, order], photo),
+        torch.bincount(gaussian, minlength=n),
+    )
 
     def errors(specular: Tensor, min_albedo: float) -> Tensor:
-        return torch.stack([fit_error(samples, specular, scale, n, min_albedo)[0] for scale in SPECULAR_SCALES])
+        return torch.stack([fit_error(samples, specular, scale, counts, min_albedo)[0] for scale in SPECULAR_SCALES])
 
     grid = torch.stack([errors(specular, 0.0) for specular in samples.specular])
-    initial_error = fit_error(samples, samples.specular[roughness_index], specular_scale, n, 0.0)[0]
+    initial_error = fit_error(samples, samples.specular[roughness_index], specular_scale, counts, 0.0)[0]
     if grid.min() > (1 - MIN_IMPROVEMENT) * initial_error:
         return None
     best_roughness = int(grid.amin(1).argmin())
@@ -99,23 +102,23 @@ def fit(samples: Samples, n: int, roughness_index: int, specular_scale: float) -
         return None  # errors of light and shape can make the optimal scale grow without limit
     scale = SPECULAR_SCALES[best_scale]
     x, s = samples.diffuse, samples.specular[best_roughness]
-    _, weight = fit_error(samples, s, scale, n, -math.inf)
-    albedo_per_scale = torch.stack([_albedos(samples, weight, y, n) for y in samples.specular])
+    _, weight = fit_error(samples, s, scale, counts, -math.inf)
+    albedo_per_scale = torch.stack([_albedos(samples, weight, y, counts) for y in samples.specular])
     independent = s - albedo_per_scale[best_roughness][samples.gaussian] * x
     fraction = ((weight * independent.square()).sum(0) / (weight * s.square()).sum(0).clamp_min(1e-12)).mean()
     return SpecularFit(best_roughness, scale, albedo_per_scale) if fraction > MIN_INDEPENDENT_FRACTION else None
 
 
 def fit_error(
-    samples: Samples, specular: Float[Tensor, "p 3"], scale: float, n: int, min_albedo: float
+    samples: Samples, specular: Float[Tensor, "p 3"], scale: float, counts: Int64[Tensor, " n"], min_albedo: float
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "p 3"]]:
     """Mean absolute error in sRGB with the best albedo of every Gaussian, and the final weights of the pixels.
 
     Args:
-        samples: Pixels with their lobes.
+        samples: Pixels with their lobes, sorted by Gaussian.
         specular: Specular lobe at scale 1, of one roughness.
         scale: Specular scale.
-        n: Number of Gaussians.
+        counts: Number of pixels of every Gaussian.
         min_albedo: Lower limit of the albedos.
     """
     y = samples.photo
@@ -124,7 +127,7 @@ def fit_error(
     squared, diffuse = sensitivity.square(), y - scale * specular
     weight, error = squared, y
     for _ in range(REWEIGHTINGS):
-        albedo = _albedos(samples, weight, diffuse, n).clamp_min(min_albedo)
+        albedo = _albedos(samples, weight, diffuse, counts).clamp_min(min_albedo)
         modelled = albedo.index_select(0, samples.gaussian).mul_(samples.diffuse)
         error = torch.sub(diffuse, modelled, out=modelled).mul_(sensitivity).abs_()
         weight = squared / (error + ERROR_FLOOR)
@@ -132,12 +135,12 @@ def fit_error(
 
 
 def _albedos(
-    samples: Samples, weight: Float[Tensor, "p 3"], radiance: Float[Tensor, "p 3"], n: int
+    samples: Samples, weight: Float[Tensor, "p 3"], radiance: Float[Tensor, "p 3"], counts: Int64[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
     """Weighted least-squares albedo of each Gaussian for a given diffuse radiance of the pixels."""
 
     def sum_by_gaussian(values: Tensor) -> Tensor:
-        return values.new_zeros(n, 3).index_add(0, samples.gaussian, values)
+        return torch.segment_reduce(values, "sum", lengths=counts, unsafe=True)
 
     weighted = weight * samples.diffuse
     return sum_by_gaussian(weighted * radiance) / sum_by_gaussian(weighted * samples.diffuse).clamp_min(1e-9)

@@ -11,7 +11,7 @@ rigid motions, `(v, omega)`. `exp` is smooth everywhere, `log` for angles below 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, overload
 
 import numpy as np
@@ -98,6 +98,14 @@ class SO3:
 
     def matrix(self) -> Float[Tensor, "*b 3 3"]:
         """Rotation matrices, `R @ x_b = x_a` for column vectors."""
+        # A matrix with a gradient may not be kept: the first caller may have switched gradients off.
+        return self._computed_matrix() if self.wxyz.requires_grad else self._kept_matrix
+
+    @cached_property
+    def _kept_matrix(self) -> Float[Tensor, "*b 3 3"]:
+        return self._computed_matrix()
+
+    def _computed_matrix(self) -> Float[Tensor, "*b 3 3"]:
         q = self.wxyz
         products = (q[..., :, None] * q[..., None, :]).flatten(-2)
         # One matrix product instead of many small operations, because stages convert single poses in every step.
@@ -176,7 +184,7 @@ class SE3:
         """From rotation matrices, without translation."""
         return SE3(SO3.from_matrix(matrix).wxyz, torch.zeros_like(matrix[..., 0]))
 
-    @property
+    @cached_property
     def rotation(self) -> SO3:
         """`R_a_b`."""
         return SO3(self.wxyz)

@@ -5,7 +5,13 @@ It calls the rendering kernels of `backends`, and contains no losses and no trai
 
 from tumble.backends import threads_for_kernels, usable_device
 from tumble.rendering import lit_frames, relight
-from tumble.rendering.gbuffer import antialiased_gbuffer, corner_features, rasterize_material, render_gbuffer
+from tumble.rendering.gbuffer import (
+    antialiased_gbuffer,
+    corner_features,
+    rasterize_material,
+    render_gbuffer,
+    with_offset,
+)
 from tumble.rendering.prefiltered_light import Prefiltered, prefilter
 from tumble.rendering.rasterizer import Buffers, rasterize
 from tumble.rendering.shading import (
@@ -14,6 +20,8 @@ from tumble.rendering.shading import (
     Surface,
     shade,
     shade_split,
+    shading_light,
+    split_lobes,
     surface,
 )
 from tumble.rendering.trace import (
@@ -47,6 +55,8 @@ __all__ = [
     "render_gbuffer",
     "shade",
     "shade_split",
+    "shading_light",
+    "split_lobes",
     "surface",
     "surface_points",
     "threads_for_kernels",
@@ -54,4 +64,5 @@ __all__ = [
     "unoccluded",
     "usable_device",
     "visibility",
+    "with_offset",
 ]

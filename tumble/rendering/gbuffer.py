@@ -42,8 +42,12 @@ def corner_features(material: Material) -> tuple[Float[Tensor, "n 4 7"], Float[T
 
 
 def rasterize_material(asset: HasMaterial, corners: Float[Tensor, "n 4 7"], T_cam_obj: SE3, camera: Camera) -> Buffers:
-    """View with the feature "material": albedo, roughness and normal offset; normals include the offset."""
-    view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, {"material": corners})
+    """View with the feature "material": albedo, roughness and normal offset; normals are those without the offset."""
+    return rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, {"material": corners})
+
+
+def with_offset(view: Buffers) -> Buffers:
+    """A view by `rasterize_material` whose normals include the offset."""
     return replace(view, normal=view.normal + view.features["material"][..., 4:])
 
 
@@ -56,7 +60,7 @@ def render_gbuffer(
         corners: `corner_features` of the material, if they are known.
     """
     corners = corner_features(asset.material)[0] if corners is None else corners
-    view = rasterize_material(asset, corners, T_cam_obj, camera)
+    view = with_offset(rasterize_material(asset, corners, T_cam_obj, camera))
     images = view.features["material"].split([3, 1, 3], -1)
     return replace(view, features=dict(zip(("albedo", "roughness", "offset"), images, strict=True)))
 

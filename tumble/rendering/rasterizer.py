@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tumble import backends
 from tumble.maths import SE3
-from tumble.scene import Camera, Gaussians, opacity
+from tumble.scene import Camera, Gaussians
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ def rasterize(
     corners = [*features.values()] or [means.new_zeros(len(gaussians), 4, 0)]
     # A single feature is not copied.
     corners = corners[0] if len(corners) == 1 else torch.cat(corners, -1)
-    view = backends.choose(means.device, means.dtype).rasterize(
+    backend = backends.choose(means.device, means.dtype)
+    view = backend.rasterize(
         means,
         gaussians.quats,
-        gaussians.scales,
-        opacity(gaussians.sdf, gamma),
+        *backend.activate(gaussians.log_scales, gaussians.sdf, gamma),
         gaussians.sh,
         corners,
         T_cam_obj.rotation.matrix(),

@@ -19,16 +19,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from tumble import backends
+from tumble.backends import NARROW_ROUGHNESS
 from tumble.maths import SE3, reflect
 from tumble.rendering import brdf
 from tumble.rendering.prefiltered_light import Prefiltered, cell_roughness
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.trace import Visibility
 from tumble.scene import Camera, Environment
-
-NARROW_ROUGHNESS = (0.3, 0.45)
-"""Range of roughness over which `shade_split` blends from the prefiltered lobe to the sum over directions; below it, a
-few hundred directions cannot resolve the lobe."""
 
 
 @dataclass(frozen=True)
@@ -201,6 +198,25 @@ def split_lobes(
     )
     wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
     return lobes.diffuse, torch.lerp(narrow, lobes.specular, wideness)
+
+
+def shading_light(prefiltered: Prefiltered, visibility: Visibility, bounce: Bounce | None) -> backends.ShadingLight:
+    """Light and occlusion of `shade_split` for the kernel `Backend.shading_term`, which finds the rows by itself.
+
+    Raises:
+        ValueError: The light has a higher resolution than its convolutions, which the kernel does not look up.
+    """
+    stack = prefiltered.stack
+    if prefiltered.is_finer:
+        raise ValueError(
+            f"a light of {len(prefiltered.radiance)} rows is finer than its {stack.shape[1]} filtered ones"
+        )
+    albedo, transfer = stack.new_zeros(0, 3), stack.new_zeros(0, 9)
+    blocker = stack.new_full((1, 1), -1, dtype=torch.int32)
+    if bounce is not None and visibility.blocker is not None:
+        albedo, transfer, blocker = bounce.albedo, bounce.transfer, visibility.blocker
+    seen = (visibility.directions, visibility.bits, blocker, albedo, transfer)
+    return backends.ShadingLight(stack, *seen, reflectance_table(stack.dtype, stack.device))
 
 
 def specular(

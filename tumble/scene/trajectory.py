@@ -8,6 +8,7 @@ light also turns by itself, from frame to frame.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 import torch
@@ -22,8 +23,13 @@ Light = Literal["camera", "object"]
 
 def opengl_from_opencv(like: Tensor) -> Float[Tensor, "3 3"]:
     """Rotation from OpenCV to OpenGL camera axes, and its own inverse."""
-    # Made on the device: a list of numbers would be copied to it, for which the host waits.
-    return torch.diag(1 - 2 * (torch.arange(3, device=like.device) > 0).to(like))
+    return _opengl_from_opencv(like.dtype, like.device)
+
+
+@cache
+def _opengl_from_opencv(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 3"]:
+    """`opengl_from_opencv`, copied to a device once."""
+    return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=dtype)).to(device)
 
 
 def env_from_obj(T_cam_obj: SE3, light: Light) -> Float[Tensor, "*b 3 3"]:

@@ -7,7 +7,7 @@
 struct GaussianTerms {
     const float *means, *quats, *log_scales, *sdf, *gamma, *weight, *depth, *R, *t, *focal;
     int n, height, width, threads;
-    float floor, reach;
+    float floor, reach, weights[3];   // weights: of the terms
     u32* magnitudes;   // one per Gaussian
     float *terms, *g_means, *g_quats, *g_log_scales, *g_sdf, *g_gamma, *g_R, *g_t;   // g_R and g_t: the third row
 };
@@ -37,11 +37,11 @@ static void sharpness_term(const GaussianTerms& s) {
         s.magnitudes[i] &= 0x7fffffff;
     }
     float missing = 1.762747f / fmax2(median(s.magnitudes, s.n), s.floor) - s.gamma[0];
-    s.terms[1] = fmax2(missing, 0), s.g_gamma[0] = missing >= 0 ? -1 : 0;
+    s.terms[1] = s.weights[1] * fmax2(missing, 0), s.g_gamma[0] = missing >= 0 ? -s.weights[1] : 0;
 }
 
 static void rank_term(const GaussianTerms& s) {
-    float per_gaussian = 1.0f / s.n;
+    float per_gaussian = s.weights[0] / s.n;
     vf total = {};
     for (int first = 0; first < s.n; first += LANES) {
         int count = imin2(LANES, s.n - first);
@@ -84,7 +84,7 @@ INLINE vf depth_at(const GaussianTerms& s, vf u, vf v, vi wanted) {
 static void projection_term(const GaussianTerms& s) {
     int seen = 0;
     for (int i = 0; i < s.n; i++) seen += s.weight[i] > 0;
-    float per_seen = 1.0f / imax2(seen, 1);
+    float per_seen = s.weights[2] / imax2(seen, 1);
     vf total = {}, v_R[3] = {}, v_t = {};
     for (int first = 0; first < s.n; first += LANES) {
         int count = imin2(LANES, s.n - first);

@@ -15,7 +15,7 @@ struct Image {
     const u8 *photo, *mask;
     const float *R, *focal, *taps;   // taps: the weights of SSIM's window along one axis
     int height, width, plane_size, threads;   // plane_size: floats of a plane of the whole image
-    float ssim_weight, crease, saturated, knee, c1, c2;
+    float ssim_weight, crease, saturated, knee, c1, c2, weights[4];   // weights: of the terms
     float* scratch;                  // PLANES planes per channel
     float *terms, *g_rgb, *g_alpha, *g_depth, *g_depth_var, *g_normal, *g_R;
 };
@@ -148,8 +148,8 @@ static float photometric(const Image& m, const Window& w, int ch) {
     for (int i = 0; i < 3; i++) clear(maps[i], 4 * size);
     float l1 = srgb_planes(m, w, ch, x, y, slope);
     float unlike = similarity(m, w, x, y, rows, maps);
-    float of_l1 = (1 - m.ssim_weight) / (3.0f * m.height * m.width);
-    float of_ssim = m.ssim_weight / (3.0f * (m.height - MARGIN) * (m.width - MARGIN));
+    float of_l1 = m.weights[0] * (1 - m.ssim_weight) / (3.0f * m.height * m.width);
+    float of_ssim = m.weights[0] * m.ssim_weight / (3.0f * (m.height - MARGIN) * (m.width - MARGIN));
     blur_maps(m, w, maps, rows);
     for (int r = 0; r < w.height; r++)
         for (int c = 0; c < w.width; c += LANES) {
@@ -168,7 +168,8 @@ static float photometric(const Image& m, const Window& w, int ch) {
 
 // Terms of mask and depth variance, which concern single pixels.
 static void pixel_terms(const Image& m, const Window& w) {
-    float per_pixel = 1 / ((float)m.height * m.width);
+    float per_pixel = 1 / ((float)m.height * m.width), of_mask = m.weights[1] * per_pixel;
+    float of_deviation = m.weights[3] * per_pixel;
     vf mask_sum = {}, deviation = {};
     for (int r = 0; r < w.height; r++)
         for (int c = 0; c < w.width; c += LANES) {
@@ -178,17 +179,17 @@ static void pixel_terms(const Image& m, const Window& w) {
             vf alpha = load_some(m.alpha + at, n);
             vf error = keep(code != 128.0f, alpha - keep(code == 255.0f, splat(1.0f)));
             mask_sum += error * error;
-            store_some(m.g_alpha + at, 2 * per_pixel * error, n);
+            store_some(m.g_alpha + at, 2 * of_mask * error, n);
             vf var = load_some(m.depth_var + at, n), root = vsqrt(vmax(var, vf{}) + 1e-6f);
             deviation += keep(alpha > 0.0f, root - 1e-3f);
-            store_some(m.g_depth_var + at, keep((alpha > 0.0f) & (var >= 0.0f), 0.5f * per_pixel / root), n);
+            store_some(m.g_depth_var + at, keep((alpha > 0.0f) & (var >= 0.0f), 0.5f * of_deviation / root), n);
         }
-    m.terms[1] = per_pixel * sum_of(mask_sum), m.terms[3] = per_pixel * sum_of(deviation);
+    m.terms[1] = of_mask * sum_of(mask_sum), m.terms[3] = of_deviation * sum_of(deviation);
 }
 
 // Term of the consistency of rendered normals with those of the depth map.
 static void normal_term(const Image& m, const Window& w) {
-    float per_pixel = 1 / ((float)m.height * m.width), fx = m.focal[0], fy = m.focal[1];
+    float per_pixel = m.weights[2] / ((float)m.height * m.width), fx = m.focal[0], fy = m.focal[1];
     vf total = {}, v_R[9] = {};
     for (int row = imax2(1, w.top); row < imin2(m.height - 1, w.top + w.height); row++) {
         float Y = (row + 0.5f - m.focal[3]) / fy;

@@ -8,10 +8,13 @@
 #include "maps.h"
 #include "material.h"
 #include "parallel.h"
+#include "parameters.h"
+#include "prefilter.h"
 #include "project.h"
 #include "relight.h"
 #include "sh_shade.h"
 #include "shade.h"
+#include "shading_term.h"
 
 #define API extern "C" __attribute__((visibility("default")))
 
@@ -21,7 +24,8 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(Fusion), sizeof(Baking), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep),
+                       sizeof(ShadingTerm), sizeof(Prefilter), sizeof(Fusion), sizeof(Baking), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -107,10 +111,18 @@ API void sh_shade_adjoint(const ShShade* s) {
     parallel(s->threads, [=, &light](int share) { sh_shade_adjoint_share(*s, light, share); });
 }
 
+API void activation_forward(const GaussianActivation* s) {
+    parallel(s->threads, [=](int share) { gaussian_activation_share(*s, share); });
+}
+API void activation_adjoint(const GaussianActivation* s) {
+    parallel(s->threads, [=](int share) { gaussian_activation_adjoint_share(*s, share); });
+}
+API int adam(const AdamStep* s) { return adam_step(*s); }
+
 API void image_loss(const Image* m) { image_terms(*m); }
 API void gaussian_loss(const GaussianTerms* s) { gaussian_terms(*s); }
 
-API void lookup_forward(const Lookup* s) { lookup_values(*s); }
+API void lookup_forward(const Lookup* s) { lookup_values(*s, 0, 1); }
 API void lookup_backward(const Lookup* s) { lookup_adjoint(*s); }
 
 API void material_forward(const Activation* m) {
@@ -122,6 +134,11 @@ API void material_adjoint(const Activation* m) {
 API void bounce_forward(const Indirect* s) { bounce_values(*s, false); }
 API void bounce_adjoint(const Indirect* s) { bounce_values(*s, true); }
 API void material_loss(const MaterialImage* m) { material_terms(*m); }
+
+API void prefilter_forward(const Prefilter* s) { prefilter_map(*s); }
+API void prefilter_backward(const Prefilter* s) { prefilter_adjoint(*s); }
+
+API void shading_loss(const ShadingTerm* s) { shading_term(*s); }
 
 API void relight_points(const Relight* s) {
     parallel(s->threads, [=](int share) { relight_share(*s, share); });

@@ -1,5 +1,6 @@
 // Lookups in a stack of equirectangular maps, one level per roughness, and their adjoint (`Backend.lookup`).
 #pragma once
+#include "raster.h"
 #include "simd.h"
 
 struct Lookup {
@@ -114,9 +115,10 @@ INLINE vf value_at(const Lookup& s, const Texels& o, int ch) {
     return blend(blend(x[0], x[1], o.fy), blend(x[2], x[3], o.fy), o.fz);
 }
 
-static void lookup_values(const Lookup& s) {
-    for (int first = 0; first < s.n; first += LANES) {
-        int count = imin2(LANES, s.n - first);
+static void lookup_values(const Lookup& s, int share, int shares) {
+    int end = share_start(s.n, share + 1, shares);
+    for (int first = share_start(s.n, share, shares); first < end; first += LANES) {
+        int count = imin2(LANES, end - first);
         Texels o;
         texels_at(s, first, count, o);
         for (int ch = 0; ch < 3; ch++) {
