@@ -5,8 +5,8 @@ kernels render: **rasterize** (splatting of Gaussians), **trace** (rays against 
 light). The others replace hundreds of small operations per step: colour (**sh_shade**), materials
 (**corner_features**), light (**lookup**, **bounce**) and loss terms (**image_terms**, **gaussian_terms**,
 **material_terms**). `reference.py` defines the correct result; the others compute the same, faster. There are no
-options: rules for culling, depth and interpolation are part of the method, and other rules need another module. One
-more kernel, that of relighting (`RelightKernel`), is optional.
+options: rules for culling, depth and interpolation are part of the method, and other rules need another module. Two
+more kernels are optional, those of relighting (`RelightKernel`) and of bundle adjustment (`BundleKernel`).
 
 Vocabulary
     *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third axis
@@ -35,10 +35,14 @@ import torch
 
 from tumble.backends._contract import (
     Backend,
+    BundleKernel,
+    BundleObservations,
+    BundleVariables,
     GlossyGaussians,
     Hits,
     LightTables,
     Lobes,
+    ReducedBundle,
     RelightKernel,
     Rendering,
     SurfaceSamples,
@@ -48,6 +52,9 @@ __all__ = [
     "ALPHA_MAX",
     "ALPHA_MIN",
     "Backend",
+    "BundleKernel",
+    "BundleObservations",
+    "BundleVariables",
     "CORNER",
     "FACING",
     "GlossyGaussians",
@@ -62,6 +69,7 @@ __all__ = [
     "OBJECT",
     "RATIO_MAX",
     "ROUGHNESS_MIN",
+    "ReducedBundle",
     "RelightKernel",
     "Rendering",
     "SATURATED",
@@ -74,6 +82,7 @@ __all__ = [
     "T_MIN",
     "UNKNOWN",
     "VISIBLE",
+    "bundle_kernel",
     "choose",
     "load",
     "names",
@@ -216,6 +225,12 @@ def choose(device: torch.device, dtype: torch.dtype) -> Backend:
 def relight_kernel(backend: Backend) -> RelightKernel | None:
     """The kernel of relighting of a backend, None if it has none."""
     return getattr(backend, "relight", None)
+
+
+def bundle_kernel() -> BundleKernel | None:
+    """The kernel of bundle adjustment, which runs on the CPU; None if it is not ready."""
+    backend = load("cpu")
+    return None if backend.ready(torch.device("cpu"), torch.float32) else cast(BundleKernel, backend)
 
 
 @cache

@@ -489,3 +489,93 @@ class RelightKernel(Protocol):
             f0: Reflectance at normal incidence, of points and Gaussians.
         """
         ...
+
+
+class BundleObservations(NamedTuple):
+    """Observations of points by cameras in `g` groups that share neither; observations are sorted by point, and points
+    by group."""
+
+    camera: Int64[Tensor, " o"]
+    """Camera of every observation, numbered over all groups, each of which has as many."""
+    uv: Float64[Tensor, "o 2"]
+    """Observed position [pixels]."""
+    weight: Float64[Tensor, " o"]
+    point: Int64[Tensor, " n"]
+    """Index of every point in `BundleVariables.X`, in this order."""
+    first_observation: Int64[Tensor, " n+1"]
+    """First observation of every point, and the number of all."""
+    first_point: Int64[Tensor, " g+1"]
+    """First point of every group, and the number of all."""
+    principal: tuple[float, float]
+    """Principal point cx, cy [pixels]."""
+    scale: float
+    """Scale s of the Cauchy loss w s^2 log(1 + |r|^2 / s^2) of a reprojection error r [pixels]."""
+    min_depth: float
+    """Lower limit of a point's depth in projections."""
+
+
+class BundleVariables(NamedTuple):
+    """Cameras, and points with a prior, prior |X|^2."""
+
+    R: Float64[Tensor, "c 3 3"]
+    t: Float64[Tensor, "c 3"]
+    focal: Float64[Tensor, "c 2"]
+    """Focal lengths fx, fy [pixels]."""
+    X: Float64[Tensor, "n 3"]
+    prior: Float64[Tensor, " g"]
+    """Weight of the prior on the points of every group."""
+
+
+class ReducedBundle(NamedTuple):
+    """Gauss-Newton normal equations of the cameras, and what the elimination of the damped points subtracts.
+
+    Parameters of a camera are a rotation vector applied from the left, and a translation. The logarithm of the focal
+    length is one more parameter of every group, on which the prior of the points depends by its square.
+    """
+
+    U: Float64[Tensor, "c 6 6"]
+    """Diagonal blocks of the cameras, without damping."""
+    g_camera: Float64[Tensor, "c 6"]
+    """Gradient by the cameras."""
+    E: Float64[Tensor, "g m m"]
+    """Subtracted from the blocks, for all parameters of a group's cameras."""
+    e: Float64[Tensor, "c 6"]
+    """Subtracted from the gradient."""
+    focal_camera: Float64[Tensor, "c 6"] | None
+    """Entries that couple the focal length with the cameras; None if it is known."""
+    focal_e: Float64[Tensor, "c 6"] | None
+    """Subtracted from them."""
+    focal_sums: Float64[Tensor, "g 4"] | None
+    """Diagonal entry and gradient of the focal length, and what is subtracted from both."""
+    points: Any
+    """What `bundle_move` needs of the points."""
+
+
+@runtime_checkable
+class BundleKernel(Protocol):
+    """Optional functions of a backend for bundle adjustment, in float64; `poses.sfm.bundle_adjustment` defines them."""
+
+    def bundle_cost(self, observations: BundleObservations, variables: BundleVariables) -> Float64[Tensor, " g"]:
+        """Loss and prior of the points of every group."""
+        ...
+
+    def bundle_reduce(
+        self,
+        observations: BundleObservations,
+        variables: BundleVariables,
+        damping: Float64[Tensor, " g"],
+        *,
+        focal_free: bool,
+    ) -> ReducedBundle:
+        """Normal equations without points, whose diagonal entries d become d + damping d + 1e-9."""
+        ...
+
+    def bundle_move(
+        self,
+        observations: BundleObservations,
+        reduced: ReducedBundle,
+        d_camera: Float64[Tensor, "c 6"],
+        d_focal: Float64[Tensor, " g"] | None,
+    ) -> Float64[Tensor, "n 3"]:
+        """Steps of the points that follow from those of the cameras and of the logarithms of the focal lengths."""
+        ...

@@ -20,6 +20,7 @@ ENTRY_POINTS = (
     *("sh_shade_forward", "sh_shade_adjoint", "image_loss", "gaussian_loss"),
     *("lookup_forward", "lookup_backward", "material_forward", "material_adjoint"),
     *("bounce_forward", "bounce_adjoint", "material_loss", "relight_points"),
+    *("bundle_cost", "bundle_reduce", "bundle_move"),
 )
 """Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (

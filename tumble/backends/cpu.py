@@ -1,4 +1,4 @@
-"""CPU backend: float32 kernels in C++ with SIMD and threads, called through a plain C ABI (see `native/`).
+"""CPU backend: kernels in C++ with SIMD and threads, called through a plain C ABI (see `native/`).
 
 This file wraps the kernels in `autograd.Function`s.
 """
@@ -7,7 +7,7 @@ import ctypes
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
 from tumble.backends import (
@@ -22,10 +22,13 @@ from tumble.backends import (
     TRACE_SIGMAS,
     TRACE_T_MIN,
     VISIBLE,
+    BundleObservations,
+    BundleVariables,
     GlossyGaussians,
     Hits,
     LightTables,
     Lobes,
+    ReducedBundle,
     Rendering,
     SurfaceSamples,
     _native,
@@ -39,12 +42,15 @@ from tumble.backends._cpu_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
+from tumble.backends._structs import Bundle, Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
     "blockers",
     "bounce",
     "build",
+    "bundle_cost",
+    "bundle_move",
+    "bundle_reduce",
     "corner_features",
     "gaussian_terms",
     "image_terms",
@@ -79,6 +85,8 @@ LEAF_FIELDS = 15
 """Numbers of a Gaussian that are computed for its leaf."""
 NODE = 10 * 16
 """Numbers of a node in `native/bvh.h`."""
+BUNDLE_POINT = 12
+"""Numbers of a point in `native/bundle.h`."""
 FEATURES_PER_PASS = 16
 """Maximum number of features that the kernels blend in one pass; more are split into several passes."""
 MAX_GRADIENT_SCRATCH = 1 << 28
@@ -487,3 +495,67 @@ def relight(
     _native.library().relight_points(ctypes.byref(struct))
     del kept
     return out
+
+
+# Bundle adjustment ----------------------------------------------------------------------------------------------------
+
+
+def bundle_cost(observations: BundleObservations, variables: BundleVariables) -> Float64[Tensor, " g"]:
+    """See `BundleKernel.bundle_cost`."""
+    struct, kept = _bundle(observations, variables)
+    cost = variables.prior.new_empty(len(variables.prior))
+    set_pointers(struct, cost=cost)
+    _native.library().bundle_cost(ctypes.byref(struct))
+    del kept
+    return cost
+
+
+def bundle_reduce(
+    observations: BundleObservations,
+    variables: BundleVariables,
+    damping: Float64[Tensor, " g"],
+    *,
+    focal_free: bool,
+) -> ReducedBundle:
+    """See `BundleKernel.bundle_reduce`."""
+    struct, kept = _bundle(observations, variables)
+    g, f = struct.n_groups, struct.n_cameras
+    row = -(-6 // (_native.library().lanes() // 2)) * (_native.library().lanes() // 2)
+    empty = variables.X.new_empty
+    camera_rows = {name: empty(g * f, 6) for name in ("g_camera", "e")}
+    focal = {"focal_camera": empty(g * f, 6), "focal_e": empty(g * f, 6), "focal_sums": empty(g, 4)}
+    results = {"U": empty(g * f, 6, 6), "E": empty(g, 6 * f, 6 * f), **camera_rows}
+    results |= focal if focal_free else dict.fromkeys(focal)
+    points = empty(len(observations.camera), 3 * row), empty(len(variables.X), BUNDLE_POINT)
+    memory = empty(struct.threads * ((f * f + f) * 6 * row + 4 * f * row))
+    kept += set_pointers(struct, results, damping=damping, records=points[0], point_records=points[1], scratch=memory)
+    _native.library().bundle_reduce(ctypes.byref(struct))
+    del kept
+    return ReducedBundle(**results, points=(variables, *points))
+
+
+def bundle_move(
+    observations: BundleObservations,
+    reduced: ReducedBundle,
+    d_camera: Float64[Tensor, "c 6"],
+    d_focal: Float64[Tensor, " g"] | None,
+) -> Float64[Tensor, "n 3"]:
+    """See `BundleKernel.bundle_move`."""
+    variables, records, point_records = reduced.points
+    struct, kept = _bundle(observations, variables)
+    moved = variables.X.new_empty(variables.X.shape)
+    kept += set_pointers(struct, records=records, point_records=point_records, d_point=moved)
+    kept += set_pointers(struct, d_camera=d_camera.contiguous(), d_focal=d_focal)
+    _native.library().bundle_move(ctypes.byref(struct))
+    del kept
+    return moved
+
+
+def _bundle(observations: BundleObservations, variables: BundleVariables) -> tuple[Bundle, list[Tensor]]:
+    """Arguments that all functions of bundle adjustment have, and the tensors that they point to."""
+    groups = len(variables.prior)
+    (cx, cy), scale, min_depth = observations.principal, observations.scale, observations.min_depth
+    sizes = {"n_groups": groups, "n_cameras": len(variables.t) // groups, "threads": min(threads(), groups)}
+    struct = Bundle(**sizes, scale=scale, min_depth=min_depth, cx=cx, cy=cy)
+    named = {name: x for name, x in observations._asdict().items() if isinstance(x, Tensor)} | variables._asdict()
+    return struct, set_pointers(struct, {name: x.contiguous() for name, x in named.items()})

@@ -1,5 +1,6 @@
 // The plain C ABI of the CPU backend, one translation unit that needs no C or C++ library.
 #include "bin.h"
+#include "bundle.h"
 #include "bvh.h"
 #include "composite.h"
 #include "gaussian_terms.h"
@@ -20,7 +21,7 @@ API int lanes() { return LANES; }
 API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
-                       sizeof(Relight), sizeof(Leaf), sizeof(Node)};
+                       sizeof(Relight), sizeof(Bundle), sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -132,4 +133,14 @@ API void material_loss(const MaterialImage* m) { material_terms(*m); }
 
 API void relight_points(const Relight* s) {
     parallel(s->threads, [=](int share) { relight_share(*s, share); });
+}
+
+API void bundle_cost(const Bundle* b) {
+    parallel(b->threads, [=](int share) { bundle_cost_share(*b, share); });
+}
+API void bundle_reduce(const Bundle* b) {
+    parallel(b->threads, [=](int share) { bundle_reduce_share(*b, share); });
+}
+API void bundle_move(const Bundle* b) {
+    parallel(b->threads, [=](int share) { bundle_move_share(*b, share); });
 }
