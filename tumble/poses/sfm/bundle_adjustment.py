@@ -572,13 +572,10 @@ def triangulate(
     sphere = radius[tracks.frame] * t.norm(dim=-1)
     half2 = sphere.square() - t.square().sum(-1) + middle.square()
     half = torch.maximum(half2, (MIN_HALF_CHORD * sphere).square()).sqrt()
-    front = torch.einsum("oji,oj->oi", R, ray * (middle - FRONT_POSITION * half)[:, None] - t)
-    direction = torch.einsum("oji,oj->oi", R, ray)
-    eye = torch.eye(3, dtype=torch.float64)
-    across = eye - direction[:, :, None] * direction[:, None]
-    centre = -torch.einsum("oji,oj->oi", R, t)
-    A = torch.zeros(tracks.n, 3, 3, dtype=torch.float64)
-    A.index_add_(0, tracks.point, across + FRONT_WEIGHT * eye)
-    b = torch.zeros(tracks.n, 3, dtype=torch.float64)
-    b.index_add_(0, tracks.point, (across @ centre[..., None])[..., 0] + FRONT_WEIGHT * front)
-    return torch.linalg.solve(A, b)
+    direction, centre = torch.einsum("oji,oj->oi", R, ray), -torch.einsum("oji,oj->oi", R, t)
+    front = centre + direction * (middle - FRONT_POSITION * half)[:, None]
+    # The projection across a ray is I - d d^T, and d . centre is -middle.
+    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(tracks.n, 3, 3, dtype=torch.float64)
+    A = zero.index_add(0, tracks.point, (1 + FRONT_WEIGHT) * eye - direction[:, :, None] * direction[:, None])
+    right = centre + direction * middle[:, None] + FRONT_WEIGHT * front
+    return torch.linalg.solve(A, zero[..., 0].index_add(0, tracks.point, right))
