@@ -34,7 +34,7 @@ MAY_IMPORT = {
     "datasets": {"io", "maths", "scene"},
     "preprocess": {"io", "maths", "scene", "datasets"},
     "synthetic": {"io", "maths", "scene", "datasets"},
-    "poses": {"io", "maths", "scene", "engine", "matching"},
+    "poses": {"io", "maths", "backends", "scene", "engine", "matching"},
     "inverse_rendering": {"io", "maths", "backends", "scene", "rendering", "engine"},
     "evaluation": {"io", "maths", "scene", "rendering", "datasets"},
     "export": {"io", "maths", "backends", "scene", "rendering"},

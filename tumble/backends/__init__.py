@@ -5,8 +5,9 @@ kernels render: **rasterize** (splatting of Gaussians), **trace** (rays against 
 light). The others replace hundreds of small operations per step: colour (**sh_shade**), materials
 (**corner_features**), light (**lookup**, **bounce**) and loss terms (**image_terms**, **gaussian_terms**,
 **material_terms**). `reference.py` defines the correct result; the others compute the same, faster. There are no
-options: rules for culling, depth and interpolation are part of the method, and other rules need another module. Three
-more kernels are optional: relighting (`RelightKernel`), depth fusion (`FuseKernel`) and baking (`BlendKernel`).
+options: rules for culling, depth and interpolation are part of the method, and other rules need another module. More
+kernels are optional: relighting (`RelightKernel`), depth fusion (`FuseKernel`), baking (`BlendKernel`) and bundle
+adjustment (`BundleKernel`).
 
 Vocabulary
     *Gaussian*: mean `mu`, rotation `R_q` of its quaternion, standard deviations `s`, opacity `o`. Its third axis
@@ -35,10 +36,6 @@ import torch
 
 from tumble.backends._contract import (
     Backend,
-    BlendKernel,
-    Cameras,
-    DepthMaps,
-    FuseKernel,
     GlossyGaussians,
     Hits,
     Leaf,
@@ -50,12 +47,25 @@ from tumble.backends._contract import (
     ShadingLight,
     SurfaceSamples,
 )
+from tumble.backends._geometry.contract import (
+    BlendKernel,
+    BundleKernel,
+    BundleObservations,
+    BundleVariables,
+    Cameras,
+    DepthMaps,
+    FuseKernel,
+    ReducedBundle,
+)
 
 __all__ = [
     "ALPHA_MAX",
     "ALPHA_MIN",
     "Backend",
     "BlendKernel",
+    "BundleKernel",
+    "BundleObservations",
+    "BundleVariables",
     "CORNER",
     "Cameras",
     "DepthMaps",
@@ -75,6 +85,7 @@ __all__ = [
     "OBJECT",
     "RATIO_MAX",
     "ROUGHNESS_MIN",
+    "ReducedBundle",
     "RelightKernel",
     "Rendering",
     "SATURATED",
@@ -90,6 +101,7 @@ __all__ = [
     "UNKNOWN",
     "VISIBLE",
     "blend_kernel",
+    "bundle_kernel",
     "choose",
     "fuse_kernel",
     "load",
@@ -247,6 +259,12 @@ def fuse_kernel(backend: Backend) -> FuseKernel | None:
 def blend_kernel(backend: Backend) -> BlendKernel | None:
     """The kernel of texture baking of a backend, None if it has none."""
     return getattr(backend, "blend", None)
+
+
+def bundle_kernel() -> BundleKernel | None:
+    """The kernel of bundle adjustment, which runs on the CPU; None if it is not ready."""
+    backend = load("cpu")
+    return None if backend.ready(torch.device("cpu"), torch.float32) else cast(BundleKernel, backend)
 
 
 @cache

@@ -23,6 +23,7 @@ ENTRY_POINTS = (
     *("maps_fuse", "maps_blend"),
     *("activation_forward", "activation_adjoint", "adam", "shading_loss"),
     *("prefilter_forward", "prefilter_backward"),
+    *("bundle_cost", "bundle_reduce", "bundle_move"),
 )
 """Functions that `native/kernels.cpp` exports."""
 FROM_SYSTEM = (

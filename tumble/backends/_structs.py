@@ -30,6 +30,10 @@ def _floats(names: str) -> list[tuple[str, Any]]:
     return [(name, ctypes.c_float) for name in names.split()]
 
 
+def _doubles(names: str) -> list[tuple[str, Any]]:
+    return [(name, ctypes.c_double) for name in names.split()]
+
+
 class Raster(ctypes.Structure):
     """`Raster` of `native/raster.h`: arguments of the rasterizer."""
 
@@ -239,10 +243,22 @@ class Prefilter(ctypes.Structure):
     ]
 
 
+class Bundle(ctypes.Structure):
+    """`Bundle` of `native/bundle.h`: arguments of bundle adjustment, in double precision."""
+
+    _fields_ = [
+        *_pointers("R t focal X uv weight prior damping camera point first_observation first_point"),
+        *_ints("n_groups n_cameras threads"),
+        *_doubles("scale min_depth cx cy"),
+        *_pointers("cost U g_camera E e focal_camera focal_e focal_sums records point_records scratch"),
+        *_pointers("d_camera d_focal d_point"),
+    ]
+
+
 STRUCTURES = (
     *(Raster, Bvh, Rays, Shade, ShShade, Image, GaussianTerms),
     *(Lookup, Activation, Indirect, MaterialImage, Relight, GaussianActivation, AdamLeaf, AdamStep),
-    *(ShadingTerm, Prefilter, Fusion, Baking),
+    *(ShadingTerm, Prefilter, Fusion, Baking, Bundle),
 )
 """All structures, in the order of `sizes` in `native/kernels.cpp`."""
 

@@ -1,4 +1,4 @@
-"""CPU backend: float32 kernels in C++ with SIMD and threads, called through a plain C ABI (see `native/`).
+"""CPU backend: kernels in C++ with SIMD and threads, called through a plain C ABI (see `native/`).
 
 This file wraps the kernels in `autograd.Function`s.
 """
@@ -22,8 +22,6 @@ from tumble.backends import (
     TRACE_SIGMAS,
     TRACE_T_MIN,
     VISIBLE,
-    Cameras,
-    DepthMaps,
     GlossyGaussians,
     Hits,
     LightTables,
@@ -45,15 +43,19 @@ from tumble.backends._cpu_terms import (
     sh_shade,
     shading_term,
 )
-from tumble.backends._structs import Baking, Bvh, Fusion, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
+from tumble.backends._geometry.cpu import blend, bundle_cost, bundle_move, bundle_reduce, fuse
+from tumble.backends._structs import Bvh, Lookup, Raster, Rays, Relight, Shade, scratch, set_pointers
 
 __all__ = [
-    "blend",
     "activate",
     "adam",
+    "blend",
     "blockers",
     "bounce",
     "build",
+    "bundle_cost",
+    "bundle_move",
+    "bundle_reduce",
     "corner_features",
     "fuse",
     "gaussian_terms",
@@ -499,49 +501,3 @@ def relight(
     _native.library().relight_points(ctypes.byref(struct))
     del kept
     return out
-
-
-@torch.no_grad()
-def fuse(
-    points: Float[Tensor, "n 3"], maps: DepthMaps, cameras: Cameras, *, cell: float, reach: float, distance: float
-) -> Float[Tensor, "5 n"]:
-    """See `FuseKernel`."""
-    out = points.new_empty(5, len(points))
-    views, height, width = maps.index.shape
-    struct = Fusion(
-        n=len(points), n_views=views, cell=cell, reach=reach, distance=distance, **_size(height, width, cameras)
-    )
-    named = {"points": points, **maps._asdict(), **cameras._asdict()}
-    del named["fx_fy_cx_cy"]
-    kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, out=out)
-    _native.library().maps_fuse(ctypes.byref(struct))
-    del kept
-    return out
-
-
-@torch.no_grad()
-def blend(
-    total: Float[Tensor, "n 7"],
-    weights: Float[Tensor, " n"],
-    maps: Float[Tensor, "h w 9"],
-    camera: Cameras,
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    *,
-    min_cosine: float,
-    tolerance: float,
-) -> None:
-    """See `BlendKernel`."""
-    size = _size(maps.shape[0], maps.shape[1], camera)
-    struct = Baking(n=len(points), min_cosine=min_cosine, tolerance=tolerance, **size)
-    named = {"maps": maps, "points": points, "normals": normals, "R": camera.R, "t": camera.t}
-    named["position"] = camera.positions
-    kept = set_pointers(struct, {name: x.contiguous() for name, x in named.items()}, total=total, weights=weights)
-    _native.library().maps_blend(ctypes.byref(struct))
-    del kept
-
-
-def _size(height: int, width: int, cameras: Cameras) -> dict[str, Any]:
-    """Size of maps, intrinsics of their cameras, and number of threads, as fields of a structure."""
-    intrinsics = dict(zip(("fx", "fy", "cx", "cy"), cameras.fx_fy_cx_cy.tolist(), strict=True))
-    return {"height": height, "width": width, "threads": threads(), **intrinsics}

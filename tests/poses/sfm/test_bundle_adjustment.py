@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tumble.backends import bundle_kernel
 from tumble.maths.se3 import SO3
 from tumble.poses.sfm import bundle_adjustment
 from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
@@ -167,6 +168,38 @@ def test_elimination_solves_the_dense_system(short: int, factor: float | None, m
     assert (system.border is None) == (d_focal is None) == (factor is None)
     H = H + torch.diag(0.01 * H.diagonal() + 1e-9)
     torch.testing.assert_close(found, torch.linalg.solve(H, -g), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [None, 1.1])
+def test_the_kernel_makes_the_step_of_plain_torch(factor: float | None) -> None:
+    """Cost and step of two groups whose points are observed in 1 to 7 frames, in any order, by outliers too."""
+    truth = scene(2, 7, 40)
+    problem, at = observed(truth, noise=0.5), perturbed(truth, 0.05)
+    if factor is not None:
+        problem, at = with_wrong_focal(at, problem, factor)
+    rng = torch.Generator().manual_seed(2)
+    kept = torch.rand(len(problem.tracks), generator=rng) < 0.6
+    kept |= problem.tracks.frame % 7 == problem.tracks.point % 7
+    shuffled = torch.nonzero(kept)[:, 0][torch.randperm(int(kept.sum()), generator=rng)]
+    tracks = Tracks(*(x[shuffled] for x in vars(problem.tracks).values()))
+    uv = tracks.uv + 40 * (torch.rand(len(tracks), 1, generator=rng) < 0.1)
+    weight = 0.5 + torch.rand(len(tracks), generator=rng).double()
+    # Groups are interleaved: the kernel sorts points by group.
+    problem = replace(problem, tracks=replace(tracks, uv=uv), weight=weight, log_focal_prior=0.02)
+    order = torch.randperm(len(at.X), generator=rng)
+    place = torch.argsort(order)
+    problem = replace(problem, group=problem.group[order], tracks=replace(problem.tracks, point=place[tracks.point]))
+    at = replace(at, X=at.X[order])
+    kernel = bundle_kernel()
+    assert kernel is not None, "the CPU has one"
+    damping = torch.tensor([0.01, 0.3]).double()
+    cost, step = bundle_adjustment._equations(problem, 1.5)
+    kernel_cost, kernel_step = bundle_adjustment._kernel_equations(kernel, problem, 1.5)
+    torch.testing.assert_close(kernel_cost(at).cost, cost(at).cost, rtol=1e-12, atol=0)
+    moved, moved_by_kernel = step(at, cost(at).system, damping), kernel_step(at, None, damping)
+    for name, x in vars(moved).items():
+        # The condition of the normal equations is about 1e6.
+        torch.testing.assert_close(getattr(moved_by_kernel, name), x, rtol=1e-9, atol=1e-9)
 
 
 def test_exact_observations_give_exact_poses() -> None:

@@ -1,5 +1,6 @@
 // The plain C ABI of the CPU backend, one translation unit that needs no C or C++ library.
 #include "bin.h"
+#include "bundle.h"
 #include "bvh.h"
 #include "composite.h"
 #include "gaussian_terms.h"
@@ -25,7 +26,8 @@ API int sizes(int which) {
     const int all[] = {sizeof(Raster), sizeof(Bvh), sizeof(Rays), sizeof(Shade), sizeof(ShShade), sizeof(Image),
                        sizeof(GaussianTerms), sizeof(Lookup), sizeof(Activation), sizeof(Indirect), sizeof(MaterialImage),
                        sizeof(Relight), sizeof(GaussianActivation), sizeof(AdamLeaf), sizeof(AdamStep),
-                       sizeof(ShadingTerm), sizeof(Prefilter), sizeof(Fusion), sizeof(Baking), sizeof(Leaf), sizeof(Node)};
+                       sizeof(ShadingTerm), sizeof(Prefilter), sizeof(Fusion), sizeof(Baking), sizeof(Bundle),
+                       sizeof(Leaf), sizeof(Node)};
     return all[which];
 }
 
@@ -149,4 +151,14 @@ API void maps_fuse(const Fusion* s) {
 }
 API void maps_blend(const Baking* s) {
     parallel(s->threads, [=](int share) { blend_share(*s, share); });
+}
+
+API void bundle_cost(const Bundle* b) {
+    parallel(b->threads, [=](int share) { bundle_cost_share(*b, share); });
+}
+API void bundle_reduce(const Bundle* b) {
+    parallel(b->threads, [=](int share) { bundle_reduce_share(*b, share); });
+}
+API void bundle_move(const Bundle* b) {
+    parallel(b->threads, [=](int share) { bundle_move_share(*b, share); });
 }

@@ -107,15 +107,15 @@ def adjust_windows(
     middle = R[:, size // 2, None]
     # The mirror image (Necker reversal) reverses depth in the rotations relative to the middle frame.
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
-    found, losses = [], []
-    for start in (R, flip @ R @ middle.mT @ flip @ middle):
-        t = silhouette_centres(inputs.capture, inputs.silhouettes)[frames]
-        scene, loss = BundleState(start, t, torch.zeros(0, 3, dtype=R.dtype)), torch.zeros(len(frames))
-        for scale in cfg.window_scales:
-            scene, loss = adjust_round(cfg, inputs, scene, tracks, group, frames, scale)
-        found.append(scene.R)
-        losses.append(loss)
-    return Windows(frames, torch.stack(found, 1), torch.stack(losses, 1))
+    g = len(frames)
+    starts = torch.cat([R, flip @ R @ middle.mT @ flip @ middle])
+    both = concatenate(tracks, replace(tracks, frame=tracks.frame + frames.numel()))
+    group, frames = torch.cat([group, group + g]), frames.repeat(2, 1)
+    t = silhouette_centres(inputs.capture, inputs.silhouettes)[frames]
+    scene, loss = BundleState(starts, t, torch.zeros(0, 3, dtype=R.dtype)), torch.zeros(2 * g)
+    for scale in cfg.window_scales:
+        scene, loss = adjust_round(cfg, inputs, scene, both, group, frames, scale)
+    return Windows(frames[:g], torch.stack(scene.R.split(g), 1), torch.stack(loss.split(g), 1))
 
 
 def averaged_windows(

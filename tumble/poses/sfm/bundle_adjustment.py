@@ -11,6 +11,7 @@ origin's mean distance from the camera; the final scale is set at the end of the
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from tumble.backends import BundleKernel, BundleObservations, BundleVariables, bundle_kernel
 from tumble.maths import SO3, Damping, Linearised, minimise
 from tumble.poses.sfm.tracks import Tracks
 from tumble.scene import Camera
@@ -193,6 +195,20 @@ def adjust(
         scale: Scale of the Cauchy loss: the residual from which an observation is down-weighted [pixels].
         tolerance: A group has converged when an iteration lowers its cost by less than this fraction.
     """
+    choose = partial(_select_better, problem)
+    damping = Damping(minimum=1e-10, maximum=1e8)
+    kernel = bundle_kernel()
+    equations = _equations(problem, scale) if kernel is None else _kernel_equations(kernel, problem, scale)
+    scene, last = minimise(scene, *equations, choose, steps=steps, damping=damping, tolerance=tolerance)
+    return scene, last.cost
+
+
+Equations = tuple[Callable[[BundleState], Linearised], Callable[[BundleState, Any, Tensor], BundleState]]
+"""Costs and normal equations of a state, and the state after the damped step that solves them."""
+
+
+def _equations(problem: Problem, scale: float) -> Equations:
+    """The equations in plain torch, which define what the kernel computes."""
     layout = _layout(problem)
 
     def linearised(scene: BundleState) -> Linearised:
@@ -202,10 +218,59 @@ def adjust(
     def moved(scene: BundleState, system: _System, damping: Tensor) -> BundleState:
         return _apply_step(scene, *_solve(problem, scene, system, damping, layout))
 
-    choose = partial(_select_better, problem)
-    damping = Damping(minimum=1e-10, maximum=1e8)
-    scene, last = minimise(scene, linearised, moved, choose, steps=steps, damping=damping, tolerance=tolerance)
-    return scene, last.cost
+    return linearised, moved
+
+
+def _kernel_equations(kernel: BundleKernel, problem: Problem, scale: float) -> Equations:
+    """The same by a kernel, which linearises again at every step instead of keeping the equations of all states."""
+    observations = _sorted_observations(problem, scale)
+
+    def variables(scene: BundleState) -> BundleVariables:
+        weight = _point_prior_weight(problem, scene, torch.arange(len(scene.t)))[:, 0].expand(len(scene.t))
+        R, t = scene.R.flatten(0, 1), scene.t.flatten(0, 1)
+        return BundleVariables(R, t, _focals(problem, scene), scene.X, weight)
+
+    def linearised(scene: BundleState) -> Linearised:
+        cost = kernel.bundle_cost(observations, variables(scene))
+        cost = cost + _origin_prior(problem, scene)[1].square().sum(-1).reshape(scene.t.shape[:2]).sum(1)
+        if scene.log_focal is not None:
+            cost = cost + _focal_weight(problem, len(cost)) * (scene.log_focal - problem.log_focal_prior).square()
+        return Linearised(cost, None)
+
+    def moved(scene: BundleState, _: None, damping: Tensor) -> BundleState:
+        g, f = scene.t.shape[:2]
+        focal_free = scene.log_focal is not None
+        reduced = kernel.bundle_reduce(observations, variables(scene), damping, focal_free=focal_free)
+        _camera_priors(problem, scene, reduced.U, reduced.g_camera)
+        U = _damped(reduced.U, damping.repeat_interleave(f)[:, None])
+        S = -reduced.E
+        S.view(g, f, 6, f, 6).diagonal(dim1=1, dim2=3).add_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
+        row = None
+        if scene.log_focal is not None:
+            assert reduced.focal_camera is not None, "the kernel was asked for them"
+            H, gradient, subtracted_H, subtracted = reduced.focal_sums.unbind(1)
+            H, gradient = _add_focal_priors(problem, scene, reduced.focal_camera, H, gradient)
+            row = _FocalRow(reduced.focal_camera - reduced.focal_e, H, gradient, subtracted_H, subtracted)
+        d_cam, d_focal = _camera_steps(S, reduced.e - reduced.g_camera, row, damping)
+        return _apply_step(scene, d_cam, kernel.bundle_move(observations, reduced, d_cam, d_focal), d_focal)
+
+    return linearised, moved
+
+
+def _sorted_observations(problem: Problem, scale: float) -> BundleObservations:
+    """The observations in the order of their points, which are in the order of their groups."""
+    tracks, g = problem.tracks, len(problem.centre)
+    point = torch.argsort(problem.group, stable=True)
+    rank = torch.empty_like(point)
+    rank[point] = torch.arange(len(point))
+    order = torch.argsort(rank[tracks.point], stable=True)
+    zero = point.new_zeros(1)
+    count = torch.bincount(tracks.point, minlength=len(point))[point]
+    first_observation = torch.cat([zero, count.cumsum(0)])
+    first_point = torch.cat([zero, torch.bincount(problem.group, minlength=g).cumsum(0)])
+    _, _, cx, cy = problem.camera.fx_fy_cx_cy.double().tolist()
+    each = tracks.frame[order], tracks.uv[order], problem.weight[order]
+    return BundleObservations(*each, point, first_observation, first_point, (cx, cy), scale, MIN_DEPTH)
 
 
 def _layout(problem: Problem) -> _Layout:
@@ -280,7 +345,7 @@ def _linearise(problem: Problem, scene: BundleState, scale: float, layout: _Layo
     cost = torch.zeros(g, dtype=torch.float64).index_add_(0, problem.group[track.point], loss)
     cost = cost + _camera_priors(problem, scene, U, g_cam)
     # A prior keeps weakly constrained points within the object.
-    prior = _point_prior_weight(problem, scene)
+    prior = _point_prior_weight(problem, scene, problem.group)
     V = V + prior[..., None] * torch.eye(3, dtype=torch.float64)
     g_point = g_point + prior * scene.X
     cost = cost.index_add(0, problem.group, prior[:, 0] * scene.X.square().sum(-1))
@@ -294,10 +359,11 @@ def _gradient(wJ: Float[Tensor, "o 2 d"], residual: Float[Tensor, "o 2"]) -> Flo
     return wJ[:, 0] * residual[:, :1] + wJ[:, 1] * residual[:, 1:]
 
 
-def _point_prior_weight(problem: Problem, scene: BundleState) -> Float[Tensor, "#n 1"]:
-    """Weight of the prior on the points' distance from the origin; a longer focal length implies a smaller object."""
+def _point_prior_weight(problem: Problem, scene: BundleState, group: Tensor) -> Float[Tensor, "#n 1"]:
+    """Weight of the prior on the distance from the origin of points in these groups; a longer focal length implies a
+    smaller object."""
     weight = torch.full((1, 1), (NOISE / problem.radius) ** 2, dtype=torch.float64)
-    return weight if scene.log_focal is None else weight * (2 * scene.log_focal).exp()[problem.group, None]
+    return weight if scene.log_focal is None else weight * (2 * scene.log_focal).exp()[group, None]
 
 
 def _focal_border(
@@ -310,17 +376,32 @@ def _focal_border(
     group = problem.group[track.point]
     J = x[:, :2] / x[:, 2:].clamp_min(MIN_DEPTH) * focal[track.frame]
     cam = torch.zeros(g * f, 6, dtype=torch.float64).index_add_(0, track.frame, _gradient(wJ_cam, J))
-    prior = _point_prior_weight(problem, scene) * scene.X
+    prior = _point_prior_weight(problem, scene, problem.group) * scene.X
     point = prior.index_add(0, track.point, _gradient(wJ_point, J))
     zero, offset = torch.zeros(g, dtype=torch.float64), scene.log_focal - problem.log_focal_prior
-    weight = (FOCAL_NOISE / FOCAL_SIGMA) ** 2 * zero.index_add(0, group, problem.weight)
     shrinkage = zero.index_add(0, problem.group, (prior * scene.X).sum(-1))
-    H = (weight + shrinkage).index_add(0, group, w * J.square().sum(-1))
-    gradient = (weight * offset + shrinkage).index_add(0, group, w * (J * residual).sum(-1))
+    H = shrinkage.index_add(0, group, w * J.square().sum(-1))
+    gradient = shrinkage.index_add(0, group, w * (J * residual).sum(-1))
+    H, gradient = _add_focal_priors(problem, scene, cam, H, gradient)
+    return _focal_weight(problem, g) * offset.square(), _FocalBorder(H, gradient, cam, point)
+
+
+def _focal_weight(problem: Problem, g: int) -> Float[Tensor, " g"]:
+    """Weight of the focal length's prior in every group."""
+    total = torch.zeros(g, dtype=torch.float64).index_add(0, problem.group[problem.tracks.point], problem.weight)
+    return (FOCAL_NOISE / FOCAL_SIGMA) ** 2 * total
+
+
+def _add_focal_priors(
+    problem: Problem, scene: BundleState, cam: Tensor, H: Tensor, gradient: Tensor
+) -> tuple[Float[Tensor, " g"], Float[Tensor, " g"]]:
+    """Diagonal entry and gradient of the focal length with all priors; those coupled with poses are added in place."""
+    assert scene.log_focal is not None, "the focal length is estimated"
+    g, weight = len(scene.t), _focal_weight(problem, len(scene.t))
     rows, r, J = _origin_prior(problem, scene)
     cam[:, 3:] += torch.einsum("cki,ck->ci", rows[:, :2], J)
-    H, gradient = H + J.square().reshape(g, -1).sum(1), gradient + (J * r[:, :2]).reshape(g, -1).sum(1)
-    return weight * offset.square(), _FocalBorder(H, gradient, cam, point)
+    gradient = gradient + weight * (scene.log_focal - problem.log_focal_prior) + (J * r[:, :2]).reshape(g, -1).sum(1)
+    return H + weight + J.square().reshape(g, -1).sum(1), gradient
 
 
 def _camera_priors(problem: Problem, scene: BundleState, U: Tensor, g_cam: Tensor) -> Float[Tensor, " g"]:
@@ -352,10 +433,7 @@ def _solve(
     """Damped steps of poses, points and, where they are estimated, logarithms of the focal lengths."""
     g, f = scene.t.shape[:2]
     lam_cam, lam_point = damping.repeat_interleave(f)[:, None], damping[problem.group][:, None]
-    U, V = (
-        H + torch.diag_embed(lam * H.diagonal(dim1=-2, dim2=-1) + 1e-9)
-        for H, lam in ((system.U, lam_cam), (system.V, lam_point))
-    )
+    U, V = _damped(system.U, lam_cam), _damped(system.V, lam_point)
     V_inv = torch.linalg.inv(V)
     frame, point = problem.tracks.frame, problem.tracks.point
     # With V_inv = L L^T, points add -(W L)(W L)^T, which is symmetric.
@@ -375,22 +453,56 @@ def _solve(
     S = S.reshape(g, 6 * f, 6 * f) - pairs - pairs.mT - half @ half.mT
     eliminated = (V_inv @ system.g_point[..., None])[point]
     right = (-system.g_cam).index_add(0, frame, (system.W @ eliminated)[..., 0])
-    d_cam = torch.linalg.solve(S, right.reshape(g, 6 * f, 1)).reshape(g * f, 6)
-    g_point, d_focal = system.g_point, None
+    g_point, row = system.g_point, None
     if (border := system.border) is not None:
         V_point = (V_inv @ border.point[..., None])[..., 0]
         side = border.cam.index_add(0, frame, -(system.W @ V_point[point][..., None])[..., 0])
-        slope = torch.linalg.solve(S, side.reshape(g, 6 * f, 1)).reshape(g * f, 6)
-
-        def total(cameras: Tensor, points: Tensor) -> Float[Tensor, " g"]:
-            return cameras.reshape(g, -1).sum(1).index_add(0, problem.group, points.sum(-1))
-
-        H = (1 + damping) * border.H - total(side * slope, border.point * V_point)
-        d_focal = (-border.g - total(side * d_cam, -V_point * g_point)) / H
-        d_cam = d_cam - d_focal.repeat_interleave(f)[:, None] * slope
+        subtracted = (
+            torch.zeros(g, dtype=torch.float64).index_add(0, problem.group, (V_point * x).sum(-1))
+            for x in (border.point, g_point)
+        )
+        row = _FocalRow(side, border.H, border.g, *subtracted)
+    d_cam, d_focal = _camera_steps(S, right, row, damping)
+    if border is not None and d_focal is not None:
         g_point = g_point + d_focal[problem.group][:, None] * border.point
     back = g_point.index_add(0, point, (system.W.mT @ d_cam[frame][..., None])[..., 0])
     return d_cam, -(V_inv @ back[..., None])[..., 0], d_focal
+
+
+@dataclass(frozen=True)
+class _FocalRow:
+    """Row of the logarithm of the focal length in the normal equations of each group, points eliminated."""
+
+    camera: Float[Tensor, "c 6"]
+    """Entries coupled with the poses."""
+    H: Float[Tensor, " g"]
+    """Diagonal entry before the elimination."""
+    g: Float[Tensor, " g"]
+    """Gradient before the elimination."""
+    subtracted_H: Float[Tensor, " g"]
+    """What points subtract from the diagonal entry."""
+    subtracted_g: Float[Tensor, " g"]
+    """What points subtract from the gradient."""
+
+
+def _camera_steps(
+    S: Float[Tensor, "g m m"], right: Float[Tensor, "c 6"], focal: _FocalRow | None, damping: Float[Tensor, " g"]
+) -> tuple[Float[Tensor, "c 6"], Float[Tensor, " g"] | None]:
+    """Steps of the poses and of the logarithms of the focal lengths; the latter are None where these are known."""
+    g, m = S.shape[:2]
+    if focal is None:
+        return torch.linalg.solve(S, right.reshape(g, m, 1)).reshape(-1, 6), None
+    both = torch.linalg.solve(S, torch.stack([right, focal.camera], -1).reshape(g, m, 2))
+    step, slope = both.unbind(-1)
+    side = focal.camera.reshape(g, m)
+    H = (1 + damping) * focal.H - focal.subtracted_H - (side * slope).sum(1)
+    d_focal = (focal.subtracted_g - focal.g - (side * step).sum(1)) / H
+    return (step - d_focal[:, None] * slope).reshape(-1, 6), d_focal
+
+
+def _damped(H: Float[Tensor, "n d d"], damping: Float[Tensor, "n 1"]) -> Float[Tensor, "n d d"]:
+    """Blocks of the normal equations with their diagonals raised."""
+    return H + torch.diag_embed(damping * H.diagonal(dim1=-2, dim2=-1) + 1e-9)
 
 
 def _apply_step(scene: BundleState, d_cam: Tensor, d_point: Tensor, d_focal: Tensor | None = None) -> BundleState:
@@ -460,13 +572,10 @@ def triangulate(
     sphere = radius[tracks.frame] * t.norm(dim=-1)
     half2 = sphere.square() - t.square().sum(-1) + middle.square()
     half = torch.maximum(half2, (MIN_HALF_CHORD * sphere).square()).sqrt()
-    front = torch.einsum("oji,oj->oi", R, ray * (middle - FRONT_POSITION * half)[:, None] - t)
-    direction = torch.einsum("oji,oj->oi", R, ray)
-    eye = torch.eye(3, dtype=torch.float64)
-    across = eye - direction[:, :, None] * direction[:, None]
-    centre = -torch.einsum("oji,oj->oi", R, t)
-    A = torch.zeros(tracks.n, 3, 3, dtype=torch.float64)
-    A.index_add_(0, tracks.point, across + FRONT_WEIGHT * eye)
-    b = torch.zeros(tracks.n, 3, dtype=torch.float64)
-    b.index_add_(0, tracks.point, (across @ centre[..., None])[..., 0] + FRONT_WEIGHT * front)
-    return torch.linalg.solve(A, b)
+    direction, centre = torch.einsum("oji,oj->oi", R, ray), -torch.einsum("oji,oj->oi", R, t)
+    front = centre + direction * (middle - FRONT_POSITION * half)[:, None]
+    # The projection across a ray is I - d d^T, and d . centre is -middle.
+    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(tracks.n, 3, 3, dtype=torch.float64)
+    A = zero.index_add(0, tracks.point, (1 + FRONT_WEIGHT) * eye - direction[:, :, None] * direction[:, None])
+    right = centre + direction * middle[:, None] + FRONT_WEIGHT * front
+    return torch.linalg.solve(A, zero[..., 0].index_add(0, tracks.point, right))

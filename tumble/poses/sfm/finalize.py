@@ -20,7 +20,7 @@ from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
 from tumble.poses.sfm.relocalization import ContourConstraints
 from tumble.poses.sfm.symmetry import MirrorSymmetry
 from tumble.poses.sfm.tracks import Tracks
-from tumble.scene import BACKGROUND, UNKNOWN, Capture, Trajectory, visual_hull
+from tumble.scene import BACKGROUND, UNKNOWN, Camera, Capture, Trajectory, visual_hull
 
 INLIER_THRESHOLD = 1.5
 """Reprojection error below which an observation is an inlier [pixels]."""
@@ -326,22 +326,40 @@ def _hull_overlap(
         tolerance=tolerance,
     )
     camera = capture.camera.resized(HULL_RESOLUTION, HULL_RESOLUTION)
-    depth_one = torch.ones(HULL_RESOLUTION, HULL_RESOLUTION)
-    direction = camera.unproject(camera.pixel_centers(), depth_one).reshape(-1, 1, 3)
     ticks = torch.arange(HULL_RESOLUTION) + 0.5
     rows = (ticks * capture.camera.height / HULL_RESOLUTION).long()
     columns = (ticks * capture.camera.width / HULL_RESOLUTION).long()
     overlaps = []
     for frame in range(len(trajectory)):
-        T_cam_obj = trajectory.T_cam_obj[frame]
-        depth = T_cam_obj.xyz[2] + torch.linspace(-1.1, 1.1, 2 * HULL_RESOLUTION)[:, None]
-        x_obj = T_cam_obj.inverse() @ (direction * depth)
-        grid = x_obj.flip(-1)[None, None]  # grid_sample expects the last axis of the volume first
-        hit = torch.nn.functional.grid_sample(inside[None, None], grid, align_corners=False)[0, 0, 0].amax(-1) > 0.5
-        mask = capture.masks[frame][rows][:, columns].flatten()
+        hit = _hull_silhouette(inside, trajectory.T_cam_obj[frame], camera)
+        mask = capture.masks[frame][rows][:, columns]
         counted, silhouette = mask != UNKNOWN, mask != BACKGROUND
         overlaps.append(iou(hit, silhouette, counted))
     return torch.stack(overlaps)
+
+
+def _hull_silhouette(inside: Float[Tensor, "x y z"], T_cam_obj: SE3, camera: Camera) -> Bool[Tensor, "h w"]:
+    """Pixels whose rays hit the visual hull; only rays and depths close to its cells are sampled."""
+    cell = 2 / len(inside)
+    x_cam = T_cam_obj @ ((torch.nonzero(inside > 0.5) + 0.5) * cell - 1)
+    hit = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    if not len(x_cam):
+        return hit
+    # A sample is inside only if one of the eight cells around it is.
+    reach = math.sqrt(3) * cell
+    near, far = float(x_cam[:, 2].min()) - reach, float(x_cam[:, 2].max()) + reach
+    depth = T_cam_obj.xyz[2] + torch.linspace(-1.1, 1.1, 2 * HULL_RESOLUTION)
+    depth = depth[(depth >= near) & (depth <= far)]
+    directions = camera.unproject(camera.pixel_centers(), torch.ones_like(hit, dtype=torch.float))
+    slope = x_cam[:, :2] / x_cam[:, 2:]
+    margin = reach / max(near, 1e-6) * (1 + float(slope.abs().max()))
+    inner = (directions[..., :2] > slope.amin(0) - margin) & (directions[..., :2] < slope.amax(0) + margin)
+    close = inner.all(-1) if near > 0 else torch.ones_like(hit)
+    x_obj = T_cam_obj.inverse() @ (directions[close][:, None] * depth[:, None])
+    grid = x_obj.flip(-1)[None, None]  # grid_sample expects the last axis of the volume first
+    sampled = torch.nn.functional.grid_sample(inside[None, None], grid, align_corners=False)[0, 0, 0]
+    hit[close] = (sampled > 0.5).any(-1)
+    return hit
 
 
 def _select_frames(capture: Capture, frames: Sequence[int]) -> Capture:

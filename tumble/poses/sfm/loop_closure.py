@@ -70,15 +70,23 @@ def loop_closures(capture: Capture, trajectory: Trajectory, matcher: str, *, cou
         i: _hull_pixels(cells, normals, capture.masks[i] == OBJECT, trajectory.T_cam_obj[i], capture.camera)
         for i in {i for i, _ in pairs}
     }
-    matches = []
+    # All in one call, for which a matcher computes features of every view once.
+    views = matching.views_of(capture)
+    predicted = []
     for i, j in pairs:
         pixels = hull_pixels[i]
         cosine = torch.minimum(
             *(visual_hull.view_cosine(camera_centres[k], pixels.x_obj, pixels.normals) for k in (i, j))
         )
-        uv = capture.camera.project(trajectory.T_cam_obj[j] @ pixels.x_obj)
-        matches.append(_match_warped(capture, matcher, i, j, pixels, uv, cosine > MIN_COSINE))
-    return [match for match in matches if len(match) >= MIN_MATCHES]
+        predicted.append(capture.camera.project(trajectory.T_cam_obj[j] @ pixels.x_obj))
+        views.append(_warped_view(capture, j, pixels, predicted[-1], cosine > MIN_COSINE))
+    numbers = [(i, len(capture) + number) for number, (i, _) in enumerate(pairs)]
+    matches = matching.match_pairs(views, numbers, matcher)
+    found = [
+        _unwarped(match, j, hull_pixels[i], uv, capture.camera)
+        for match, (i, j), uv in zip(matches, pairs, predicted, strict=True)
+    ]
+    return [match for match in found if len(match) >= MIN_MATCHES]
 
 
 def _covisible_pairs(surface: visual_hull.OrientedPoints, trajectory: Trajectory, *, count: int, gap: int) -> Pairs:
@@ -126,40 +134,34 @@ def _sample_volume(volume: Float[Tensor, "x y z c"], x_obj: Float[Tensor, "*b 3"
     return values[0, :, 0, 0].T.reshape(*x_obj.shape[:-1], volume.shape[-1])
 
 
-def _match_warped(
-    capture: Capture,
-    matcher: str,
-    i: int,
-    j: int,
-    pixels: HullPixels,
-    uv: Float[Tensor, "n 2"],
-    visible: Bool[Tensor, " n"],
-) -> Match:
-    """Match frame i with frame j warped into the view of frame i; the result refers to the original pixels of both.
+def _warped_view(
+    capture: Capture, j: int, pixels: HullPixels, uv: Float[Tensor, "n 2"], visible: Bool[Tensor, " n"]
+) -> View:
+    """Frame j warped into the view of another frame.
 
     Args:
         capture: Images and masks of all frames.
-        matcher: Name of a module of `matching`.
-        i: Frame whose view is kept.
         j: Frame that is warped.
-        pixels: Pixels of frame i.
+        pixels: Pixels of the other frame.
         uv: Predicted positions of these pixels in frame j [pixels].
         visible: Whether the surface there is visible in both frames, by the angle of its normal.
     """
-    camera = capture.camera
     rgba = torch.cat([capture.images[j].float(), 255.0 * (capture.masks[j] == OBJECT)[..., None]], -1)
     warped = _sample_image(rgba, uv)
     visible = visible & (warped[:, 3] > 254)
-    image = torch.zeros_like(capture.images[i])
+    image = torch.zeros_like(capture.images[j])
     image[pixels.row_column] = (warped[:, :3] * visible[:, None]).round().to(torch.uint8)
-    mask = torch.full_like(capture.masks[i], BACKGROUND)
+    mask = torch.full_like(capture.masks[j], BACKGROUND)
     mask[pixels.row_column] = torch.where(visible, OBJECT, BACKGROUND).to(mask)
-    views = [View(i, capture.images[i], capture.masks[i]), View(j, image, mask)]
-    match = matching.match_pairs(views, [(0, 1)], matcher)[0]
+    return View(j, image, mask)
+
+
+def _unwarped(match: Match, j: int, pixels: HullPixels, uv: Float[Tensor, "n 2"], camera: Camera) -> Match:
+    """A match with the warped frame j, thinned out, as one with the original pixels of that frame."""
     match = match.select(torch.arange(len(match))[:: 1 + len(match) // MAX_MATCHES])
     warp = uv.new_zeros(camera.height, camera.width, 2)
     warp[pixels.row_column] = uv
-    return Match(i, j, match.uv_i, _sample_image(warp, match.uv_j), match.confidence)
+    return Match(match.i, j, match.uv_i, _sample_image(warp, match.uv_j), match.confidence)
 
 
 def _sample_image(image: Float[Tensor, "h w c"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m c"]:

@@ -338,9 +338,10 @@ def _normal_equations(q: _Problem, R: Tensor, ell: Tensor) -> tuple[Tensor, Tens
     z = x[..., 2:]
     J = torch.stack([q.focal[k] / z * (rows[k] - x[..., k : k + 1] / z * rows[2]) for k in range(2)], -2)
     J = J - slide[..., None] * (slide[..., None] * J).sum(-2, keepdim=True)
-    w = q.weight / root
-    H = torch.einsum("pm,pmki,pmkj->pij", w, J, J)
-    g = torch.einsum("pm,pmki,pmk->pi", w, J, residual)
+    both = torch.cat([J, residual[..., None]], -1).flatten(1, 2)
+    w = (q.weight / root).repeat_interleave(2, 1)
+    H, g = ((w[..., None] * both).mT @ both)[:, :4].split([4, 1], -1)
+    g = g[..., 0]
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=H.dtype)
     H = H + DEPTH_WEIGHT**2 * torch.diag(last)
     g = g + DEPTH_WEIGHT**2 * ell[:, None] * last
