@@ -430,20 +430,10 @@ BASELINES: dict[str, Callable[[Recipe], Recipe]] = {
 
 DEPARTURES: dict[str, tuple[str, ...]] = {
     "paper": ("relight", "seed"),
-    "hull": (
-        "refine.start",
-        "refine.points",
-        "refine.opacity",
-        "refine.gamma",
-        "refine.gamma_floor",
-        "refine.hull",
-        "refine.weights.gamma",
-        "refine.rates.gamma",
-        "refine.rates.sdf",
-    ),
-    "rates-2": tuple(
-        f"refine.rates.{name}"
-        for name in ["means", "quats", "log_scales", "albedo", "light", "sh", "sh_rest", "decay", "others_decay"]
+    "hull": ("refine.start", "refine.points", "refine.opacity", "refine.hull"),
+    "rates-2": (
+        *(f"refine.rates.{name}" for name in ("means", "quats", "log_scales", "albedo", "light", "sh", "sh_rest")),
+        *("refine.rates.decay", "refine.rates.others_decay"),
     ),
     "densification": ("refine.densification",),
     "squared-mask": ("refine.mask_loss", "refine.weights.mask"),
@@ -451,31 +441,31 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "projection": ("refine.weights.proj",),
     "light": ("refine.colour", "refine.shadow_start", "decompose.roughness", "decompose.initial_albedo"),
     "specular-scale": (
-        "refine.weights.specular",
-        "refine.rates.specular_scale",
-        "decompose.weights.specular",
-        "decompose.rates.specular_scale",
+        *("refine.weights.specular", "refine.rates.specular_scale"),
+        *("decompose.weights.specular", "decompose.rates.specular_scale"),
     ),
     "poses": (
-        "matcher",
-        "track",
-        "refine.pose_model",
-        "refine.realignments",
-        "refine.rates.poses",
-        "decompose.pose_model",
-        "decompose.rates.poses",
+        *("matcher", "track", "refine.pose_model", "refine.realignments", "refine.rates.poses"),
+        *("decompose.pose_model", "decompose.rates.poses"),
     ),
     "rates-3": (
-        *(f"decompose.{name}" for name in ["steps", "warmup", "doublings", "rows", "pixels"]),
-        *(f"decompose.rates.{name}" for name in ["albedo", "roughness", "normal", "light", "decay"]),
-        *(f"decompose.rates.{name}" for name in ["means", "quats", "log_scales", "sdf"]),
+        *(f"decompose.{name}" for name in ("steps", "warmup", "doublings", "rows", "pixels")),
+        *(f"decompose.rates.{name}" for name in ("albedo", "roughness", "normal", "light", "decay")),
+        *(f"decompose.rates.{name}" for name in ("means", "quats", "log_scales", "sdf")),
+    ),
+    "mask-3": ("decompose.weights.mask",),
+    "sharpness": (
+        "refine.gamma",
+        "refine.gamma_floor",
+        "refine.weights.gamma",
+        "refine.rates.gamma",
+        "refine.rates.sdf",
     ),
     "smoothness": ("decompose.weights.light", "decompose.weights.material", "decompose.smooth_light"),
     "directions": ("decompose.directions", "decompose.sets"),
     "cached-visibility": ("decompose.shadows",),
     "split-sum": ("decompose.lobes",),
     "frame-bounce": ("decompose.bounce",),
-    "mask-3": ("decompose.weights.mask",),
     "specular-grid": ("decompose.fit_specular",),
     "albedo-solve": ("decompose.solve_albedo",),
 }
