@@ -1,5 +1,6 @@
 """Recipes: PAPER has the paper's numbers, and a scaled recipe still learns."""
 
+import itertools
 import math
 import signal
 from dataclasses import replace
@@ -191,6 +192,19 @@ def test_a_scaled_recipe_has_the_same_rates_weights_and_switches(name: str, fact
     assert all("weights" not in key and "realignments" not in key for key in changed)
     assert bool(changed) == (factor < 1)
     assert part[".refine.steps"] == whole[".refine.steps"] * factor
+
+
+@pytest.mark.parametrize("name", ["draft", "standard", "full"])
+def test_the_ladder_leads_from_the_paper_to_the_recipe(name: str) -> None:
+    """No setting departs twice, each rung changes something, and nothing is left at its end."""
+    recipe = recipes.QUALITIES[name]
+    rungs = [recipes.departed(count, recipe) for count in range(len(recipes.DEPARTURES) + 1)]
+    assert rungs[0] == recipes.scaled(recipes.PAPER, recipe.refine.steps / recipes.PAPER.refine.steps)
+    assert rungs[-1] == recipe
+    settings = [name for names in recipes.DEPARTURES.values() for name in names]
+    assert len(set(settings)) == len(settings)
+    if name == "draft":
+        assert all(below != above for below, above in itertools.pairwise(rungs))
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, 1.5, math.nan])

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 from tumble import inverse_rendering, rendering
@@ -425,6 +426,74 @@ BASELINES: dict[str, Callable[[Recipe], Recipe]] = {
     "irgs": irgs,
 }
 """Baselines by name; docs/benchmarks.md says how they differ from the methods after which they are named."""
-METHODS: dict[str, Callable[[Recipe], Recipe]] = {"tumble": unchanged, **BASELINES, **ABLATIONS}
-"""What a row of a benchmark suite can run, by the value of `--method`: the method, baselines, ablations. The floor is
-"average", the mean colour over the frames as albedo."""
+
+
+DEPARTURES: dict[str, tuple[str, ...]] = {
+    "paper": ("relight", "seed"),
+    "hull": ("refine.start", "refine.points", "refine.opacity", "refine.hull"),
+    "rates-2": (
+        *(f"refine.rates.{name}" for name in ("means", "quats", "log_scales", "albedo", "light", "sh", "sh_rest")),
+        *("refine.rates.decay", "refine.rates.others_decay"),
+    ),
+    "densification": ("refine.densification",),
+    "squared-mask": ("refine.mask_loss", "refine.weights.mask"),
+    "normals": ("refine.weights.normal", "refine.crease", "refine.ramp"),
+    "projection": ("refine.weights.proj",),
+    "light": ("refine.colour", "refine.shadow_start", "decompose.roughness", "decompose.initial_albedo"),
+    "specular-scale": (
+        *("refine.weights.specular", "refine.rates.specular_scale"),
+        *("decompose.weights.specular", "decompose.rates.specular_scale"),
+    ),
+    "poses": (
+        *("matcher", "track", "refine.pose_model", "refine.realignments", "refine.rates.poses"),
+        *("decompose.pose_model", "decompose.rates.poses"),
+    ),
+    "rates-3": (
+        *(f"decompose.{name}" for name in ("steps", "warmup", "doublings", "rows", "pixels")),
+        *(f"decompose.rates.{name}" for name in ("albedo", "roughness", "normal", "light", "decay")),
+        *(f"decompose.rates.{name}" for name in ("means", "quats", "log_scales", "sdf")),
+    ),
+    "mask-3": ("decompose.weights.mask",),
+    "sharpness": (
+        "refine.gamma",
+        "refine.gamma_floor",
+        "refine.weights.gamma",
+        "refine.rates.gamma",
+        "refine.rates.sdf",
+    ),
+    "smoothness": ("decompose.weights.light", "decompose.weights.material", "decompose.smooth_light"),
+    "directions": ("decompose.directions", "decompose.sets"),
+    "cached-visibility": ("decompose.shadows",),
+    "split-sum": ("decompose.lobes",),
+    "frame-bounce": ("decompose.bounce",),
+    "specular-grid": ("decompose.fit_specular",),
+    "albedo-solve": ("decompose.solve_albedo",),
+}
+"""Our departures from the paper, in the order of the ladder: by name, the settings that are ours from there on."""
+
+
+def departed(count: int, recipe: Recipe) -> Recipe:
+    """A rung of the ladder from the paper to a recipe: PAPER with the first `count` of `DEPARTURES`, of the same size.
+
+    PAPER is scaled so that stage 2 has as many steps as the recipe's. With all departures it is the recipe.
+    """
+    paper = scaled(PAPER, min(1.0, recipe.refine.steps / PAPER.refine.steps))
+    for names in list(DEPARTURES.values())[:count]:
+        for name in names:
+            paper = _with_setting(paper, name, attrgetter(name)(recipe))
+    return paper
+
+
+def _with_setting(settings: Any, name: str, value: Any) -> Any:
+    """The settings with another value at a path of attributes."""
+    first, _, rest = name.partition(".")
+    return replace(settings, **{first: _with_setting(getattr(settings, first), rest, value) if rest else value})
+
+
+LADDER: dict[str, Callable[[Recipe], Recipe]] = {
+    f"ladder-{i:02d}-{name}": partial(departed, i + 1) for i, name in enumerate(DEPARTURES)
+}
+"""The rungs from the paper to our method, by name: each has the departure that it is named after, and all before."""
+METHODS: dict[str, Callable[[Recipe], Recipe]] = {"tumble": unchanged, **BASELINES, **ABLATIONS, **LADDER}
+"""What a row of a benchmark suite can run, by the value of `--method`: the method, baselines, ablations, rungs of the
+ladder. The floor is "average", the mean colour over the frames as albedo."""
