@@ -16,6 +16,7 @@ from tumble import actions, cli, pipeline
 from tumble.io import files, video
 from tumble.io.files import BadFile
 from tumble.preprocess.options import FootageOptions
+from tumble.report import write_report
 from tumble.scene.environment import Environment
 
 
@@ -195,7 +196,7 @@ def test_nothing_is_written_through_the_links_of_a_run_from_elsewhere(
         lambda: pipeline.reconstruct(capture, foreign, RECIPE),
         lambda: actions.evaluate_run(foreign, capture),
         lambda: actions.export_run(foreign, None, "splat", None),
-        lambda: actions.write_report(foreign),
+        lambda: write_report(foreign),
     ):
         with pytest.raises(BadFile, match=rf"{name}: is a link to .*mine.*, outside of .*foreign \(remove it; "):
             call()
