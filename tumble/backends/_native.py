@@ -27,6 +27,11 @@ VARIANTS = (("-march=native",), ("-mcpu=native",), ())
 """Flags for the processor of this machine, tried in this order because compilers differ in what they accept."""
 
 
+KEPT_MEMORY = {-1: 1 << 28, -3: 1 << 25}
+"""Parameters of `mallopt`: how much free memory at the end of the heap is kept (M_TRIM_THRESHOLD), and the size
+from which on a block has pages of its own (M_MMAP_THRESHOLD) [bytes]."""
+
+
 class CannotCompile(RuntimeError):
     """Error for a missing or failing compiler; the message holds the reason and the fix."""
 
@@ -45,7 +50,15 @@ def library() -> ctypes.CDLL | SimpleNamespace:
     assert all(kernels.sizes(i) == ctypes.sizeof(struct) for i, struct in enumerate(STRUCTURES)), (
         "the structures in _structs.py differ from those in native/"
     )
+    _keep_freed_memory()
     return kernels
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep freed memory: new pages in every step would cost as much as rendering a small image."""
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+        for parameter, size in KEPT_MEMORY.items():
+            mallopt(parameter, size)
 
 
 def origin() -> str:

@@ -14,6 +14,7 @@
 
 typedef float vf __attribute__((vector_size(4 * LANES)));
 typedef int vi __attribute__((vector_size(4 * LANES)));
+typedef unsigned vu __attribute__((vector_size(4 * LANES)));
 typedef float vf_loose __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 typedef unsigned char u8;
 typedef unsigned int u32;
@@ -110,7 +111,7 @@ INLINE vf vexp2(vf x) {
     p = p * f + 2.402211972e-1f;
     p = p * f + 6.931469671e-1f;
     p = p * f + 1.000000072f;
-    return (vf)((vi)p + ((vi)t << 23));
+    return (vf)((vu)p + ((vu)t << 23));   // unsigned, because lanes that are not needed may overflow
 }
 INLINE vf vexp(vf x) { return vexp2(x * 1.44269504f); }
 
