@@ -134,6 +134,25 @@ def test_swapped_views_give_equivalent_matches(matcher: matching.Matcher) -> Non
     assert abs(len(forward) - len(backward)) <= 0.15 * len(forward)
 
 
+def test_threads_do_not_change_the_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does OpenCV's own number of threads, on which flow would depend, and which is restored."""
+    view_i, view_j = pair()
+    views = [view_i, view_j, View(5, view_j.image.flip(1), view_j.mask.flip(1)), View(6, view_i.image, view_i.mask)]
+    pairs = list(itertools.combinations(range(4), 2))
+    before, found = cv2.getNumThreads(), []
+    for threads in (1, 3):
+        monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
+        cv2.setNumThreads(threads)
+        found.append(match_pairs(views, pairs, "mixed"))
+        assert cv2.getNumThreads() == threads
+    cv2.setNumThreads(before)
+    assert [(m.i, m.j) for m in found[0]] == [(views[i].number, views[j].number) for i, j in pairs]
+    for one, several in zip(*found, strict=True):
+        assert (one.i, one.j) == (several.i, several.j)
+        for name in ("uv_i", "uv_j", "confidence"):
+            assert torch.equal(getattr(one, name), getattr(several, name))
+
+
 def test_sift_is_exactly_symmetric() -> None:
     view_i, view_j = pair()
     match = load_plugin("matching", "sift").load("cpu")

@@ -2,15 +2,20 @@
 
 A matcher takes two views and returns pairs of pixels that show the same surface point. Both pixels lie on the object,
 away from the border of the mask and from unknown pixels; a view without such pixels gives an empty match. VERSION is
-raised when the same views give another result. A matcher that combines others lists their names in PARTS.
+raised when the same views give another result. A matcher that combines others lists their names in PARTS. One that sets
+CONCURRENT is called by several threads at once.
 """
 
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import torch
 
 from tumble.io import BadFile, load_plugin, progress, read_tensors, write_tensors
@@ -54,16 +59,39 @@ def match_pairs(
     load = functools.cache(load_plugin("matching", matcher).load)
     key = settings(matcher)
     digests = [_window.digest(view) for view in views]
-    matches = []
-    for i, j in progress.track(pairs, f"matching ({matcher})", len(pairs)):
+
+    def match(number: int) -> tuple[int, Match]:
+        i, j = pairs[number]
         path = _cache_path(cache, matcher, key, digests[i], digests[j])
         if path is not None and path.exists():
-            matches.append(_read(path, views[i].number, views[j].number))
-            continue
-        matches.append(load(device)(views[i], views[j]))
+            return number, _read(path, views[i].number, views[j].number)
+        found = load(device)(views[i], views[j])
         if path is not None:
-            _write(path, matches[-1])
-    return matches
+            _write(path, found)
+        return number, found
+
+    n_threads = torch.get_num_threads() if getattr(load_plugin("matching", matcher), "CONCURRENT", False) else 1
+    # Threads work on pairs far apart in the list, so that no two of them compute features of the same view.
+    share = max(1, math.ceil(len(pairs) / n_threads))
+    order = sorted(range(len(pairs)), key=lambda number: (number % share, number))
+    with _one_thread_in_opencv(), ThreadPoolExecutor(n_threads) as threads:
+        try:
+            found = dict(progress.track(threads.map(match, order), f"matching ({matcher})", len(pairs)))
+        except BaseException:
+            threads.shutdown(cancel_futures=True)
+            raise
+    return [found[number] for number in range(len(pairs))]
+
+
+@contextmanager
+def _one_thread_in_opencv() -> Iterator[None]:
+    """Context in which OpenCV's functions use one thread: the result of some depends on the number of threads."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def settings(matcher: str) -> str:

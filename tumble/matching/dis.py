@@ -12,7 +12,8 @@ import torch
 from tumble.matching._window import Window, crop_windows
 from tumble.scene import Match, View, empty_match
 
-VERSION = 1
+VERSION = 2
+CONCURRENT = True
 SIZE = 384
 """Height and width of the window around the object that is matched [pixels]."""
 MAX_CYCLE_ERROR = 1.5

@@ -11,6 +11,7 @@ from tumble.matching import dis, sift
 from tumble.scene import Match, View
 
 VERSION = 1
+CONCURRENT = True
 PARTS = ("sift", "dis")
 """Names of the combined matchers."""
 MIN_CONFIDENCE = 0.6

@@ -12,6 +12,7 @@ from tumble.matching._window import MARGIN, crop_window, digest, extent
 from tumble.scene import Match, View, empty_match
 
 VERSION = 1
+CONCURRENT = True
 SIZE = 384
 """Height and width of the window around the object that is matched [pixels].
 

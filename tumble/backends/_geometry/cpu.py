@@ -88,7 +88,7 @@ def bundle_reduce(
     empty = variables.X.new_empty
     camera_rows = {name: empty(g * f, 6) for name in ("g_camera", "e")}
     focal = {"focal_camera": empty(g * f, 6), "focal_e": empty(g * f, 6), "focal_sums": empty(g, 4)}
-    results = {"U": empty(g * f, 6, 6), "E": empty(g, 6 * f, 6 * f), **camera_rows}
+    results: dict[str, Any] = {"U": empty(g * f, 6, 6), "E": empty(g, 6 * f, 6 * f), **camera_rows}
     results |= focal if focal_free else dict.fromkeys(focal)
     points = empty(len(observations.camera), 3 * row), empty(len(variables.X), BUNDLE_POINT)
     memory = empty(struct.threads * ((f * f + f) * 6 * row + 4 * f * row))

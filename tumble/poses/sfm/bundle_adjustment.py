@@ -247,10 +247,13 @@ def _kernel_equations(kernel: BundleKernel, problem: Problem, scale: float) -> E
         S.view(g, f, 6, f, 6).diagonal(dim1=1, dim2=3).add_(U.reshape(g, f, 6, 6).permute(0, 2, 3, 1))
         row = None
         if scene.log_focal is not None:
-            assert reduced.focal_camera is not None, "the kernel was asked for them"
-            H, gradient, subtracted_H, subtracted = reduced.focal_sums.unbind(1)
-            H, gradient = _add_focal_priors(problem, scene, reduced.focal_camera, H, gradient)
-            row = _FocalRow(reduced.focal_camera - reduced.focal_e, H, gradient, subtracted_H, subtracted)
+            cam, e, sums = reduced.focal_camera, reduced.focal_e, reduced.focal_sums
+            assert cam is not None, "the kernel was asked for it"
+            assert e is not None, "the kernel was asked for it"
+            assert sums is not None, "the kernel was asked for them"
+            H, gradient, *subtracted = sums.unbind(1)
+            H, gradient = _add_focal_priors(problem, scene, cam, H, gradient)
+            row = _FocalRow(cam - e, H, gradient, *subtracted)
         d_cam, d_focal = _camera_steps(S, reduced.e - reduced.g_camera, row, damping)
         return _apply_step(scene, d_cam, kernel.bundle_move(observations, reduced, d_cam, d_focal), d_focal)
 
