@@ -379,9 +379,11 @@ def shading_term(
     return _ShadingTermFunction.apply(*moving, view.dominant, view.photo, view.pixels, *seen, fx_fy_cx_cy)
 
 
-_SHADING_MOVING = ("features", "alpha", "normal", "stack", "albedo", "f0", "R_cam_obj", "R_env_obj")
+_SHADING_MOVING: tuple[str, ...] = ("features", "alpha", "normal", "stack", "albedo", "f0", "R_cam_obj", "R_env_obj")
 """Differentiable arguments of `shading_term` by their names in `native/shading_term.h`."""
-_SHADING_REST = ("dominant", "photo", "pixels", "directions", "visibility", "blocker", "transfer", "table", "focal")
+_SHADING_REST: tuple[str, ...] = (
+    *("dominant", "photo", "pixels", "directions", "visibility", "blocker", "transfer", "table", "focal"),
+)
 """The other arguments by these names."""
 
 

@@ -71,10 +71,10 @@ class Adam:
         """Move every leaf that has a gradient, unless one is not finite; whether all were."""
         moved = [(g, x) for g, x in zip(self.param_groups, gradients, strict=True) if x is not None]
         states = [self.state_of(group["params"][0]) for group, _ in moved]
-        leaves = [
-            backends.Leaf(group["params"][0], x, *(state[key] for key in MOMENTS), group["lr"], int(state["step"]) + 1)
-            for (group, x), state in zip(moved, states, strict=True)
-        ]
+        leaves = []
+        for (group, x), state in zip(moved, states, strict=True):
+            first, second = (state[key] for key in MOMENTS)
+            leaves.append(backends.Leaf(group["params"][0], x, first, second, group["lr"], int(state["step"]) + 1))
         if not leaves:
             return True
         backend = backends.choose(leaves[0].value.device, leaves[0].value.dtype)

@@ -454,39 +454,23 @@ def _render_term(
     f0 = params.material.f0 * params.log_specular_scale.exp()
     bounce = _bounce(cfg, state, params, mean_albedo)
     light = prefilter(params.environment) if cfg.lobes == "split" else None
-    cached = _caches_visibility(cfg) and cfg.shadows == "cached" and not isinstance(bounce, AveragedBounce)
-    if cached and light is not None and not light.is_finer:
+    cached = cfg.visibility and cfg.shadows == "cached" and not isinstance(bounce, AveragedBounce)
+    if light is not None and not light.is_finer and cached:
         shading = shading_light(light, _cached_visibility(cfg, state), bounce)
         pose = (shown.T_cam_obj, shown.R_env_obj)
         return losses.shading_term(shown.view, shown.pixels, shown.photo, camera, *pose, shading, f0)
     view, pixels = with_offset(shown.view), shown.pixels.clamp_min(0)
     points = surface(view, shown.T_cam_obj, camera, pixels=pixels)
     albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
-    gaussian = _dominant_gaussian(view, points)
-    shaded = _shade(cfg, state, params, points, gaussian, shown.R_env_obj, albedo, rough, f0, bounce)
+    visible = _pixel_visibility(cfg, state, params, points, _dominant_gaussian(view, points))
+    material, lit = (points, albedo, rough), (shown.R_env_obj, visible)
+    if light is None:
+        shaded = shade(*material, params.environment, *lit, f0=f0, bounce=bounce)
+    else:
+        shaded = shade_split(*material, light, *lit, f0=f0, bounce=bounce)
     rendered, wanted = (shaded * points.sample(view.alpha[..., None])), points.sample(shown.photo).to(albedo) / 255
     error = (losses.srgb_as_captured(rendered[None], wanted[None]) - wanted).abs()[0]
     return (error * (shown.pixels >= 0)[:, None]).mean()
-
-
-def _shade(
-    cfg: Config,
-    state: State,
-    params: Params,
-    points: Surface,
-    gaussian: Int64[Tensor, " p"],
-    R_env_obj: Tensor,
-    albedo: Float[Tensor, "p 3"],
-    roughness: Float[Tensor, "p 1"],
-    f0: float | Tensor,
-    bounce: Bounce | AveragedBounce | None,
-) -> Float[Tensor, "p 3"]:
-    """Reflected radiance of surface points under the current light; `gaussian` are the Gaussians that they show."""
-    visible = _pixel_visibility(cfg, state, params, points, gaussian)
-    if cfg.lobes == "sum":
-        return shade(points, albedo, roughness, params.environment, R_env_obj, visible, f0=f0, bounce=bounce)
-    light = prefilter(params.environment)
-    return shade_split(points, albedo, roughness, light, R_env_obj, visible, f0=f0, bounce=bounce)
 
 
 def _dominant_gaussian(view: Buffers, points: Surface) -> Tensor:
