@@ -767,7 +767,7 @@ def test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference(
     def run(by: backends.Backend, dtype: torch.dtype) -> list[torch.Tensor]:
         x = [y.to(dtype).requires_grad_() for y in moving]
         constant = [y.to(dtype) for y in (directions, transfer, table, focal)]
-        view = backends.ShadedPixels(*x[:3], dominant, photo, pixels)
+        view = backends.SampledView(*x[:3], dominant, photo, pixels)
         light = backends.ShadingLight(x[3], constant[0], visibility, blocker, x[4], *constant[1:3])
         term = by.shading_term(view, light, x[6], x[7], constant[3], x[5])
         return [term[None], *torch.autograd.grad(3 * term, x, materialize_grads=True)]

@@ -43,7 +43,7 @@ from tumble.backends._contract import (
     Lobes,
     RelightKernel,
     Rendering,
-    ShadedPixels,
+    SampledView,
     ShadingLight,
     SurfaceSamples,
 )
@@ -92,7 +92,7 @@ __all__ = [
     "SSIM_SIGMA",
     "SSIM_STABILISERS",
     "SSIM_WINDOW",
-    "ShadedPixels",
+    "SampledView",
     "ShadingLight",
     "SurfaceSamples",
     "TRACE_SIGMAS",

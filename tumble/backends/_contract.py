@@ -57,7 +57,7 @@ class Lobes(NamedTuple):
     """Visible fraction of the specular lobe. Not differentiable."""
 
 
-class ShadedPixels(NamedTuple):
+class SampledView(NamedTuple):
     """A view with the material of `Backend.corner_features`, and the pixels that `Backend.shading_term` shades."""
 
     features: Float[Tensor, "h w 7"]
@@ -459,7 +459,7 @@ class Backend(Protocol):
 
     def shading_term(
         self,
-        view: ShadedPixels,
+        view: SampledView,
         light: ShadingLight,
         R_cam_obj: Float[Tensor, "3 3"],
         R_env_obj: Float[Tensor, "3 3"],

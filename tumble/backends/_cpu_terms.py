@@ -22,7 +22,7 @@ from tumble.backends import (
     SSIM_STABILISERS,
     SSIM_WINDOW,
     Leaf,
-    ShadedPixels,
+    SampledView,
     ShadingLight,
     _native,
     reference,
@@ -366,7 +366,7 @@ class _MaterialTermsFunction(torch.autograd.Function):
 
 
 def shading_term(
-    view: ShadedPixels,
+    view: SampledView,
     light: ShadingLight,
     R_cam_obj: Float[Tensor, "3 3"],
     R_env_obj: Float[Tensor, "3 3"],

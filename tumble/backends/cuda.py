@@ -14,7 +14,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tumble.backends import Hits, Lobes, Rendering, ShadedPixels, ShadingLight
+from tumble.backends import Hits, Lobes, Rendering, SampledView, ShadingLight
 from tumble.backends.reference import (
     activate,
     adam,
@@ -294,7 +294,7 @@ def shade(
 
 
 def shading_term(
-    view: ShadedPixels,
+    view: SampledView,
     light: ShadingLight,
     R_cam_obj: Float[Tensor, "3 3"],
     R_env_obj: Float[Tensor, "3 3"],

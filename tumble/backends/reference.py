@@ -36,7 +36,7 @@ from tumble.backends import (
     Leaf,
     Lobes,
     Rendering,
-    ShadedPixels,
+    SampledView,
     ShadingLight,
 )
 from tumble.backends._brute import blockers, build, lookup, rotation, shade, trace, visible
@@ -489,7 +489,7 @@ def bounce(
 
 
 def shading_term(
-    view: ShadedPixels,
+    view: SampledView,
     light: ShadingLight,
     R_cam_obj: Float[Tensor, "3 3"],
     R_env_obj: Float[Tensor, "3 3"],
@@ -502,7 +502,7 @@ def shading_term(
 
 def shading_term_by(
     shade_by: Callable[..., Lobes],
-    view: ShadedPixels,
+    view: SampledView,
     light: ShadingLight,
     R_cam_obj: Float[Tensor, "3 3"],
     R_env_obj: Float[Tensor, "3 3"],

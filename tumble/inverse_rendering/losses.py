@@ -149,7 +149,7 @@ def shading_term(
         light: Light and occlusion.
         f0: Reflectance at normal incidence.
     """
-    shaded = backends.ShadedPixels(
+    shaded = backends.SampledView(
         view.features["material"], view.alpha, view.normal, view.dominant, photo.contiguous(), pixels
     )
     pose = (T_cam_obj.rotation.matrix(), R_env_obj, camera.fx_fy_cx_cy.to(view.alpha))
