@@ -454,8 +454,8 @@ def _render_term(
     f0 = params.material.f0 * params.log_specular_scale.exp()
     bounce = _bounce(cfg, state, params, mean_albedo)
     light = prefilter(params.environment) if cfg.lobes == "split" else None
-    cached = cfg.visibility and cfg.shadows == "cached" and not isinstance(bounce, AveragedBounce)
-    if light is not None and not light.is_finer and cached:
+    cached = cfg.visibility and cfg.shadows == "cached"
+    if cached and light is not None and not light.is_finer and not isinstance(bounce, AveragedBounce):
         shading = shading_light(light, _cached_visibility(cfg, state), bounce)
         pose = (shown.T_cam_obj, shown.R_env_obj)
         return losses.shading_term(shown.view, shown.pixels, shown.photo, camera, *pose, shading, f0)
