@@ -2,7 +2,8 @@
 
 `python -m benchmarks.commands CAPTURE [--large CAPTURE] [--against CHECKOUT]` runs each command as a process of its
 own, `--repeats` times, in this checkout and the other one in turn, and writes `benchmarks/commands.json` and the table
-`benchmarks/commands.md`. Captures need known poses and ground truth. A checkout's commands work on its own run.
+`benchmarks/commands.md`. Captures need known poses and ground truth. A checkout's commands work on its own run. With
+`--only`, rows that are not measured keep their figures.
 
 Stages 2 and 3: as the log of `tumble run` gives them. Stage 1: as the log of `tumble run --poses estimate` gives it;
 and from the start of the process to that of stage 2, at which the process is stopped.
@@ -136,7 +137,9 @@ def measure(
     wanted = {PARTS.get(row, row): repeats for row in only}
     if wanted.keys() & {"export web", "export film", "evaluate"}:
         wanted.setdefault("run", 1)
-    result: dict[str, Any] = {"command": COMMAND, "machine": machine(), "repeats": repeats, "rows": {}, "failed": []}
+    kept = json.loads(out.read_text("utf-8"))["rows"] if out.is_file() else {}
+    kept = {row: times for row, times in kept.items() if PARTS.get(row, row) not in wanted}
+    result: dict[str, Any] = {"command": COMMAND, "machine": machine(), "rows": kept, "failed": []}
     for checkout in checkouts.values():
         with contextlib.suppress(Failed):
             checkout.command("doctor")  # compiles modules and kernels
@@ -223,10 +226,10 @@ def report(result: dict[str, Any]) -> str:
     """The figures in Markdown."""
     lines = [
         f"# Time of whole commands\n\n`{result['command']}`: each command as a process of its own, recipe DRAFT; "
-        f"{result['machine']['class']}. Seconds by the wall clock (and of processor time), medians of "
-        f"{result['repeats']} in this checkout and in another one in turn.\n",
-        "| what | this [s] | other [s] | ratio |",
-        "|---|---|---|---|",
+        f"{result['machine']['class']}. Seconds by the wall clock (and of processor time), medians of several runs in "
+        "this checkout and in another one in turn.\n",
+        "| what | runs | this [s] | other [s] | ratio |",
+        "|---|---|---|---|---|",
     ]
     for row, title in ROWS.items():
         times = result["rows"].get(row)
@@ -234,7 +237,8 @@ def report(result: dict[str, Any]) -> str:
             continue
         walls = {name: statistics.median(x["wall"] for x in found) for name, found in times.items()}
         ratio = f"{walls['against'] / walls['this']:.2f}" if walls.keys() == {"this", "against"} else ""
-        lines += [f"| {title} | {_median(times, 'this')} | {_median(times, 'against')} | {ratio} |"]
+        runs = max(map(len, times.values()))
+        lines += [f"| {title} | {runs} | {_median(times, 'this')} | {_median(times, 'against')} | {ratio} |"]
     return "\n".join([*lines, "", *(f"Failed: {text}" for text in result["failed"]), ""])
 
 
