@@ -35,7 +35,7 @@ def glb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     color[:, 32:] = RIGHT
     rough, normal = np.full((64, 64), 153, np.uint8), np.full((64, 64, 3), [128, 128, 255], np.uint8)
     path = tmp_path_factory.mktemp("glb") / "asset.glb"
-    gltf.write_glb(path, flat, Textures(color, rough, normal, np.ones((64, 64), bool)), f0=0.02, metres=RADIUS)
+    gltf.write_glb(path, flat, Textures(color, rough, normal), f0=0.02, metres=RADIUS)
     return path
 
 

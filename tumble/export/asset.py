@@ -4,11 +4,11 @@ All files use the object frame, which has +y up as in glTF (if the object has an
 the object's size is given, else the object radius.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -21,6 +21,8 @@ from tumble.export.poses import write_poses
 from tumble.io import files, progress
 from tumble.rendering import lit_frames
 from tumble.scene import Asset, Capture
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -80,14 +82,14 @@ def write_asset(
     settings = PRESETS[preset]
     with ThreadPoolExecutor(1) as beside:
         # The mesh is made by one thread most of the time.
-        frames = beside.submit(_lit_frames, asset, capture if settings else None)
-        score = beside.submit(_confidence, asset) if settings else None
+        frames = _started(beside, asset, lambda: _lit_frames(asset, capture if settings else None))
+        score = _started(beside, asset, lambda: _confidence(asset)) if settings else None
         shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
         flat, textures = None, None
         if settings and shape:
             with progress.task("texture coordinates"):
                 flat = atlas.unwrap(shape, settings.texture)
-            flat, textures = textured_mesh(asset, flat, settings, frames.result())
+            flat, textures = textured_mesh(asset, flat, settings, frames())
     surface = flat or shape
     metres = 1.0 if scale_mm is None or surface is None else scale_mm / 1000 / mesh.diameter(surface.vertices)
     facts = {
@@ -102,12 +104,20 @@ def write_asset(
     files.write_json(out / EXPORT_FILE, facts)
     if flat and textures and score:
         gltf.write_glb(out / "asset.glb", flat, textures, f0=float(asset.material.f0), metres=metres)
-        texture = bake.nearest_gaussian_texture(score.result(), asset, flat, resolution=512)
+        texture = bake.nearest_gaussian_texture(score(), asset, flat, resolution=512)
         files.write_png(out / CONFIDENCE_FILE, texture[..., None])
     ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
     ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
     _write_light(asset, out)
     write_poses(asset, names, metres, out)
+
+
+def _started(pool: ThreadPoolExecutor, asset: Asset, task: Callable[[], T]) -> Callable[[], T]:
+    """The result of a task that a thread does meanwhile; on a device, whose work is one queue, it is done at once."""
+    if asset.gaussians.means.device.type == "cpu":
+        return pool.submit(task).result
+    result = task()
+    return lambda: result
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
