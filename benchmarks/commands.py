@@ -135,7 +135,8 @@ def measure(
 ) -> None:
     """Time the commands alternately in all checkouts, and write all figures after each."""
     wanted = {PARTS.get(row, row): repeats for row in only}
-    if wanted.keys() & {"export web", "export film", "evaluate"}:
+    ready = all((checkout.work / "run").is_dir() for checkout in checkouts.values())
+    if not ready and wanted.keys() & {"export web", "export film", "evaluate"}:
         wanted.setdefault("run", 1)
     kept = json.loads(out.read_text("utf-8"))["rows"] if out.is_file() else {}
     kept = {row: times for row, times in kept.items() if PARTS.get(row, row) not in wanted}
