@@ -34,8 +34,9 @@ from tests.learning.short import SHORT, Errors, averaged, errors, run, scene
 from tumble import pipeline, recipes
 from tumble.datasets import folder
 from tumble.evaluation import align_views, metrics
-from tumble.inverse_rendering import decompose, losses, refine, self_shadowing
+from tumble.inverse_rendering import decompose, losses, self_shadowing
 from tumble.maths.images import to_srgb8
+from tumble.scene import Trajectory
 
 BAR = Errors(albedo=24.4, normal=7.6, roughness=0.21, contrast=0.05, light=0.47, lamp=4.3)
 """Least albedo and contrast, and largest of the other errors, of `SHORT`."""
@@ -80,9 +81,8 @@ def linear_loss(patch: pytest.MonkeyPatch) -> None:
 
 def transposed_rotation(patch: pytest.MonkeyPatch) -> None:
     """The light turns the wrong way."""
-    right = refine.env_from_obj
-    for stage in (refine, decompose):
-        patch.setattr(stage, "env_from_obj", lambda T_cam_obj, light: right(T_cam_obj, light).mT)
+    right = Trajectory.R_env_obj_at
+    patch.setattr(Trajectory, "R_env_obj_at", lambda *arguments: right(*arguments).mT)
 
 
 def no_shadow(patch: pytest.MonkeyPatch) -> None:
