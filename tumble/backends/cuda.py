@@ -7,6 +7,7 @@ Shading by spherical harmonics, lookups, materials and loss terms have no kernel
 """
 
 import importlib.util
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tumble.backends import Hits, Lobes, Rendering, SampledView, ShadingLight
+from tumble.backends import Hits, Lobes, Rendering
 from tumble.backends.reference import (
     activate,
     adam,
@@ -293,16 +294,8 @@ def shade(
     return Lobes(values[:, :3], values[:, 3:6], visible / total.clamp(min=torch.finfo(total.dtype).tiny))
 
 
-def shading_term(
-    view: SampledView,
-    light: ShadingLight,
-    R_cam_obj: Float[Tensor, "3 3"],
-    R_env_obj: Float[Tensor, "3 3"],
-    fx_fy_cx_cy: Float[Tensor, "4"],
-    f0: Float[Tensor, "3"],
-) -> Float[Tensor, ""]:
-    """See `Backend.shading_term`; only its `shade` is a kernel."""
-    return shading_term_by(shade, view, light, R_cam_obj, R_env_obj, fx_fy_cx_cy, f0)
+shading_term = partial(shading_term_by, shade)
+"""See `Backend.shading_term`; only its `shade` is a kernel."""
 
 
 class _Shade(torch.autograd.Function):

@@ -6,6 +6,7 @@ frame, `W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -355,9 +356,7 @@ def image_terms(
     weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
 ) -> Float[Tensor, "4"]:
     """See `Backend.image_terms`."""
-    known, image = (mask != UNKNOWN).to(rgb), photo.to(rgb) / 255
-    srgb = _srgb(rgb)
-    srgb = torch.where((photo >= SATURATED) & (srgb > image), image, srgb)
+    known, (srgb, image) = (mask != UNKNOWN).to(rgb), _as_captured(rgb, photo)
     x, y = srgb * known[..., None], image * known[..., None]
     photometric = (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - similarity(x, y)).mean()
     silhouette = ((alpha - (mask == OBJECT).to(rgb)) ** 2 * known).mean()
@@ -488,18 +487,6 @@ def bounce(
     return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
 
 
-def shading_term(
-    view: SampledView,
-    light: ShadingLight,
-    R_cam_obj: Float[Tensor, "3 3"],
-    R_env_obj: Float[Tensor, "3 3"],
-    fx_fy_cx_cy: Float[Tensor, "4"],
-    f0: Float[Tensor, "3"],
-) -> Float[Tensor, ""]:
-    """See `Backend.shading_term`."""
-    return shading_term_by(shade, view, light, R_cam_obj, R_env_obj, fx_fy_cx_cy, f0)
-
-
 def shading_term_by(
     shade_by: Callable[..., Lobes],
     view: SampledView,
@@ -533,15 +520,19 @@ def shading_term_by(
     narrow = mirrored * lobes.specular_visibility[:, None] * reflectance
     wide = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
     reflected = albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wide)
-    linear, photo = reflected * view.alpha.flatten()[pixels, None], view.photo.flatten(0, 1)[pixels]
-    srgb, image = _srgb(linear), photo.to(linear) / 255
-    srgb = torch.where((photo >= SATURATED) & (srgb > image), image, srgb)
+    srgb, image = _as_captured(reflected * view.alpha.flatten()[pixels, None], view.photo.flatten(0, 1)[pixels])
     return ((srgb - image).abs() * counted).mean()
 
 
-def _srgb(linear: Tensor) -> Tensor:
+shading_term = partial(shading_term_by, shade)
+"""See `Backend.shading_term`."""
+
+
+def _as_captured(linear: Float[Tensor, "*b 3"], photo: UInt8[Tensor, "*b 3"]) -> tuple[Tensor, Tensor]:
+    """A linear rendering in sRGB, at most the photo where that is saturated, and the photo from 0 to 1."""
     power = 1.055 * linear.clamp(min=KNEE) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= KNEE, 12.92 * linear.clamp(min=0), power)
+    srgb, image = torch.where(linear <= KNEE, 12.92 * linear.clamp(min=0), power), photo.to(linear) / 255
+    return torch.where((photo >= SATURATED) & (srgb > image), image, srgb), image
 
 
 def prefilter(radiance: Float[Tensor, "h w 3"], lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "out w 3"]:

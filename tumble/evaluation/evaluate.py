@@ -174,8 +174,8 @@ def compare(predicted: Prediction, capture: Capture, truth: Truth, networks: Seq
     """
     notes = _missing_parts(predicted, truth)
     scale = _albedo_scale(predicted, truth, notes)
-    with progress.task("scoring views"):
-        rows = in_threads(lambda i: _view_scores(i, predicted, truth, scale, networks), range(len(truth)))
+    of_views = in_threads(lambda i: _view_scores(i, predicted, truth, scale, networks), range(len(truth)))
+    rows = list(progress.track(of_views, "scoring views", len(truth)))
     light: dict[str, Any] = {}
     if predicted.light is not None and truth.light is not None:
         light = metrics.light_scores(predicted.light, truth.light, torch.ones(3) if scale is None else scale)

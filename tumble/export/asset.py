@@ -4,11 +4,11 @@ All files use the object frame, which has +y up as in glTF (if the object has an
 the object's size is given, else the object radius.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor
@@ -18,11 +18,9 @@ from tumble.export import atlas, bake, confidence, gltf, mesh, photo_texture, pl
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
-from tumble.io import files, progress
+from tumble.io import begin, files, progress
 from tumble.rendering import lit_frames
 from tumble.scene import Asset, Capture
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -82,8 +80,9 @@ def write_asset(
     settings = PRESETS[preset]
     with ThreadPoolExecutor(1) as beside:
         # The mesh is made by one thread most of the time.
-        frames = _started(beside, asset, lambda: _lit_frames(asset, capture if settings else None))
-        score = _started(beside, asset, lambda: _confidence(asset)) if settings else None
+        device = asset.gaussians.means.device
+        frames = begin(beside, device, lambda: _lit_frames(asset, capture if settings else None))
+        score = begin(beside, device, lambda: _confidence(asset)) if settings else None
         shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
         flat, textures = None, None
         if settings and shape:
@@ -110,14 +109,6 @@ def write_asset(
     ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
     _write_light(asset, out)
     write_poses(asset, names, metres, out)
-
-
-def _started(pool: ThreadPoolExecutor, asset: Asset, task: Callable[[], T]) -> Callable[[], T]:
-    """The result of a task that a thread does meanwhile; on a device, whose work is one queue, it is done at once."""
-    if asset.gaussians.means.device.type == "cpu":
-        return pool.submit(task).result
-    result = task()
-    return lambda: result
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:

@@ -16,7 +16,7 @@ from torch.nn.functional import grid_sample, normalize
 from tumble import backends
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.depth_fusion import posed_cameras, surrounding_cameras
-from tumble.maths import SE3, srgb_from_linear
+from tumble.maths import SE3, nearest, srgb_from_linear
 from tumble.rendering import Buffers, render_gbuffer
 from tumble.scene import Asset, Camera
 
@@ -231,6 +231,4 @@ def _nearest_material(
 
 def _nearest(points: Float[Tensor, "t 3"], means: Float[Tensor, "n 3"]) -> Int[Tensor, " t"]:
     """Index of the nearest Gaussian of every point."""
-    from scipy.spatial import KDTree
-
-    return torch.from_numpy(KDTree(means.detach().cpu().numpy()).query(points.cpu().numpy())[1]).to(means.device)
+    return nearest(points.cpu(), means.detach().cpu()).to(means.device)

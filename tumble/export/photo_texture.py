@@ -155,7 +155,7 @@ def solve(
     albedo, losses = baked, list[float]()
     for iteration in range(iterations):
         if iteration == 2:
-            parts = in_threads(partial(_registered, albedo, frames[0].camera), parts)
+            parts = list(in_threads(partial(_registered, albedo, frames[0].camera), parts))
         total, weights = REGULARISATION * (baked - albedo), np.full_like(baked, REGULARISATION)
         for part in parts:
             residual = part.photo - part.rendered(albedo)

@@ -84,10 +84,8 @@ def fit(samples: Samples, n: int, roughness_index: int, specular_scale: float) -
     # Sums by Gaussian are faster if its pixels are neighbours in memory.
     order = samples.gaussian.argsort(stable=True)
     gaussian, diffuse, photo = (x[order] for x in (samples.gaussian, samples.diffuse, samples.photo))
-    samples, counts = (
-        Samples(gaussian, diffuse, samples.specular[:, order], photo),
-        torch.bincount(gaussian, minlength=n),
-    )
+    samples = Samples(gaussian, diffuse, samples.specular[:, order], photo)
+    counts = torch.bincount(gaussian, minlength=n)
 
     def errors(specular: Tensor, min_albedo: float) -> Tensor:
         return torch.stack([fit_error(samples, specular, scale, counts, min_albedo)[0] for scale in SPECULAR_SCALES])

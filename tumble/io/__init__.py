@@ -8,10 +8,11 @@ from tumble.io import files, limits, outputs, progress, tree, video, weights
 from tumble.io.checked_tensors import read_tensors, write_tensors
 from tumble.io.errors import BadFile, one_line
 from tumble.io.plugins import load_plugin, plugin_names
-from tumble.io.threads import in_threads
+from tumble.io.threads import begin, in_threads
 
 __all__ = [
     "BadFile",
+    "begin",
     "files",
     "in_threads",
     "limits",

@@ -11,14 +11,13 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import torch
 
-from tumble.io import BadFile, load_plugin, progress, read_tensors, write_tensors
+from tumble.io import BadFile, in_threads, load_plugin, progress, read_tensors, write_tensors
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
@@ -74,12 +73,8 @@ def match_pairs(
     # Threads work on pairs far apart in the list, so that no two of them compute features of the same view.
     share = max(1, math.ceil(len(pairs) / n_threads))
     order = sorted(range(len(pairs)), key=lambda number: (number % share, number))
-    with _one_thread_in_opencv(), ThreadPoolExecutor(n_threads) as threads:
-        try:
-            found = dict(progress.track(threads.map(match, order), f"matching ({matcher})", len(pairs)))
-        except BaseException:
-            threads.shutdown(cancel_futures=True)
-            raise
+    with _one_thread_in_opencv():
+        found = dict(progress.track(in_threads(match, order, n_threads), f"matching ({matcher})", len(pairs)))
     return [found[number] for number in range(len(pairs))]
 
 

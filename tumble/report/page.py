@@ -29,7 +29,7 @@ from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
-from tumble.io import BadFile, files, progress, tree
+from tumble.io import BadFile, begin, files, progress, tree
 from tumble.maths import fibonacci_sphere
 from tumble.poses import PoseQuality, background_removal
 from tumble.preprocess import read_provenance
@@ -109,8 +109,8 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
         all_frames = AllFrames(full_capture, refined, hand_coloured)
         with ThreadPoolExecutor(1) as beside:
             # The mesh is made by one thread most of the time.
-            model = beside.submit(write_model, asset, Path(folder))
-            build(asset, run_capture, model.result, summary, quality, out / run.REPORT, all_frames=all_frames)
+            model = begin(beside, asset.gaussians.means.device, lambda: write_model(asset, Path(folder)))
+            build(asset, run_capture, model, summary, quality, out / run.REPORT, all_frames=all_frames)
     return out / run.REPORT
 
 
