@@ -9,6 +9,7 @@ import ctypes
 import hashlib
 import importlib
 import math
+import pkgutil
 import re
 import struct
 import subprocess
@@ -22,8 +23,8 @@ from typing import Any
 import warp
 from torch import Tensor
 
-from tumble import backends
-from tumble.backends import _cache, _native, _warp, _warp_composite
+from tumble.backends import _cache, _native, _warp
+from tumble.backends._warp import compositing, runtime
 
 HERE = Path(__file__).parent
 UNUSED_HEADERS = ("crt", "deterministic", "hashgrid", "matnn", "mesh", "noise", "svd", "texture", "tile*", "volume*")
@@ -42,10 +43,10 @@ class EmulationError(Exception):
 @cache
 def ptx_files() -> list[Path]:
     """Every module of the kernels as compiled for a GPU by Warp, in the cache; its source lies beside it."""
-    names = [f"tumble.backends.{path.stem}" for path in Path(backends.__file__).parent.glob("_warp_*.py")]
+    names = [f"{_warp.__name__}.{found.name}" for found in pkgutil.iter_modules(_warp.__path__)]
     modules = [warp.get_module(importlib.import_module(name).__name__) for name in sorted(names)]
-    factories = _warp_composite.forward, _warp_composite.adjoint
-    modules += [make(channels).module for make in factories for channels in _warp_composite.WIDTHS]
+    factories = compositing.forward, compositing.adjoint
+    modules += [make(channels).module for make in factories for channels in compositing.WIDTHS]
     folder = _cache.of_warp() / "ptx"
     found = [warp.compile_aot_module(x, arch=90, module_dir=folder, use_ptx=True) for x in modules if x.kernels]
     return [path for paths in found for path in paths]
@@ -120,14 +121,14 @@ class EmulatedGpu:
         library.emulation_launch.argtypes = [ctypes.c_char_p, pointer, pointer, number, ctypes.c_int, number]
 
     def launch(self, kernel: Any, threads: int | tuple[int, int], *arguments: Tensor | float) -> None:
-        """Takes the place of `_warp.launch`."""
+        """Takes the place of `runtime.launch`."""
         parameters = kernel.adj.args
         shape = threads if isinstance(threads, tuple) else (threads,)
         n = math.prod(shape)
         # Warp's `launch_bounds_t`: shape, number of threads, threads of the same index.
         packed: list[Any] = [ctypes.create_string_buffer(struct.pack(f"@{len(shape)}IQQ", *shape, n, 1))]
         for parameter, value in zip(parameters, arguments, strict=True):
-            packed.append(_packed(parameter.type, _warp._argument(parameter, value)))
+            packed.append(_packed(parameter.type, runtime._argument(parameter, value)))
         arrays = {p.label: x for p, x in zip(parameters, arguments, strict=True) if isinstance(x, Tensor)}
         opaque = any(p.type is warp.uint64 for p in parameters)
         self.run(f"{kernel.get_mangled_name()}_cuda_kernel_forward", packed, n, arrays, opaque=opaque)

@@ -81,7 +81,7 @@ def test_hits_of_rays_along_the_axes_are_those_of_brute_force(kernels: Any) -> N
 
 def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any) -> None:
     """Compared with the response of every Gaussian at every pixel."""
-    from tumble.backends import _warp, _warp_project
+    from tumble.backends._warp import projection, runtime
 
     scene = cases.hard()
     height, width = 8 * scene.height, 8 * scene.width
@@ -89,10 +89,10 @@ def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any
     camera = torch.cat([R.flatten(), t, 8 * focal]).float()
     n = len(means)
     record, depth, n_tiles = torch.empty(n, 8, 4), torch.empty(n), torch.empty(n, dtype=torch.int32)
-    with _warp.stream(means.device):
+    with runtime.stream(means.device):
         gaussians = [x.float().contiguous() for x in (means, quats, scales, opacity, sh)]
         prepared = record, depth, n_tiles
-        _warp.launch(_warp_project.project_forward, n, *gaussians, camera, height, width, *prepared)
+        runtime.launch(projection.project_forward, n, *gaussians, camera, height, width, *prepared)
         starts, listed = cuda._bin(*prepared, height, width)
     across, down = -(-width // 16), -(-height // 16)
     in_list = torch.zeros(across * down, n, dtype=torch.bool)

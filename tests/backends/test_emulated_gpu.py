@@ -28,7 +28,7 @@ except _native.CannotCompile as no_compiler:
 import warp
 
 from tests.backends.emulated_gpu import EmulatedGpu, EmulationError, compiled, cuda_sources
-from tumble.backends import _warp
+from tumble.backends._warp import runtime
 
 SMALL_KERNELS = """
 #define LANE (threadIdx.x % 32)
@@ -182,7 +182,7 @@ def gpu(library: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> Iterator[Emula
     Memory that is not initialised holds NaN or the largest integer.
     """
     emulated = EmulatedGpu(library)
-    monkeypatch.setattr(_warp, "launch", emulated.launch)
+    monkeypatch.setattr(runtime, "launch", emulated.launch)
     torch.use_deterministic_algorithms(True)
     yield emulated
     torch.use_deterministic_algorithms(False)

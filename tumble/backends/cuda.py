@@ -1,4 +1,4 @@
-"""CUDA backend: float32 kernels written in NVIDIA Warp (`_warp*.py`).
+"""CUDA backend: float32 kernels written in NVIDIA Warp (the folder `_warp`).
 
 This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
 it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
@@ -78,7 +78,7 @@ def rasterize(
     mask: Float[Tensor, "#h #w"],
 ) -> Rendering:
     """One view of the Gaussians; see `Backend.rasterize`. Many features are rendered in several passes."""
-    from tumble.backends._warp_composite import WIDTHS
+    from tumble.backends._warp.compositing import WIDTHS
 
     camera = torch.cat([R_cam_obj.flatten(), t_cam_obj, fx_fy_cx_cy])
     views = []
@@ -98,28 +98,28 @@ def rasterize(
 class _Rasterize(torch.autograd.Function):
     """(means, quats, scales, opacity, sh, corners, camera, height, width, mask) -> pixels, weight, touched, dominant.
 
-    The layouts of camera and pixels are those of `_warp_project` and `_warp_composite`.
+    The layouts of camera and pixels are those of `_warp`.
     """
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[Tensor, ...]:
-        from tumble.backends import _warp, _warp_composite, _warp_project
+        from tumble.backends._warp import compositing, projection, runtime
 
         *inputs, height, width, mask = args
         inputs = [x.contiguous() for x in inputs]
         *geometry, corners, camera = inputs
         means, n, channels = geometry[0], len(corners), corners.shape[2]
-        record = means.new_empty(n, _warp_project.RECORD, 4)
+        record = means.new_empty(n, projection.RECORD, 4)
         depth, n_tiles = means.new_empty(n), _int32(means, n)
-        pixels = means.new_zeros(height * width, _warp_composite.FIXED + channels)
+        pixels = means.new_zeros(height * width, compositing.FIXED + channels)
         statistics = means.new_zeros(n), torch.zeros_like(n_tiles), _int32(means, height * width).fill_(-1)
-        with _warp.stream(means.device):
+        with runtime.stream(means.device):
             prepared = record, depth, n_tiles
-            _warp.launch(_warp_project.project_forward, n, *geometry, camera, height, width, *prepared)
+            runtime.launch(projection.project_forward, n, *geometry, camera, height, width, *prepared)
             starts, listed = _bin(*prepared, height, width)
             drawing = record, _packed(corners), camera, mask.expand(height, width), starts, listed, height, width
-            kernel = _warp_composite.forward(channels)
-            _warp.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
+            kernel = compositing.forward(channels)
+            runtime.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
         ctx.size = height, width
         ctx.save_for_backward(*inputs, record, n_tiles, starts, listed, pixels)
         ctx.mark_non_differentiable(*statistics)
@@ -128,23 +128,23 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_pixels: Tensor, *_: Any) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        from tumble.backends import _warp, _warp_composite, _warp_project
+        from tumble.backends._warp import compositing, projection, runtime
 
         means, quats, scales, _, sh, corners, camera, record, n_tiles, starts, listed, pixels = ctx.saved_tensors
         n, channels = len(means), corners.shape[2]
-        sums = means.new_zeros(n, _warp_project.CORNERS + 4 * channels)
+        sums = means.new_zeros(n, projection.CORNERS + 4 * channels)
         v_means, v_quats, v_scales, v_sh = (torch.zeros_like(x) for x in (means, quats, scales, sh))
         v_camera = camera.new_zeros(1, len(camera))
-        with _warp.stream(means.device):
+        with runtime.stream(means.device):
             drawn = record, _packed(corners), camera, starts, listed, *ctx.size, pixels
-            kernel = _warp_composite.adjoint(channels)
-            _warp.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
+            kernel = compositing.adjoint(channels)
+            runtime.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
             gradients = v_means, v_quats, v_scales, v_sh, v_camera
-            n_threads = -(-n // _warp.LANES) * _warp.LANES
+            n_threads = -(-n // runtime.LANES) * runtime.LANES
             inputs = means, quats, scales, sh, camera, n_tiles
-            _warp.launch(_warp_project.project_adjoint, n_threads, *inputs, sums, *gradients)
-        v_opacity = sums[:, _warp_project.OPACITY]
-        v_corners = sums[:, _warp_project.CORNERS :].view(n, 4, channels)
+            runtime.launch(projection.project_adjoint, n_threads, *inputs, sums, *gradients)
+        v_opacity = sums[:, projection.OPACITY]
+        v_corners = sums[:, projection.CORNERS :].view(n, 4, channels)
         return v_means, v_quats, v_scales, v_opacity, v_sh, v_corners, v_camera[0], None, None, None
 
 
@@ -155,7 +155,7 @@ def _packed(corners: Float[Tensor, "n 4 c"]) -> Float[Tensor, "n 4 c1"]:
 
 def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
     """Number of threads of the blending kernels, one per pixel of all tiles."""
-    from tumble.backends._warp_project import TILE
+    from tumble.backends._warp.projection import TILE
 
     return (len(starts) - 1) * TILE * TILE
 
@@ -166,15 +166,15 @@ def _bin(
     """Start of the list of each tile (and end of the last), and all lists: Gaussians by depth, ties by index."""
     import warp
 
-    from tumble.backends import _warp, _warp_project
+    from tumble.backends._warp import projection, runtime
 
     order = torch.argsort(depth, stable=True)
     ends = n_tiles[order].cumsum(0)
     n_pairs = int(ends[-1]) if len(ends) else 0
     # The second half of both is workspace of the sort, which is stable and so keeps the depth order within a tile.
     tiles, listed = _int32(depth, 2 * n_pairs), _int32(depth, 2 * n_pairs)
-    _warp.launch(_warp_project.list_tiles, len(order), order, ends, record, n_tiles, height, width, tiles, listed)
-    n_all = -(-height // _warp_project.TILE) * -(-width // _warp_project.TILE)
+    runtime.launch(projection.list_tiles, len(order), order, ends, record, n_tiles, height, width, tiles, listed)
+    n_all = -(-height // projection.TILE) * -(-width // projection.TILE)
     warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), n_pairs, end_bit=n_all.bit_length())
     all_tiles = torch.arange(n_all + 1, dtype=torch.int32, device=depth.device)
     return torch.searchsorted(tiles[:n_pairs], all_tiles, out_int32=True), listed[:n_pairs]
@@ -186,7 +186,7 @@ class WarpBvh(NamedTuple):
     boxes: Any
     """Bounding boxes of the Gaussians as a `warp.Bvh`."""
     record: Float[Tensor, "n 4 4"]
-    """Records of the Gaussians, see `_warp_trace`."""
+    """Records of the Gaussians, see `tracing`."""
     low: Float[Tensor, "n 3"]
     """Lower corners of the boxes, to which `boxes` points."""
     high: Float[Tensor, "n 3"]
@@ -203,15 +203,15 @@ def build(
     """See `Backend.build`."""
     import warp
 
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     # Warp's tree cannot be empty, so that without Gaussians it holds one box that no ray reaches.
     n = max(len(means), 1)
     record = means.new_zeros(n, 4, 4)
-    low, high = means.new_full((n, 3), _warp_trace.UNREACHABLE), means.new_full((n, 3), _warp_trace.UNREACHABLE)
-    with _warp.stream(means.device):
+    low, high = means.new_full((n, 3), tracing.UNREACHABLE), means.new_full((n, 3), tracing.UNREACHABLE)
+    with runtime.stream(means.device):
         gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
-        _warp.launch(_warp_trace.enclose, len(means), *gaussians, record, low, high)
+        runtime.launch(tracing.enclose, len(means), *gaussians, record, low, high)
         boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3))
     return WarpBvh(boxes, record, low, high)
 
@@ -224,13 +224,13 @@ def trace(
     radiance: Float[Tensor, "m 3"],
 ) -> Hits:
     """See `Backend.trace`."""
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     n = len(origins)
     hits = Hits(origins.new_empty(n), origins.new_empty(n, 3), _int32(origins, n))
-    with _warp.stream(origins.device):
+    with runtime.stream(origins.device):
         rays = [x.contiguous() for x in (radiance, origins, directions)]
-        _warp.launch(_warp_trace.trace_rays, n, bvh.boxes.id, bvh.record, *rays, *hits)
+        runtime.launch(tracing.trace_rays, n, bvh.boxes.id, bvh.record, *rays, *hits)
     return hits
 
 
@@ -242,13 +242,13 @@ def visible(
     directions: Float[Tensor, "d 3"],
 ) -> Int32[Tensor, "p words"]:
     """See `Backend.visible`."""
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     words = -(-len(directions) // 32)
     bits = _int32(points, len(points), words)
-    with _warp.stream(points.device):
+    with runtime.stream(points.device):
         inputs = [x.contiguous() for x in (points, normals, directions)]
-        _warp.launch(_warp_trace.trace_visibility, (words, len(points)), bvh.boxes.id, bvh.record, *inputs, bits)
+        runtime.launch(tracing.trace_visibility, (words, len(points)), bvh.boxes.id, bvh.record, *inputs, bits)
     return bits
 
 
@@ -261,13 +261,13 @@ def blockers(
     visibility: Int32[Tensor, "p words"],
 ) -> Int32[Tensor, "p d"]:
     """See `Backend.blockers`."""
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     blocker = _int32(points, len(points), len(directions))
-    with _warp.stream(points.device):
+    with runtime.stream(points.device):
         inputs = [x.contiguous() for x in (points.new_zeros(0, 3), points, normals, directions, visibility)]
         threads = len(directions), len(points)
-        _warp.launch(_warp_trace.find_blockers, threads, bvh.boxes.id, bvh.record, *inputs, blocker)
+        runtime.launch(tracing.find_blockers, threads, bvh.boxes.id, bvh.record, *inputs, blocker)
     return blocker
 
 
@@ -303,32 +303,32 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *args: Tensor) -> Tensor:
-        from tumble.backends import _warp, _warp_shade
+        from tumble.backends._warp import runtime, shading
 
         tensors = [x.contiguous() for x in args]
         n, d = len(tensors[0]), len(tensors[3])
         tensors[6] = tensors[6].expand(n, d)
         out = tensors[0].new_zeros(n, 8)
-        with _warp.stream(out.device):
-            _warp.launch(_warp_shade.shade_forward, (n, _warp.LANES), *tensors, out)
+        with runtime.stream(out.device):
+            runtime.launch(shading.shade_forward, (n, runtime.LANES), *tensors, out)
         ctx.save_for_backward(*tensors)
         return out
 
     @staticmethod
     def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        from tumble.backends import _warp, _warp_shade
+        from tumble.backends._warp import runtime, shading
 
         *surface, directions, radiance, visibility, blocker, blocker_radiance = ctx.saved_tensors
         v_diffuse, v_specular = v_out[:, :3].contiguous(), v_out[:, 3:6].contiguous()
-        n, groups = len(v_out), -(-len(v_out) // _warp_shade.POINTS)
+        n, groups = len(v_out), -(-len(v_out) // shading.POINTS)
         v_points = v_out.new_zeros(n, 7)
         v_radiance, v_blocker_radiance = torch.zeros_like(radiance), torch.zeros_like(blocker_radiance)
-        with _warp.stream(v_out.device):
+        with runtime.stream(v_out.device):
             inputs = *surface, directions, radiance, visibility, blocker, blocker_radiance
-            _warp.launch(_warp_shade.shade_adjoint, (n, _warp.LANES), *inputs, v_diffuse, v_specular, v_points)
+            runtime.launch(shading.shade_adjoint, (n, runtime.LANES), *inputs, v_diffuse, v_specular, v_points)
             inputs = *surface, directions, visibility, blocker
             threads = groups, len(directions)
             gradients = v_radiance, v_blocker_radiance
-            _warp.launch(_warp_shade.light_adjoint, threads, *inputs, v_diffuse, v_specular, *gradients)
+            runtime.launch(shading.light_adjoint, threads, *inputs, v_diffuse, v_specular, *gradients)
         v_normal, v_view, v_roughness = v_points.split([3, 3, 1], 1)
         return v_normal, v_roughness[:, 0], v_view, None, v_radiance, None, None, v_blocker_radiance

@@ -27,7 +27,7 @@ The adjoint computes gradients of the Gaussians and the camera from the sums; `v
 import warp as wp
 
 from tumble.backends import ALPHA_MIN, CORNER, FACING, NEAR, NEAR_SIGMAS
-from tumble.backends._warp import add_row, no_type_check, vec32
+from tumble.backends._warp.runtime import add_row, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 

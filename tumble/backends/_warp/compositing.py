@@ -4,7 +4,7 @@
 
 With s_i = dL/dw_i, the Gaussians behind Gaussian i contribute rem = dL/dout . out - sum_{j <= i} w_j s_j, so that
 neither a reversed list nor a state per pixel is stored. Formulas and the layouts of records and sums are in
-`_warp_project.py`.
+`projection.py`.
 
 A *pixel* is rgb, alpha, depth, variance of depth, normal, features. A tile is a block of 256 threads; the 32 lanes of a
 warp cover 8 x 4 pixels and traverse the list of the tile together.
@@ -15,8 +15,8 @@ from functools import cache
 import warp as wp
 
 from tumble.backends import ALPHA_MAX, ALPHA_MIN, T_MIN
-from tumble.backends._warp import add_lanes, add_row, any_lane, count_lanes, no_type_check, vec32
-from tumble.backends._warp_project import CORNERS, SUMS, TILE
+from tumble.backends._warp.projection import CORNERS, SUMS, TILE
+from tumble.backends._warp.runtime import add_lanes, add_row, any_lane, count_lanes, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,7 +11,7 @@ import math
 import warp as wp
 
 from tumble.backends import ROUGHNESS_MIN
-from tumble.backends._warp import LANES, add_row, no_type_check, vec32
+from tumble.backends._warp.runtime import LANES, add_row, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 
