@@ -16,11 +16,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Lobes, Rendering
+from tumble.backends._cuda_terms import activate, adam, corner_features
 from tumble.backends.reference import (
-    activate,
-    adam,
     bounce,
-    corner_features,
     gaussian_terms,
     image_terms,
     lookup,

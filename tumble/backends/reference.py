@@ -453,16 +453,27 @@ def activate(
 
 
 @torch.no_grad()
-def adam(leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+def adam(
+    leaves: Sequence[Leaf],
+    loss: Float[Tensor, ""],
+    failed: Float[Tensor, ""],
+    beta_1: float,
+    beta_2: float,
+    eps: float,
+) -> None:
     """See `Backend.adam`."""
-    if not all(bool(leaf.gradient.isfinite().all()) for leaf in leaves):
-        return False
+    finite = torch.stack([loss.isfinite(), *(leaf.gradient.isfinite().all() for leaf in leaves)]).all()
+    failed.copy_(torch.maximum(failed, 1 - finite.to(failed)))
+    moves = failed == 0
     for leaf in leaves:
-        leaf.first.lerp_(leaf.gradient, 1 - beta_1)
-        leaf.second.mul_(beta_2).addcmul_(leaf.gradient, leaf.gradient, value=1 - beta_2)
-        root = leaf.second.sqrt() / math.sqrt(1 - beta_2**leaf.count) + eps
-        leaf.value.addcdiv_(leaf.first, root, value=-leaf.rate / (1 - beta_1**leaf.count))
-    return True
+        leaf.count.add_(1 - failed)
+        count, gradient = leaf.count.double(), leaf.gradient
+        first = leaf.first.lerp(gradient, 1 - beta_1)
+        second = (leaf.second * beta_2).addcmul(gradient, gradient, value=1 - beta_2)
+        root = second.sqrt() / (1 - beta_2**count).sqrt() + eps
+        value = leaf.value - leaf.rate / (1 - beta_1**count) * first / root
+        for old, new in ((leaf.value, value), (leaf.first, first), (leaf.second, second)):
+            old.copy_(torch.where(moves, new, old))
 
 
 def corner_features(

@@ -1,0 +1,121 @@
+"""CUDA kernels of the steps of stages 2 and 3 besides rendering: materials, colour and loss terms (see `_warp/`).
+
+A kernel that adds to a result needs whole warps of threads and a result of zeros.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tumble.backends import Leaf
+
+
+def activate(
+    log_scales: Float[Tensor, "n 3"], sdf: Float[Tensor, " n"], gamma: Float[Tensor, ""]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """See `Backend.activate`."""
+    return _Activate.apply(log_scales, sdf, gamma)
+
+
+class _Activate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> tuple[Tensor, Tensor]:
+        from tumble.backends._warp import parameters, runtime
+
+        log_scales, sdf, gamma = (x.contiguous() for x in args)
+        scales, opacity = torch.empty_like(log_scales), torch.empty_like(sdf)
+        with runtime.stream(sdf.device):
+            inputs = log_scales, sdf, gamma
+            runtime.launch(parameters.activate_forward, len(sdf), *inputs, scales, opacity)
+        ctx.save_for_backward(scales, sdf, gamma)
+        return scales, opacity
+
+    @staticmethod
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+        from tumble.backends._warp import parameters, runtime
+
+        scales, sdf, gamma = ctx.saved_tensors
+        gradients = torch.empty_like(scales), torch.empty_like(sdf), torch.zeros_like(gamma)
+        with runtime.stream(sdf.device):
+            seeds = (x.contiguous() for x in v_results)
+            threads = runtime.whole_warps(len(sdf))
+            runtime.launch(parameters.activate_adjoint, threads, scales, sdf, gamma, *seeds, *gradients)
+        return gradients
+
+
+def corner_features(
+    albedo_logits: Float[Tensor, "n 4 3"],
+    roughness_logits: Float[Tensor, "n 4"],
+    normal_offset: Float[Tensor, "n 4 3"],
+    temperature: float,
+) -> tuple[Float[Tensor, "n 4 7"], Float[Tensor, "n 3"]]:
+    """See `Backend.corner_features`."""
+    return _CornerFeatures.apply(albedo_logits, roughness_logits, normal_offset, temperature)
+
+
+class _CornerFeatures(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor]:
+        from tumble.backends._warp import parameters, runtime
+
+        *tensors, ctx.temperature = args
+        inputs = [x.contiguous() for x in tensors]
+        n = len(inputs[0])
+        corners, albedo = inputs[0].new_empty(n, 4, 7), inputs[0].new_empty(n, 3)
+        with runtime.stream(corners.device):
+            runtime.launch(parameters.corners_forward, n, *inputs, ctx.temperature, corners, albedo)
+        ctx.save_for_backward(corners)
+        return corners, albedo
+
+    @staticmethod
+    def backward(ctx: Any, *v_results: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        from tumble.backends._warp import parameters, runtime
+
+        (corners,) = ctx.saved_tensors
+        n = len(corners)
+        gradients = corners.new_empty(n, 4, 3), corners.new_empty(n, 4), corners.new_empty(n, 4, 3)
+        with runtime.stream(corners.device):
+            seeds = (x.contiguous() for x in v_results)
+            runtime.launch(parameters.corners_adjoint, n, corners, ctx.temperature, *seeds, *gradients)
+        return (*gradients, None)
+
+
+@torch.no_grad()
+def adam(
+    leaves: Sequence[Leaf],
+    loss: Float[Tensor, ""],
+    failed: Float[Tensor, ""],
+    beta_1: float,
+    beta_2: float,
+    eps: float,
+) -> None:
+    """See `Backend.adam`."""
+    from tumble.backends._warp import parameters, runtime
+
+    with runtime.stream(loss.device):
+        for group in _groups([loss, *(leaf.gradient for leaf in leaves)]):
+            ends = _ends(group)
+            runtime.launch(parameters.find_not_finite, ends[-1], group, ends, failed)
+        for group in _groups(leaves):
+            corrections = loss.new_empty(len(group), 2)
+            values, gradients, firsts, seconds, counts, rates = zip(*group, strict=True)
+            ends = _ends(values)
+            runtime.launch(parameters.count_step, len(group), counts, rates, beta_1, beta_2, failed, corrections)
+            moved = values, gradients, firsts, seconds, ends, corrections
+            factors = beta_2, 1 - beta_1, 1 - beta_2, eps
+            runtime.launch(parameters.adam_step, ends[-1], *moved, *factors, failed)
+
+
+def _groups(items: Sequence[Any]) -> Iterator[Sequence[Any]]:
+    from tumble.backends._warp.parameters import LEAVES
+
+    return (items[k : k + LEAVES] for k in range(0, len(items), LEAVES))
+
+
+def _ends(tensors: Sequence[Tensor]) -> list[int]:
+    """Number of numbers of each tensor and those before it."""
+    return list(accumulate(x.numel() for x in tensors))
