@@ -183,7 +183,7 @@ def _tensors(label: str, value: Any) -> dict[str, Tensor]:
     if isinstance(value, Tensor):
         return {label: value}
     if isinstance(value, Mapping):
-        return {name: x for each in value for name, x in _tensors(each, value[each]).items()}
+        return {name: x for key, each in value.items() for name, x in _tensors(f"{label}.{key}", each).items()}
     if isinstance(value, list | tuple):
         return {f"{label}[{k}]": x for k, x in enumerate(value) if isinstance(x, Tensor)}
     return {}

@@ -31,6 +31,11 @@ KERNEL_CASES = [
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 256, 7, (0.03, 0.6)),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 1, 3, (0.5, 0.5)),
     (conformance.test_a_sphere_in_uniform_light_matches_the_integrated_brdf, 0.3),
+    *[
+        (conformance.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference, n, shadowed)
+        for n, shadowed in ((133, True), (133, False), (0, True))
+    ],
+    *[(conformance.test_bounces_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
     (conformance.test_activations_and_their_gradients_are_those_of_the_reference,),
     *[(conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
     (conformance.test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none, 0, 4),
@@ -39,12 +44,10 @@ KERNEL_CASES = [
 CONFORMANCE = [
     *KERNEL_CASES,
     (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, 9, 16, 200),
-    (conformance.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference, 133, True),
     *[
         (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, 40, 50, box, 0.2, 25.0)
         for box in ((slice(8, 30), slice(12, 40)), (slice(None), slice(None)))
     ],
-    (conformance.test_bounces_and_their_gradients_are_those_of_the_reference, 75),
     (conformance.test_terms_of_materials_and_their_gradients_are_those_of_the_reference, 19, 37),
     (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 333, 8.0),
 ]

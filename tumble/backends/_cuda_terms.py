@@ -84,6 +84,103 @@ class _CornerFeatures(torch.autograd.Function):
         return (*gradients, None)
 
 
+def sh_shade(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    albedo_logits: Float[Tensor, "n 3"],
+    light: Float[Tensor, "2 16 3"],
+    specular_scale: Float[Tensor, ""],
+    occluded: Float[Tensor, "m 9"],
+    unoccluded: Float[Tensor, "m 9"],
+    directions: Float[Tensor, "d 3"],
+    reflectance: Float[Tensor, " k"],
+    R_env_obj: Float[Tensor, "3 3"],
+    position: Float[Tensor, "3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.sh_shade`."""
+    constants = (occluded, unoccluded, directions, reflectance)
+    return _ShShade.apply(means, quats, albedo_logits, light, specular_scale, R_env_obj, position, *constants)
+
+
+_SH_INPUTS: tuple[str, ...] = (
+    *("means", "quats", "albedo_logits", "light", "specular_scale", "R", "position"),
+    *("occluded", "unoccluded", "coefficients", "reflectance"),
+)
+"""Fields of `sh_lighting.ShInputs`."""
+
+
+class _ShShade(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        from tumble.backends._warp import runtime, sh_lighting
+
+        *tensors, directions, reflectance = (x.contiguous() for x in args)
+        light, R, position, occluded = tensors[3], tensors[5], tensors[6], tensors[7]
+        tensors[6] = position[None]
+        shadowed, out = len(occluded) > 0, torch.empty_like(tensors[0])
+        coefficients = light.new_zeros(1, sh_lighting.COEFFICIENTS) if shadowed else light.new_empty(1, 1)
+        with runtime.stream(out.device):
+            if shadowed:
+                threads = runtime.whole_warps(len(directions))
+                runtime.launch(sh_lighting.project_light, threads, light, directions, R, coefficients)
+            inputs = dict(zip(_SH_INPUTS, (*tensors, coefficients, reflectance), strict=True))
+            runtime.launch(sh_lighting.sh_forward, len(out), inputs, out)
+        ctx.save_for_backward(*inputs.values())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        from tumble.backends._warp import runtime, sh_lighting
+
+        inputs = dict(zip(_SH_INPUTS, ctx.saved_tensors, strict=True))
+        own = {name: torch.empty_like(inputs[name]) for name in ("means", "quats", "albedo_logits")}
+        sums = v_out.new_zeros(-(-sh_lighting.LIGHT_SUMS // runtime.LANES), runtime.LANES)
+        with runtime.stream(v_out.device):
+            threads = runtime.whole_warps(len(v_out))
+            runtime.launch(sh_lighting.sh_adjoint, threads, inputs, v_out.contiguous(), own | {"light": sums})
+        v_light, v_scale, v_R, v_position = sums.flatten()[: sh_lighting.LIGHT_SUMS].split([96, 1, 9, 3])
+        of_light = v_light.view(2, 16, 3), v_scale[0], v_R.view(3, 3), v_position
+        return *own.values(), *of_light, None, None, None, None
+
+
+def bounce(
+    albedo: Float[Tensor, "n 3"],
+    transfer: Float[Tensor, "n 9"],
+    directions: Float[Tensor, "d 3"],
+    radiance: Float[Tensor, "d 3"],
+) -> Float[Tensor, "n 3"]:
+    """See `Backend.bounce`."""
+    return _Bounce.apply(albedo, transfer, directions, radiance)
+
+
+class _Bounce(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        from tumble.backends._warp import runtime, sh_lighting
+
+        albedo, transfer, directions, radiance = (x.contiguous() for x in args)
+        out, coefficients = torch.empty_like(albedo), albedo.new_zeros(1, sh_lighting.COEFFICIENTS)
+        with runtime.stream(out.device):
+            threads = runtime.whole_warps(len(directions))
+            runtime.launch(sh_lighting.project_radiance, threads, directions, radiance, coefficients)
+            runtime.launch(sh_lighting.bounce_forward, len(albedo), albedo, transfer, coefficients, out)
+        ctx.save_for_backward(albedo, transfer, directions, coefficients)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        from tumble.backends._warp import runtime, sh_lighting
+
+        albedo, transfer, directions, coefficients = ctx.saved_tensors
+        v_albedo, v_coefficients = torch.empty_like(albedo), torch.zeros_like(coefficients)
+        v_radiance = torch.zeros_like(directions)
+        with runtime.stream(v_out.device):
+            threads, inputs = runtime.whole_warps(len(albedo)), (albedo, transfer, coefficients, v_out.contiguous())
+            runtime.launch(sh_lighting.bounce_adjoint, threads, *inputs, v_albedo, v_coefficients)
+            runtime.launch(sh_lighting.radiance_adjoint, len(directions), directions, v_coefficients, v_radiance)
+        return v_albedo, None, None, v_radiance
+
+
 @torch.no_grad()
 def adam(
     leaves: Sequence[Leaf],

@@ -16,15 +16,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Lobes, Rendering
-from tumble.backends._cuda_terms import activate, adam, corner_features
+from tumble.backends._cuda_terms import activate, adam, bounce, corner_features, sh_shade
 from tumble.backends.reference import (
-    bounce,
     gaussian_terms,
     image_terms,
     lookup,
     material_terms,
     prefilter,
-    sh_shade,
     shading_term_by,
 )
 
