@@ -36,6 +36,18 @@ KERNEL_CASES = [
         for n, shadowed in ((133, True), (133, False), (0, True))
     ],
     *[(conformance.test_bounces_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
+    *[
+        (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, height, width, box, *weights)
+        for height, width, box, weights in (
+            (40, 50, (slice(8, 30), slice(12, 40)), (0.2, 25.0)),
+            (37, 51, (slice(None), slice(None)), (1.0, 0.0)),
+            (11, 13, (slice(0, 9), slice(3, None)), (0.2, 25.0)),
+        )
+    ],
+    *[
+        (conformance.test_terms_of_materials_and_their_gradients_are_those_of_the_reference, *size)
+        for size in ((19, 37), (1, 5), (4, 1))
+    ],
     (conformance.test_activations_and_their_gradients_are_those_of_the_reference,),
     *[(conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
     (conformance.test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none, 0, 4),
@@ -44,11 +56,6 @@ KERNEL_CASES = [
 CONFORMANCE = [
     *KERNEL_CASES,
     (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, 9, 16, 200),
-    *[
-        (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, 40, 50, box, 0.2, 25.0)
-        for box in ((slice(8, 30), slice(12, 40)), (slice(None), slice(None)))
-    ],
-    (conformance.test_terms_of_materials_and_their_gradients_are_those_of_the_reference, 19, 37),
     (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 333, 8.0),
 ]
 every_case = pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from itertools import accumulate
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from tumble.backends import Leaf
@@ -179,6 +179,129 @@ class _Bounce(torch.autograd.Function):
             runtime.launch(sh_lighting.bounce_adjoint, threads, *inputs, v_albedo, v_coefficients)
             runtime.launch(sh_lighting.radiance_adjoint, len(directions), directions, v_coefficients, v_radiance)
         return v_albedo, None, None, v_radiance
+
+
+def image_terms(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    depth_var: Float[Tensor, "h w"],
+    normal: Float[Tensor, "h w 3"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    ssim_weight: float,
+    crease: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
+) -> Float[Tensor, "4"]:
+    """See `Backend.image_terms`."""
+    images = (rgb, alpha, depth, depth_var, normal)
+    return _ImageTerms.apply(*images, R_cam_obj, photo, mask, fx_fy_cx_cy, ssim_weight, crease, weights)
+
+
+_IMAGE_INPUTS: tuple[str, ...] = ("rgb", "alpha", "depth", "depth_var", "normal", "R", "photo", "mask", "focal")
+"""Tensors of `image_losses.ImageInputs`; the first six are differentiable."""
+
+
+class _ImageTerms(torch.autograd.Function):
+    """The kernels compute values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> Tensor:
+        from tumble.backends._warp import image_losses, runtime
+
+        *tensors, ssim_weight, crease, weights = args
+        inputs: dict[str, Any] = dict(zip(_IMAGE_INPUTS, (x.contiguous() for x in tensors), strict=True))
+        rgb, (height, width) = inputs["rgb"], inputs["alpha"].shape
+        inputs |= {"weights": [x / (height * width) for x in weights], "ssim_weight": ssim_weight, "crease": crease}
+        terms, (less_high, less_wide) = rgb.new_zeros(4), (x - image_losses.MARGIN for x in (height, width))
+        kept, gradients = _gradient_buffer(ctx, {x: inputs[x] for x in _IMAGE_INPUTS[:6]}, "R", "depth")
+        shapes = {"x": (height, width), "y": (height, width), "slope": (height, width)}
+        shapes |= {"rows": (4, height, less_wide), "maps": (3, less_high, less_wide), "blurred": (3, less_high, width)}
+        planes = {name: rgb.new_empty(*shape, 3) for name, shape in shapes.items()}
+        of_l1 = weights[0] * (1 - ssim_weight) / (3 * height * width)
+        of_ssim = weights[0] * ssim_weight / (3 * less_high * less_wide)
+        with runtime.stream(rgb.device):
+            threads = runtime.whole_warps(height * width)
+            runtime.launch(image_losses.pixel_terms, threads, inputs, planes, terms[None], gradients)
+            runtime.launch(image_losses.sum_rows, (height, less_wide), planes)
+            runtime.launch(image_losses.similarity, runtime.whole_warps(less_high * less_wide), planes, of_ssim, terms)
+            runtime.launch(image_losses.sum_maps, (less_high, width), planes)
+            scales = of_l1, of_ssim, gradients["rgb"]
+            runtime.launch(image_losses.photometric_adjoint, (height, width), planes, *scales)
+        ctx.save_for_backward(kept)
+        ctx.of_term = {"rgb": 0, "alpha": 1, "depth": 2, "depth_var": 3, "normal": 2, "R": 2}
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return _scaled(ctx, v_terms)
+
+
+def _gradient_buffer(ctx: Any, inputs: dict[str, Tensor], *zeroed: str) -> tuple[Tensor, dict[str, Tensor]]:
+    """One tensor for the gradients of all inputs, and its parts by name; zeros for the named ones, which come first."""
+    order = [*zeroed, *(name for name in inputs if name not in zeroed)]
+    ctx.shapes = {name: inputs[name].shape for name in order}
+    ctx.order = list(inputs)
+    n_zeros = sum(inputs[name].numel() for name in zeroed)
+    kept = inputs[order[0]].new_empty(sum(x.numel() for x in inputs.values()))
+    if n_zeros:
+        kept[:n_zeros].zero_()
+    return kept, _parts(kept, ctx.shapes)
+
+
+def _parts(kept: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
+    parts = kept.split([shape.numel() for shape in shapes.values()])
+    return {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+
+
+def _scaled(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:
+    """Gradients of all inputs: the saved ones times that of the term to which each belongs; None for other inputs."""
+    from tumble.backends._warp import image_losses, runtime
+
+    (kept,) = ctx.saved_tensors
+    out, ends = torch.empty_like(kept), list(accumulate(shape.numel() for shape in ctx.shapes.values()))
+    terms = [ctx.of_term[name] for name in ctx.shapes]
+    with runtime.stream(kept.device):
+        runtime.launch(image_losses.scale, len(kept), kept, ends, terms, v_terms.contiguous(), out)
+    gradients = _parts(out, ctx.shapes)
+    return *(gradients[name] for name in ctx.order), *[None] * (len(ctx.needs_input_grad) - len(ctx.order))
+
+
+def material_terms(
+    features: Float[Tensor, "h w c"],
+    alpha: Float[Tensor, "h w"],
+    photo: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"],
+) -> Float[Tensor, "2"]:
+    """See `Backend.material_terms`."""
+    return _MaterialTerms.apply(features, alpha, photo, mask)
+
+
+class _MaterialTerms(torch.autograd.Function):
+    """The kernel computes values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        from tumble.backends._warp import image_losses, runtime
+
+        names = ("features", "alpha", "photo", "mask")
+        inputs = dict(zip(names, (x.contiguous() for x in args), strict=True))
+        alpha, (height, width) = inputs["alpha"], inputs["alpha"].shape
+        kept, gradients = _gradient_buffer(ctx, {x: inputs[x] for x in names[:2]})
+        terms = alpha.new_zeros(2)
+        scales = 1 / max(1, 4 * height * (width - 1)), 1 / max(1, 4 * (height - 1) * width)
+        with runtime.stream(alpha.device):
+            threads = runtime.whole_warps(height * width)
+            runtime.launch(image_losses.material_pixels, threads, inputs, *scales, terms[None], *gradients.values())
+        ctx.save_for_backward(kept)
+        ctx.of_term = {"features": 1, "alpha": 0}
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return _scaled(ctx, v_terms)
 
 
 @torch.no_grad()

@@ -16,12 +16,18 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Lobes, Rendering
-from tumble.backends._cuda_terms import activate, adam, bounce, corner_features, sh_shade
+from tumble.backends._cuda_terms import (
+    activate,
+    adam,
+    bounce,
+    corner_features,
+    image_terms,
+    material_terms,
+    sh_shade,
+)
 from tumble.backends.reference import (
     gaussian_terms,
-    image_terms,
     lookup,
-    material_terms,
     prefilter,
     shading_term_by,
 )
