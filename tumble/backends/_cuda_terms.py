@@ -269,6 +269,62 @@ def _scaled(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:
     return *(gradients[name] for name in ctx.order), *[None] * (len(ctx.needs_input_grad) - len(ctx.order))
 
 
+def gaussian_terms(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    log_scales: Float[Tensor, "n 3"],
+    sdf: Float[Tensor, " n"],
+    gamma: Float[Tensor, ""],
+    weight: Float[Tensor, " n"],
+    depth: Float[Tensor, "h w"],
+    R_cam_obj: Float[Tensor, "3 3"],
+    t_cam_obj: Float[Tensor, "3"],
+    fx_fy_cx_cy: Float[Tensor, "4"],
+    floor: float,
+    reach: float,
+    weights: Sequence[float] = (1.0, 1.0, 1.0),
+) -> Float[Tensor, "3"]:
+    """See `Backend.gaussian_terms`."""
+    if not len(means):
+        return means.sum() + means.new_zeros(3)
+    own = (means, quats, log_scales, sdf, gamma)
+    return _GaussianTerms.apply(*own, R_cam_obj, t_cam_obj, weight, depth, fx_fy_cx_cy, floor, reach, weights)
+
+
+_GAUSSIAN_INPUTS: tuple[str, ...] = (
+    *("means", "quats", "log_scales", "sdf", "gamma", "R", "t"),
+    *("weight", "depth", "focal", "floor", "reach", "weights"),
+)
+"""Arguments of `gaussian_terms` as fields of `gaussian_losses.GaussianInputs`; the first seven are differentiable."""
+
+
+class _GaussianTerms(torch.autograd.Function):
+    """The kernels compute values and gradients at once."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> Tensor:
+        from tumble.backends._warp import gaussian_losses, runtime
+
+        inputs = dict(zip(_GAUSSIAN_INPUTS, args, strict=True))
+        inputs |= {name: x.contiguous() for name, x in inputs.items() if isinstance(x, Tensor)}
+        inputs["t"] = inputs["t"][None]
+        sdf, threads = inputs["sdf"], runtime.whole_warps(len(inputs["sdf"]))
+        kept, gradients = _gradient_buffer(ctx, {x: inputs[x] for x in _GAUSSIAN_INPUTS[:7]}, "R", "t")
+        terms, magnitudes = sdf.new_zeros(3), torch.empty_like(sdf)
+        seen = torch.zeros(1, dtype=torch.int32, device=sdf.device)
+        with runtime.stream(sdf.device):
+            runtime.launch(gaussian_losses.count_seen, threads, sdf, inputs["weight"], magnitudes, seen)
+            inputs |= {"median": magnitudes.median(), "seen": seen}
+            runtime.launch(gaussian_losses.all_terms, threads, inputs, terms[None], gradients)
+        ctx.save_for_backward(kept)
+        ctx.of_term = {"means": 2, "quats": 2, "log_scales": 0, "sdf": 2, "gamma": 1, "R": 2, "t": 2}
+        return terms
+
+    @staticmethod
+    def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return _scaled(ctx, v_terms)
+
+
 def material_terms(
     features: Float[Tensor, "h w c"],
     alpha: Float[Tensor, "h w"],

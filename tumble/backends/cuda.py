@@ -21,12 +21,12 @@ from tumble.backends._cuda_terms import (
     adam,
     bounce,
     corner_features,
+    gaussian_terms,
     image_terms,
     material_terms,
     sh_shade,
 )
 from tumble.backends.reference import (
-    gaussian_terms,
     lookup,
     prefilter,
     shading_term_by,
