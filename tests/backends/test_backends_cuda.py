@@ -52,6 +52,15 @@ KERNEL_CASES = [
         (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, n, gamma)
         for n, gamma in ((333, 8.0), (332, 100.0), (1, 8.0))
     ],
+    *[
+        (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, *sizes)
+        for sizes in ((9, 16, 200), (1, 1, 20), (2, 5, 0))
+    ],
+    (conformance.test_lookups_at_the_poles_are_means_of_their_rows_and_have_no_gradient,),
+    *[
+        (conformance.test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference, *sizes)
+        for sizes in ((60, 100, 70), (0, 48, 17))
+    ],
     (conformance.test_activations_and_their_gradients_are_those_of_the_reference,),
     *[(conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
     (conformance.test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none, 0, 4),
@@ -60,7 +69,6 @@ KERNEL_CASES = [
 CONFORMANCE = [
     *KERNEL_CASES,
     (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 0, 8.0),
-    (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, 9, 16, 200),
 ]
 every_case = pytest.mark.parametrize(
     "case", CONFORMANCE, ids=lambda case: "-".join([case[0].__name__, *map(str, case[1:])])

@@ -216,7 +216,7 @@ class _ImageTerms(torch.autograd.Function):
         rgb, (height, width) = inputs["rgb"], inputs["alpha"].shape
         inputs |= {"weights": [x / (height * width) for x in weights], "ssim_weight": ssim_weight, "crease": crease}
         terms, (less_high, less_wide) = rgb.new_zeros(4), (x - image_losses.MARGIN for x in (height, width))
-        kept, gradients = _gradient_buffer(ctx, {x: inputs[x] for x in _IMAGE_INPUTS[:6]}, "R", "depth")
+        kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in _IMAGE_INPUTS[:6]}, "R", "depth")
         shapes = {"x": (height, width), "y": (height, width), "slope": (height, width)}
         shapes |= {"rows": (4, height, less_wide), "maps": (3, less_high, less_wide), "blurred": (3, less_high, width)}
         planes = {name: rgb.new_empty(*shape, 3) for name, shape in shapes.items()}
@@ -236,10 +236,10 @@ class _ImageTerms(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        return _scaled(ctx, v_terms)
+        return scaled(ctx, v_terms)
 
 
-def _gradient_buffer(ctx: Any, inputs: dict[str, Tensor], *zeroed: str) -> tuple[Tensor, dict[str, Tensor]]:
+def gradient_buffer(ctx: Any, inputs: dict[str, Tensor], *zeroed: str) -> tuple[Tensor, dict[str, Tensor]]:
     """One tensor for the gradients of all inputs, and its parts by name; zeros for the named ones, which come first."""
     order = [*zeroed, *(name for name in inputs if name not in zeroed)]
     ctx.shapes = {name: inputs[name].shape for name in order}
@@ -256,7 +256,7 @@ def _parts(kept: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
     return {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
 
 
-def _scaled(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:
+def scaled(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:
     """Gradients of all inputs: the saved ones times that of the term to which each belongs; None for other inputs."""
     from tumble.backends._warp import image_losses, runtime
 
@@ -309,7 +309,7 @@ class _GaussianTerms(torch.autograd.Function):
         inputs |= {name: x.contiguous() for name, x in inputs.items() if isinstance(x, Tensor)}
         inputs["t"] = inputs["t"][None]
         sdf, threads = inputs["sdf"], runtime.whole_warps(len(inputs["sdf"]))
-        kept, gradients = _gradient_buffer(ctx, {x: inputs[x] for x in _GAUSSIAN_INPUTS[:7]}, "R", "t")
+        kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in _GAUSSIAN_INPUTS[:7]}, "R", "t")
         terms, magnitudes = sdf.new_zeros(3), torch.empty_like(sdf)
         seen = torch.zeros(1, dtype=torch.int32, device=sdf.device)
         with runtime.stream(sdf.device):
@@ -322,7 +322,7 @@ class _GaussianTerms(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        return _scaled(ctx, v_terms)
+        return scaled(ctx, v_terms)
 
 
 def material_terms(
@@ -345,7 +345,7 @@ class _MaterialTerms(torch.autograd.Function):
         names = ("features", "alpha", "photo", "mask")
         inputs = dict(zip(names, (x.contiguous() for x in args), strict=True))
         alpha, (height, width) = inputs["alpha"], inputs["alpha"].shape
-        kept, gradients = _gradient_buffer(ctx, {x: inputs[x] for x in names[:2]})
+        kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in names[:2]})
         terms = alpha.new_zeros(2)
         scales = 1 / max(1, 4 * height * (width - 1)), 1 / max(1, 4 * (height - 1) * width)
         with runtime.stream(alpha.device):
@@ -357,7 +357,7 @@ class _MaterialTerms(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        return _scaled(ctx, v_terms)
+        return scaled(ctx, v_terms)
 
 
 @torch.no_grad()

@@ -7,15 +7,15 @@ Shading by spherical harmonics, lookups, materials and loss terms have no kernel
 """
 
 import importlib.util
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tumble.backends import Hits, Lobes, Rendering
+from tumble.backends import Hits, Rendering
+from tumble.backends._cuda_shading import lookup, shade, shading_term
 from tumble.backends._cuda_terms import (
     activate,
     adam,
@@ -26,11 +26,7 @@ from tumble.backends._cuda_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends.reference import (
-    lookup,
-    prefilter,
-    shading_term_by,
-)
+from tumble.backends.reference import prefilter
 
 __all__ = [
     "activate",
@@ -275,62 +271,3 @@ def blockers(
 
 def _int32(like: Tensor, *shape: int) -> Int32[Tensor, "..."]:
     return torch.empty(shape, dtype=torch.int32, device=like.device)
-
-
-def shade(
-    normal: Float[Tensor, "p 3"],
-    roughness: Float[Tensor, " p"],
-    view: Float[Tensor, "p 3"],
-    directions: Float[Tensor, "d 3"],
-    radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "q words"],
-    blocker: Int32[Tensor, "#q #d"],
-    rows: Int64[Tensor, " p"],
-    blocker_radiance: Float[Tensor, "m 3"],
-) -> Lobes:
-    """See `Backend.shade`."""
-    blocker = blocker[rows] if len(blocker) > 1 else blocker
-    rest = directions, radiance, visibility[rows], blocker, blocker_radiance
-    values = _Shade.apply(normal, roughness, view, *rest)
-    visible, total = values[:, 6:].detach().unbind(1)
-    return Lobes(values[:, :3], values[:, 3:6], visible / total.clamp(min=torch.finfo(total.dtype).tiny))
-
-
-shading_term = partial(shading_term_by, shade)
-"""See `Backend.shading_term`; only its `shade` is a kernel."""
-
-
-class _Shade(torch.autograd.Function):
-    """`shade` with positional arguments in the same order; the last two results are visible and total weight."""
-
-    @staticmethod
-    def forward(ctx: Any, *args: Tensor) -> Tensor:
-        from tumble.backends._warp import runtime, shading
-
-        tensors = [x.contiguous() for x in args]
-        n, d = len(tensors[0]), len(tensors[3])
-        tensors[6] = tensors[6].expand(n, d)
-        out = tensors[0].new_zeros(n, 8)
-        with runtime.stream(out.device):
-            runtime.launch(shading.shade_forward, (n, runtime.LANES), *tensors, out)
-        ctx.save_for_backward(*tensors)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        from tumble.backends._warp import runtime, shading
-
-        *surface, directions, radiance, visibility, blocker, blocker_radiance = ctx.saved_tensors
-        v_diffuse, v_specular = v_out[:, :3].contiguous(), v_out[:, 3:6].contiguous()
-        n, groups = len(v_out), -(-len(v_out) // shading.POINTS)
-        v_points = v_out.new_zeros(n, 7)
-        v_radiance, v_blocker_radiance = torch.zeros_like(radiance), torch.zeros_like(blocker_radiance)
-        with runtime.stream(v_out.device):
-            inputs = *surface, directions, radiance, visibility, blocker, blocker_radiance
-            runtime.launch(shading.shade_adjoint, (n, runtime.LANES), *inputs, v_diffuse, v_specular, v_points)
-            inputs = *surface, directions, visibility, blocker
-            threads = groups, len(directions)
-            gradients = v_radiance, v_blocker_radiance
-            runtime.launch(shading.light_adjoint, threads, *inputs, v_diffuse, v_specular, *gradients)
-        v_normal, v_view, v_roughness = v_points.split([3, 3, 1], 1)
-        return v_normal, v_roughness[:, 0], v_view, None, v_radiance, None, None, v_blocker_radiance

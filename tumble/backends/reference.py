@@ -5,8 +5,7 @@ frame, `W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -35,7 +34,6 @@ from tumble.backends import (
     T_MIN,
     UNKNOWN,
     Leaf,
-    Lobes,
     Rendering,
     SampledView,
     ShadingLight,
@@ -498,8 +496,7 @@ def bounce(
     return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
 
 
-def shading_term_by(
-    shade_by: Callable[..., Lobes],
+def shading_term(
     view: SampledView,
     light: ShadingLight,
     R_cam_obj: Float[Tensor, "3 3"],
@@ -507,7 +504,7 @@ def shading_term_by(
     fx_fy_cx_cy: Float[Tensor, "4"],
     f0: Float[Tensor, "3"],
 ) -> Float[Tensor, ""]:
-    """`Backend.shading_term` with the function `shade` of a backend."""
+    """See `Backend.shading_term`."""
     counted, pixels, width = (view.pixels >= 0)[:, None], view.pixels.clamp(min=0), view.alpha.shape[1]
     albedo, roughness, offset = view.features.flatten(0, 1)[pixels].split([3, 1, 3], -1)
     normal = normalize(view.normal.flatten(0, 1)[pixels] + offset, dim=-1)
@@ -522,7 +519,7 @@ def shading_term_by(
     bounced = bounce(light.albedo, light.transfer, light.directions, sky) if len(light.albedo) else sky[:0]
     rows = view.dominant.flatten()[pixels].clamp(min=0).long()
     seen = light.visibility, light.blocker, rows, bounced
-    lobes = shade_by(normal, roughness[:, 0], towards, light.directions, sky, *seen)
+    lobes = shade(normal, roughness[:, 0], towards, light.directions, sky, *seen)
     at = torch.cat(
         [2 * (roughness.clamp(min=ROUGHNESS_MIN) - ROUGHNESS_MIN) / (1 - ROUGHNESS_MIN), 2 * n_v.clamp(0, 1)], -1
     )
@@ -533,10 +530,6 @@ def shading_term_by(
     reflected = albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wide)
     srgb, image = _as_captured(reflected * view.alpha.flatten()[pixels, None], view.photo.flatten(0, 1)[pixels])
     return ((srgb - image).abs() * counted).mean()
-
-
-shading_term = partial(shading_term_by, shade)
-"""See `Backend.shading_term`."""
 
 
 def _as_captured(linear: Float[Tensor, "*b 3"], photo: UInt8[Tensor, "*b 3"]) -> tuple[Tensor, Tensor]:
