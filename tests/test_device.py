@@ -133,20 +133,17 @@ def test_a_stage_on_a_device_goes_on_from_its_checkpoint(
 
 
 @pytest.mark.gpu
-def test_steps_on_a_gpu_wait_for_it_only_where_they_say(stages: list[Any]) -> None:
-    """A view waits for the number of pairs of a tile and a Gaussian, and stage 3 for the pixels that show the object.
-
-    Everything else runs ahead of the GPU. The tests of the simulated device count the same without kernels.
-    """
+def test_steps_on_a_gpu_run_ahead_of_it(stages: list[Any]) -> None:
+    """The tests of the simulated device count the same."""
     gpu = torch.device("cuda")
     if reason := backends.load("cuda").ready(gpu, torch.float32):
         pytest.skip(reason)
     for stage, cfg, inputs, _ in stages:
         inputs = on_device(inputs, gpu)
         state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
-        for _ in range(2):
+        for _ in range(3):  # the first steps fill caches, and the host looks at the lengths of lists
             stage.step(cfg, inputs, state)
-            state.step += 1  # the first steps fill caches
+            state.step += 1
         torch.cuda.set_sync_debug_mode("warn")
         try:
             with warnings.catch_warnings(record=True) as caught:
@@ -154,8 +151,7 @@ def test_steps_on_a_gpu_wait_for_it_only_where_they_say(stages: list[Any]) -> No
                 stage.step(cfg, inputs, state)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-        waits = {Path(w.filename).name for w in caught if "synchroniz" in str(w.message)}
-        assert waits <= {"cuda.py"} | ({"decompose.py"} if stage is decompose else set())
+        assert not [f"{w.filename}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)]
 
 
 @each_stage
@@ -178,18 +174,19 @@ def test_steps_never_wait_for_the_device_and_copy_nothing_to_it(gpu: SimulatedGp
     state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
 
     def recorded(stage: Any, cfg: Any, inputs: Any, state: Any) -> tuple[list[str], list[str]]:
-        stage.step(cfg, inputs, state)
-        state.step += 1  # the first step fills caches
+        for _ in range(3):  # the first steps fill caches, and the host looks at the lengths of lists
+            stage.step(cfg, inputs, state)
+            state.step += 1
         gpu.waits.clear()
         gpu.copies.clear()
         stage.step(cfg, inputs, state)
         return [x.split()[-1] for x in gpu.waits], [x.split()[-1] for x in gpu.copies]
 
-    assert recorded(refine, cfg, inputs, state) == (["_bin"], [])
+    assert recorded(refine, cfg, inputs, state) == ([], [])
     third = decompose.Inputs(inputs.capture, refine.finish(cfg, inputs, state))
     cfg = dataclasses.replace(recipes.known_poses(RECIPE).decompose, fit_specular=False)
     state = decompose.init(cfg, third, torch.Generator().manual_seed(0))
-    assert recorded(decompose, cfg, third, state) == (["_bin"], [])
+    assert recorded(decompose, cfg, third, state) == ([], [])
 
 
 def test_a_gradient_on_a_device_that_is_not_finite_changes_nothing_and_is_named_later(gpu: SimulatedGpu) -> None:

@@ -104,21 +104,64 @@ def test_hits_of_rays_along_the_axes_are_those_of_brute_force(kernels: Any) -> N
     assert cases.difference(hits.transmittance, truth.transmittance) < conformance.RELATIVE
 
 
-def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any) -> None:
-    """Compared with the response of every Gaussian at every pixel."""
+def projected(scene: cases.Scene, factor: int) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], int, int]:
+    """Records, depths and numbers of tiles of the Gaussians of a scene in a view of `factor` times its size."""
     from tumble.backends._warp import projection, runtime
 
+    height, width = factor * scene.height, factor * scene.width
+    *gaussians, _, R, t, focal = scene.inputs
+    camera, n = torch.cat([R.flatten(), t, factor * focal]).float(), len(gaussians[0])
+    prepared = torch.empty(n, 8, 4), torch.empty(n), torch.empty(n, dtype=torch.int32)
+    with runtime.stream(camera.device):
+        inputs = [x.float().contiguous() for x in gaussians]
+        runtime.launch(projection.project_forward, n, *inputs, camera, height, width, *prepared)
+    return prepared, height, width
+
+
+def lists(scene: cases.Scene, factor: int, limit: cuda.PairLimit | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    from tumble.backends._warp import runtime
+
+    prepared, height, width = projected(scene, factor)
+    with runtime.stream(prepared[0].device):
+        return cuda._bin(*prepared, height, width, limit)
+
+
+def test_tile_lists_with_room_for_more_are_the_same_and_those_with_too_little_say_so(kernels: Any) -> None:
+    """The limit is that of the first view of as many Gaussians, which is looked at after 1, 2, 4, ... views."""
+    near, far = cases.hard(), cases.hard()
+    far.inputs[7][2] += 30  # some hundred pairs less
+    limit = cuda.PairLimit()
+    for scene in (near, far, near):
+        (starts, listed), (true_starts, true_listed) = lists(scene, 8, limit), lists(scene, 8)
+        assert torch.equal(starts, true_starts)
+        assert torch.equal(listed[: len(true_listed)], true_listed)
+    n_pairs = len(lists(near, 8)[1])
+    assert 2 * n_pairs <= limit.capacity < 4 * n_pairs
+    limit = cuda.PairLimit()
+    small = len(lists(far, 8, limit)[1])
+    assert small < n_pairs
+    starts, listed = lists(near, 8, limit)
+    assert starts[-1] == small
+    # Of every tile the first ones: the farthest Gaussians are left out.
+    true_starts, true_listed = lists(near, 8)
+    for tile, start in enumerate(starts[:-1]):
+        kept = listed[start : starts[tile + 1]]
+        assert torch.equal(kept, true_listed[true_starts[tile] :][: len(kept)])
+    with pytest.warns(RuntimeWarning, match=f"left out {n_pairs - small} of {n_pairs} pairs"):
+        starts, listed = lists(near, 8, limit)
+    assert torch.equal(starts, true_starts)
+    for _ in range(20):  # no warning
+        lists(far, 8, limit)
+    assert limit.views == 23
+
+
+def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any) -> None:
+    """Compared with the response of every Gaussian at every pixel."""
     scene = cases.hard()
-    height, width = 8 * scene.height, 8 * scene.width
+    (_, depth, _), height, width = projected(scene, 8)
+    starts, listed = lists(scene, 8)
     means, quats, scales, opacity, sh, _, R, t, focal = scene.inputs
-    camera = torch.cat([R.flatten(), t, 8 * focal]).float()
     n = len(means)
-    record, depth, n_tiles = torch.empty(n, 8, 4), torch.empty(n), torch.empty(n, dtype=torch.int32)
-    with runtime.stream(means.device):
-        gaussians = [x.float().contiguous() for x in (means, quats, scales, opacity, sh)]
-        prepared = record, depth, n_tiles
-        runtime.launch(projection.project_forward, n, *gaussians, camera, height, width, *prepared)
-        starts, listed = cuda._bin(*prepared, height, width)
     across, down = -(-width // 16), -(-height // 16)
     in_list = torch.zeros(across * down, n, dtype=torch.bool)
     in_list[torch.repeat_interleave(torch.arange(across * down), starts.diff().long()), listed.long()] = True

@@ -7,10 +7,13 @@ Shading by spherical harmonics, lookups, materials and loss terms have no kernel
 """
 
 import importlib.util
+import warnings
+from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -114,7 +117,8 @@ class _Rasterize(torch.autograd.Function):
         with runtime.stream(means.device):
             prepared = record, depth, n_tiles
             runtime.launch(projection.project_forward, n, *geometry, camera, height, width, *prepared)
-            starts, listed = _bin(*prepared, height, width)
+            limit = _limit(means.device, height, width) if any(ctx.needs_input_grad) else None
+            starts, listed = _bin(*prepared, height, width, limit)
             drawing = record, _packed(corners), camera, mask.expand(height, width), starts, listed, height, width
             kernel = compositing.forward(channels)
             runtime.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
@@ -158,24 +162,98 @@ def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
     return (len(starts) - 1) * TILE * TILE
 
 
+@dataclass
+class PairLimit:
+    """Length of the lists of tiles for views of one size in training, so that the host need not wait for the true one.
+
+    Lists are at least twice as long as those of the first view of as many Gaussians. The device keeps the length of the
+    longest since; the host looks at it after 1, 2, 4, 8, ... views, at least every `LOOK_EVERY`, and makes lists longer
+    that were more than half full. Had a view more pairs than its lists could hold, those of the Gaussians farthest from
+    the camera were left out; then a warning says so. Views without gradients have lists of the true length.
+    """
+
+    capacity: int = 0
+    """Pairs of a tile and a Gaussian that the lists hold."""
+    n: int = -1
+    """Number of Gaussians for which this was found."""
+    views: int = 0
+    """Views of as many Gaussians so far."""
+    longest: Int32[Tensor, "1"] | None = None
+    """Number of pairs of the view with most of them, on the device."""
+
+    def room(self, ends: Int64[Tensor, " n"]) -> int:
+        """The capacity for a view whose i-th Gaussian by depth has its pairs before `ends[i]`."""
+        if len(ends) != self.n or self.longest is None:
+            self.n, self.views, self.longest = len(ends), 0, _int32(ends, 1).zero_()
+            self.capacity = _power_of_two(2 * int(ends[-1]))
+        elif self.views & (self.views - 1) == 0 or self.views % LOOK_EVERY == 0:
+            found = int(self.longest)
+            if found > self.capacity:
+                lost = f"{found - self.capacity} of {found} pairs of a tile and a Gaussian"
+                warnings.warn(f"a training view left out {lost}, far from the camera", RuntimeWarning, stacklevel=2)
+            self.capacity = max(self.capacity, _power_of_two(2 * found))
+        self.views += 1
+        return self.capacity
+
+
+LOOK_EVERY = 64
+"""Views after which the host asks a GPU for the number of pairs again."""
+
+
+@cache
+def _limit(device: torch.device, height: int, width: int) -> PairLimit:
+    """The limit for views of a size."""
+    return PairLimit()
+
+
+def _power_of_two(n: int) -> int:
+    """The smallest power of two that is at least n."""
+    return 1 << max(0, n - 1).bit_length()
+
+
 def _bin(
-    record: Float[Tensor, "n 8 4"], depth: Float[Tensor, " n"], n_tiles: Int32[Tensor, " n"], height: int, width: int
+    record: Float[Tensor, "n 8 4"],
+    depth: Float[Tensor, " n"],
+    n_tiles: Int32[Tensor, " n"],
+    height: int,
+    width: int,
+    limit: PairLimit | None,
 ) -> tuple[Int32[Tensor, " tiles_1"], Int32[Tensor, " pairs"]]:
-    """Start of the list of each tile (and end of the last), and all lists: Gaussians by depth, ties by index."""
+    """Start of the list of each tile (and end of the last), and all lists: Gaussians by depth, ties by index.
+
+    Args:
+        record: See `projection`.
+        depth: Sorting depth.
+        n_tiles: Number of tiles of each Gaussian.
+        height: Rows of the image.
+        width: Columns of the image.
+        limit: Length of the lists; the host waits for the true one if it is None.
+    """
     import warp
 
     from tumble.backends._warp import projection, runtime
 
     order = torch.argsort(depth, stable=True)
     ends = n_tiles[order].cumsum(0)
-    n_pairs = int(ends[-1]) if len(ends) else 0
-    # The second half of both is workspace of the sort, which is stable and so keeps the depth order within a tile.
-    tiles, listed = _int32(depth, 2 * n_pairs), _int32(depth, 2 * n_pairs)
-    runtime.launch(projection.list_tiles, len(order), order, ends, record, n_tiles, height, width, tiles, listed)
+    if limit is None or not len(ends):
+        room, longest = int(ends[-1]) if len(ends) else 0, _int32(depth, 1)
+    else:
+        room, longest = limit.room(ends), limit.longest
     n_all = -(-height // projection.TILE) * -(-width // projection.TILE)
-    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), n_pairs, end_bit=n_all.bit_length())
-    all_tiles = torch.arange(n_all + 1, dtype=torch.int32, device=depth.device)
-    return torch.searchsorted(tiles[:n_pairs], all_tiles, out_int32=True), listed[:n_pairs]
+    # Places without a pair count for a tile behind the last. The second half of both is workspace of the sort, which is
+    # stable and so keeps the depth order within a tile.
+    tiles, listed = _int32(depth, 2 * room).fill_(n_all), _int32(depth, 2 * room)
+    pairs = tiles[:room], listed[:room]
+    runtime.launch(projection.list_tiles, len(order), order, ends, record, n_tiles, height, width, *pairs, longest)
+    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), room, end_bit=n_all.bit_length())
+    starts = torch.searchsorted(pairs[0], _all_tiles(n_all, depth.device), out_int32=True)
+    return starts, pairs[1]
+
+
+@cache
+def _all_tiles(n: int, device: torch.device) -> Int32[Tensor, " n_1"]:
+    """Indices of n tiles, and n."""
+    return torch.arange(n + 1, dtype=torch.int32, device=device)
 
 
 class WarpBvh(NamedTuple):

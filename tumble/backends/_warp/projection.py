@@ -353,10 +353,16 @@ def list_tiles(
     width: int,
     tiles: wp.array[int],
     gaussians: wp.array[int],
+    longest: wp.array[int],
 ):
-    """Write pairs of a tile and a Gaussian; those of the i-th Gaussian by depth end before ends[i]."""
+    """Write pairs of a tile and a Gaussian as far as there is room; those of the i-th by depth end before ends[i].
+
+    `longest` becomes the number of pairs if that is larger.
+    """
     rank = wp.tid()
     i = int(order[rank])
+    if rank == order.shape[0] - 1:
+        wp.atomic_max(longest, 0, int(ends[rank]))
     if n_tiles[i] == 0:
         return
     across = (width + TILE - 1) // TILE
@@ -365,8 +371,9 @@ def list_tiles(
     for row in range(rows[0], rows[1]):
         columns = tile_columns(record, i, row, width)
         for column in range(columns[0], columns[1]):
-            tiles[pair] = row * across + column
-            gaussians[pair] = i
+            if pair < tiles.shape[0]:
+                tiles[pair] = row * across + column
+                gaussians[pair] = i
             pair += 1
 
 
