@@ -61,6 +61,10 @@ KERNEL_CASES = [
         (conformance.test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference, *sizes)
         for sizes in ((60, 100, 70), (0, 48, 17))
     ],
+    *[
+        (conformance.test_convolutions_of_maps_and_their_gradients_are_those_of_the_reference, *size)
+        for size in ((8, 24), (6, 30))
+    ],
     (conformance.test_activations_and_their_gradients_are_those_of_the_reference,),
     *[(conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
     (conformance.test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none, 0, 4),
@@ -69,6 +73,7 @@ KERNEL_CASES = [
 CONFORMANCE = [
     *KERNEL_CASES,
     (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 0, 8.0),
+    (conformance.test_convolutions_of_maps_and_their_gradients_are_those_of_the_reference, 64, 80),
 ]
 every_case = pytest.mark.parametrize(
     "case", CONFORMANCE, ids=lambda case: "-".join([case[0].__name__, *map(str, case[1:])])

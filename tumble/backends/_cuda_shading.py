@@ -1,12 +1,14 @@
 """CUDA kernels of shading: lobes, lookups of light, and the photometric term of shaded pixels (see `_warp/`)."""
 
+import math
+from functools import cache
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from tumble.backends import Lobes, SampledView, ShadingLight
+from tumble.backends import Lobes, SampledView, ShadingLight, reference
 from tumble.backends._cuda_terms import gradient_buffer, scaled
 
 
@@ -194,3 +196,52 @@ def _arrays(p: int, d: int, n: int, like: Tensor) -> dict[str, Tensor]:
     arrays = {name: part.view(shape) for (name, shape), part in zip(sums.items(), flat, strict=True)}
     arrays |= {name: like.new_empty(shape) for name, shape in others.items()}
     return arrays | {"rows": torch.empty(p, dtype=torch.int64, device=like.device)}
+
+
+MAX_COLUMNS = 64
+"""Number of columns of a map above which fast Fourier transforms are faster than sums."""
+
+
+def prefilter(radiance: Float[Tensor, "h w 3"], lobes: Float[Tensor, "f rows h"]) -> Float[Tensor, "out w 3"]:
+    """See `Backend.prefilter`."""
+    if radiance.shape[1] > MAX_COLUMNS:
+        return reference.prefilter(radiance, lobes)
+    return _Prefilter.apply(radiance, lobes)
+
+
+class _Prefilter(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Tensor) -> Tensor:
+        from tumble.backends._warp import prefiltering, runtime
+
+        radiance, ctx.lobes = (x.contiguous() for x in args)
+        (height, width, _), (frequencies, rows, _) = radiance.shape, ctx.lobes.shape
+        spectrum, filtered = (radiance.new_empty(2, frequencies, x, 3) for x in (height, rows))
+        out, waves = radiance.new_empty(height + rows, width, 3), _waves(width, radiance.device)
+        with runtime.stream(out.device):
+            runtime.launch(prefiltering.transform, (frequencies, height), radiance, 0, 0, waves, spectrum)
+            runtime.launch(prefiltering.multiply, (frequencies, rows), spectrum, ctx.lobes, filtered)
+            threads = height + rows, width
+            runtime.launch(prefiltering.transform_back, threads, radiance, height, 1, filtered, waves, out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        from tumble.backends._warp import prefiltering, runtime
+
+        (frequencies, rows, height), width, v_out = ctx.lobes.shape, v_out.shape[1], v_out.contiguous()
+        v_spectrum, v_filtered = (v_out.new_empty(2, frequencies, x, 3) for x in (height, rows))
+        v_radiance, waves = v_out.new_empty(height, width, 3), _waves(width, v_out.device)
+        with runtime.stream(v_out.device):
+            runtime.launch(prefiltering.transform, (frequencies, rows), v_out, height, 1, waves, v_filtered)
+            runtime.launch(prefiltering.multiply, (frequencies, height), v_filtered, ctx.lobes.mT, v_spectrum)
+            threads = height, width
+            runtime.launch(prefiltering.transform_back, threads, v_out, height, 0, v_spectrum, waves, v_radiance)
+        return v_radiance, None
+
+
+@cache
+def _waves(width: int, device: torch.device) -> Float[Tensor, "2 f {width}"]:
+    """Cosines and sines of all frequencies at all columns."""
+    turns = torch.arange(width // 2 + 1, dtype=torch.float64)[:, None] * torch.arange(width) / width
+    return torch.stack([(2 * math.pi * turns).cos(), (2 * math.pi * turns).sin()]).float().to(device)

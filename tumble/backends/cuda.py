@@ -3,7 +3,6 @@
 This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
 it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
 GPU differ by rounding errors. The kernels run on the device of the tensors; on the CPU they are slow and serve tests.
-Shading by spherical harmonics, lookups, materials and loss terms have no kernel yet: they are those of the reference.
 """
 
 import importlib.util
@@ -18,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Rendering
-from tumble.backends._cuda_shading import lookup, shade, shading_term
+from tumble.backends._cuda_shading import lookup, prefilter, shade, shading_term
 from tumble.backends._cuda_terms import (
     activate,
     adam,
@@ -29,7 +28,6 @@ from tumble.backends._cuda_terms import (
     material_terms,
     sh_shade,
 )
-from tumble.backends.reference import prefilter
 
 __all__ = [
     "activate",
