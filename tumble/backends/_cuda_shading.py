@@ -9,7 +9,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from tumble.backends import Lobes, SampledView, ShadingLight, reference
-from tumble.backends._cuda_terms import gradient_buffer, scaled
+from tumble.backends._cuda_terms import by_pixel, gradient_buffer, scaled
 
 
 def shade(
@@ -134,7 +134,7 @@ class _ShadingTerm(torch.autograd.Function):
     def forward(ctx: Any, *args: Tensor) -> Tensor:
         from tumble.backends._warp import runtime
 
-        inputs = dict(zip((*_MOVING, *_REST), (x.contiguous() for x in args), strict=True))
+        inputs = dict(zip((*_MOVING, *_REST), (by_pixel(x) for x in args), strict=True))
         others = [name for name in _MOVING if name != "albedo"]
         kept, gradients = gradient_buffer(ctx, {name: inputs[name] for name in _MOVING}, *others)
         term = kept.new_zeros(1, 1)

@@ -212,7 +212,7 @@ class _ImageTerms(torch.autograd.Function):
         from tumble.backends._warp import image_losses, runtime
 
         *tensors, ssim_weight, crease, weights = args
-        inputs: dict[str, Any] = dict(zip(_IMAGE_INPUTS, (x.contiguous() for x in tensors), strict=True))
+        inputs: dict[str, Any] = dict(zip(_IMAGE_INPUTS, (by_pixel(x) for x in tensors), strict=True))
         rgb, (height, width) = inputs["rgb"], inputs["alpha"].shape
         inputs |= {"weights": [x / (height * width) for x in weights], "ssim_weight": ssim_weight, "crease": crease}
         terms, (less_high, less_wide) = rgb.new_zeros(4), (x - image_losses.MARGIN for x in (height, width))
@@ -237,6 +237,12 @@ class _ImageTerms(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         return scaled(ctx, v_terms)
+
+
+def by_pixel(x: Tensor) -> Tensor:
+    """The tensor, copied only if it may be one of vectors whose numbers do not lie side by side."""
+    is_dense = x.ndim < 2 or x.stride(-1) == 1
+    return x if is_dense or (x.ndim == 2 and x.shape[1] not in (3, 4)) else x.contiguous()
 
 
 def gradient_buffer(ctx: Any, inputs: dict[str, Tensor], *zeroed: str) -> tuple[Tensor, dict[str, Tensor]]:
@@ -306,7 +312,7 @@ class _GaussianTerms(torch.autograd.Function):
         from tumble.backends._warp import gaussian_losses, runtime
 
         inputs = dict(zip(_GAUSSIAN_INPUTS, args, strict=True))
-        inputs |= {name: x.contiguous() for name, x in inputs.items() if isinstance(x, Tensor)}
+        inputs |= {name: by_pixel(x) for name, x in inputs.items() if isinstance(x, Tensor)}
         inputs["t"] = inputs["t"][None]
         sdf, threads = inputs["sdf"], runtime.whole_warps(len(inputs["sdf"]))
         kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in _GAUSSIAN_INPUTS[:7]}, "R", "t")
@@ -343,7 +349,7 @@ class _MaterialTerms(torch.autograd.Function):
         from tumble.backends._warp import image_losses, runtime
 
         names = ("features", "alpha", "photo", "mask")
-        inputs = dict(zip(names, (x.contiguous() for x in args), strict=True))
+        inputs = dict(zip(names, (by_pixel(x) for x in args), strict=True))
         alpha, (height, width) = inputs["alpha"], inputs["alpha"].shape
         kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in names[:2]})
         terms = alpha.new_zeros(2)

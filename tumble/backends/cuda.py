@@ -83,7 +83,8 @@ def rasterize(
     views = []
     for group in corners.split(max(WIDTHS), 2):
         channels = min(x for x in WIDTHS if x >= group.shape[2])
-        gaussians = means, quats, scales, opacity, sh, pad(group, (0, channels - group.shape[2]))
+        padded = pad(group, (0, channels - group.shape[2])) if channels > group.shape[2] else group
+        gaussians = means, quats, scales, opacity, sh, padded
         pixels, weight, touched, dominant = _Rasterize.apply(*gaussians, camera, height, width, mask)
         rgb, alpha, depth, depth_var, normal, features = pixels.split([3, 1, 1, 1, 3, channels], -1)
         alpha, depth, depth_var = alpha[..., 0], depth[..., 0], depth_var[..., 0]
@@ -110,8 +111,9 @@ class _Rasterize(torch.autograd.Function):
         means, n, channels = geometry[0], len(corners), corners.shape[2]
         record = means.new_empty(n, projection.RECORD, 4)
         depth, n_tiles = means.new_empty(n), _int32(means, n)
-        pixels = means.new_zeros(height * width, compositing.FIXED + channels)
-        statistics = means.new_zeros(n), torch.zeros_like(n_tiles), _int32(means, height * width).fill_(-1)
+        pixels = means.new_empty(height * width, compositing.FIXED + channels)
+        weight, touched = means.new_zeros(2, n).unbind()
+        statistics = weight, touched.view(torch.int32), _int32(means, height * width)
         with runtime.stream(means.device):
             prepared = record, depth, n_tiles
             runtime.launch(projection.project_forward, n, *geometry, camera, height, width, *prepared)
@@ -132,17 +134,17 @@ class _Rasterize(torch.autograd.Function):
 
         means, quats, scales, _, sh, corners, camera, record, n_tiles, starts, listed, pixels = ctx.saved_tensors
         n, channels = len(means), corners.shape[2]
-        sums = means.new_zeros(n, projection.CORNERS + 4 * channels)
-        v_means, v_quats, v_scales, v_sh = (torch.zeros_like(x) for x in (means, quats, scales, sh))
-        v_camera = camera.new_zeros(1, len(camera))
+        width = projection.CORNERS + 4 * channels
+        v_camera, sums = means.new_zeros(len(camera) + n * width).split([len(camera), n * width])
+        v_camera, sums = v_camera[None], sums.view(n, width)
+        v_means, v_quats, v_scales, v_sh = (torch.empty_like(x) for x in (means, quats, scales, sh))
         with runtime.stream(means.device):
             drawn = record, _packed(corners), camera, starts, listed, *ctx.size, pixels
             kernel = compositing.adjoint(channels)
             runtime.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
             gradients = v_means, v_quats, v_scales, v_sh, v_camera
-            n_threads = -(-n // runtime.LANES) * runtime.LANES
             inputs = means, quats, scales, sh, camera, n_tiles
-            runtime.launch(projection.project_adjoint, n_threads, *inputs, sums, *gradients)
+            runtime.launch(projection.project_adjoint, runtime.whole_warps(n), *inputs, sums, *gradients)
         v_opacity = sums[:, projection.OPACITY]
         v_corners = sums[:, projection.CORNERS :].view(n, 4, channels)
         return v_means, v_quats, v_scales, v_opacity, v_sh, v_corners, v_camera[0], None, None, None

@@ -129,11 +129,11 @@ def blend(b: Blend, w: float, p: Peak, record: wp.array2d[wp.vec4], g: int) -> B
 @wp.func
 @no_type_check
 def write_pixel(pixels: wp.array2d[float], i: int, b: Blend, alpha: float, z_0: float):
-    """Write all numbers of a pixel except the features."""
-    inv = 1.0 / alpha
+    """Write all numbers of a pixel except the features; alpha is 0 or at least ALPHA_MIN."""
+    inv = 1.0 / wp.max(alpha, ALPHA_MIN)
     mean = b.z * inv
     pixels[i, 3] = alpha
-    pixels[i, 4] = z_0 + mean
+    pixels[i, 4] = wp.where(alpha > 0.0, z_0 + mean, 0.0)
     pixels[i, 5] = b.zz * inv - mean * mean
     for ch in range(3):
         pixels[i, ch] = b.rgb[ch]
@@ -192,12 +192,12 @@ def forward(channels: int) -> wp.Kernel:
                     T -= w
                 add_lanes(weight, g, w)
                 count_lanes(touched, g, on and counted)
-        if winner >= 0:
+        if inside:
             i = at[1] * width + at[0]
             dominant[i] = winner
             write_pixel(pixels, i, b, 1.0 - T, camera[11])
             for ch in range(channels):
-                pixels[i, FIXED + ch] = features[ch] / (1.0 - T)
+                pixels[i, FIXED + ch] = features[ch] / wp.max(1.0 - T, ALPHA_MIN)
 
     return composite
 

@@ -471,6 +471,12 @@ def project_adjoint(
         v_means[i] = wp.transpose(o.R_cam_obj) * v_p
         v_q = rotation_adjoint(o.quat, v_R_obj_local)
         v_quats[i] = (v_q - wp.dot(v_q, o.quat) * o.quat) * o.quat_scale
+    elif i < means.shape[0]:
+        v_means[i] = wp.vec3()
+        v_quats[i] = wp.vec4()
+        v_scales[i] = wp.vec3()
+        for j in range(sh.shape[1]):
+            v_sh[i, j] = wp.vec3()
     add_row(v_camera, 0, 0, 16, v_cam)
 
 
