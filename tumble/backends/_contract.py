@@ -414,23 +414,12 @@ class Backend(Protocol):
         ...
 
     def adam(
-        self,
-        leaves: Sequence[Leaf],
-        loss: Float[Tensor, ""],
-        failed: Float[Tensor, ""],
-        beta_1: float,
-        beta_2: float,
-        eps: float,
+        self, leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float
     ) -> None:
-        """One step of Adam (Kingma and Ba 2015) on all leaves at once, unless a gradient or the loss is not finite.
+        """One step of Adam (Kingma and Ba 2015) on all leaves at once; the host does not wait for it.
 
-        With bias-corrected moments m and v, a value moves by -rate m / (sqrt(v) + eps). The host does not wait.
-
-        Args:
-            leaves: Parameters.
-            loss: What their gradients are those of.
-            failed: 1 since the first loss or gradient that was not finite, from which on nothing changes, else 0; set
-                in place, in float32.
+        With bias-corrected moments m and v, a value moves by -rate m / (sqrt(v) + eps). `failed`, a float32, is set to
+        1 if the loss or a gradient is not finite. If it is 1, nothing else is changed.
         """
         ...
 

@@ -524,14 +524,7 @@ _ACTIVATION = ("log_scales", "sdf", "gamma", "scales", "opacity")
 
 
 @torch.no_grad()
-def adam(
-    leaves: Sequence[Leaf],
-    loss: Float[Tensor, ""],
-    failed: Float[Tensor, ""],
-    beta_1: float,
-    beta_2: float,
-    eps: float,
-) -> None:
+def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float) -> None:
     """See `Backend.adam`."""
     if failed.item() or not math.isfinite(loss.item()):
         failed.fill_(1)

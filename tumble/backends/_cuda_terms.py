@@ -349,7 +349,7 @@ class _MaterialTerms(torch.autograd.Function):
         from tumble.backends._warp import image_losses, runtime
 
         names = ("features", "alpha", "photo", "mask")
-        inputs = dict(zip(names, (by_pixel(x) for x in args), strict=True))
+        inputs: dict[str, Tensor] = dict(zip(names, (by_pixel(x) for x in args), strict=True))
         alpha, (height, width) = inputs["alpha"], inputs["alpha"].shape
         kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in names[:2]})
         terms = alpha.new_zeros(2)
@@ -367,14 +367,7 @@ class _MaterialTerms(torch.autograd.Function):
 
 
 @torch.no_grad()
-def adam(
-    leaves: Sequence[Leaf],
-    loss: Float[Tensor, ""],
-    failed: Float[Tensor, ""],
-    beta_1: float,
-    beta_2: float,
-    eps: float,
-) -> None:
+def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float) -> None:
     """See `Backend.adam`."""
     from tumble.backends._warp import parameters, runtime
 

@@ -181,8 +181,8 @@ class PairLimit:
     longest: Int32[Tensor, "1"] | None = None
     """Number of pairs of the view with most of them, on the device."""
 
-    def room(self, ends: Int64[Tensor, " n"]) -> int:
-        """The capacity for a view whose i-th Gaussian by depth has its pairs before `ends[i]`."""
+    def room(self, ends: Int64[Tensor, " n"]) -> tuple[int, Int32[Tensor, "1"]]:
+        """Capacity for a view whose i-th Gaussian by depth has its pairs before `ends[i]`, and `longest`."""
         if len(ends) != self.n or self.longest is None:
             self.n, self.views, self.longest = len(ends), 0, _int32(ends, 1).zero_()
             self.capacity = _power_of_two(2 * int(ends[-1]))
@@ -193,7 +193,7 @@ class PairLimit:
                 warnings.warn(f"a training view left out {lost}, far from the camera", RuntimeWarning, stacklevel=2)
             self.capacity = max(self.capacity, _power_of_two(2 * found))
         self.views += 1
-        return self.capacity
+        return self.capacity, self.longest
 
 
 LOOK_EVERY = 64
@@ -238,7 +238,7 @@ def _bin(
     if limit is None or not len(ends):
         room, longest = int(ends[-1]) if len(ends) else 0, _int32(depth, 1)
     else:
-        room, longest = limit.room(ends), limit.longest
+        room, longest = limit.room(ends)
     n_all = -(-height // projection.TILE) * -(-width // projection.TILE)
     # Places without a pair count for a tile behind the last. The second half of both is workspace of the sort, which is
     # stable and so keeps the depth order within a tile.

@@ -451,14 +451,7 @@ def activate(
 
 
 @torch.no_grad()
-def adam(
-    leaves: Sequence[Leaf],
-    loss: Float[Tensor, ""],
-    failed: Float[Tensor, ""],
-    beta_1: float,
-    beta_2: float,
-    eps: float,
-) -> None:
+def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float) -> None:
     """See `Backend.adam`."""
     finite = torch.stack([loss.isfinite(), *(leaf.gradient.isfinite().all() for leaf in leaves)]).all()
     failed.copy_(torch.maximum(failed, 1 - finite.to(failed)))
