@@ -136,13 +136,12 @@ class _ShadingTerm(torch.autograd.Function):
 
         inputs = dict(zip((*_MOVING, *_REST), (by_pixel(x) for x in args), strict=True))
         others = [name for name in _MOVING if name != "albedo"]
-        kept, gradients = gradient_buffer(ctx, {name: inputs[name] for name in _MOVING}, *others)
-        term = kept.new_zeros(1, 1)
+        term, kept, gradients = gradient_buffer(ctx, 1, {name: inputs[name] for name in _MOVING}, *others)
         with runtime.stream(kept.device):
-            _shade_pixels(inputs, term, gradients)
+            _shade_pixels(inputs, term[None], gradients)
         ctx.save_for_backward(kept)
         ctx.of_term = dict.fromkeys(_MOVING, 0)
-        return term[0, 0]
+        return term[0]
 
     @staticmethod
     def backward(ctx: Any, v_term: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]

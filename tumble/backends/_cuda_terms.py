@@ -215,8 +215,8 @@ class _ImageTerms(torch.autograd.Function):
         inputs: dict[str, Any] = dict(zip(_IMAGE_INPUTS, (by_pixel(x) for x in tensors), strict=True))
         rgb, (height, width) = inputs["rgb"], inputs["alpha"].shape
         inputs |= {"weights": [x / (height * width) for x in weights], "ssim_weight": ssim_weight, "crease": crease}
-        terms, (less_high, less_wide) = rgb.new_zeros(4), (x - image_losses.MARGIN for x in (height, width))
-        kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in _IMAGE_INPUTS[:6]}, "R", "depth")
+        less_high, less_wide = (x - image_losses.MARGIN for x in (height, width))
+        terms, kept, gradients = gradient_buffer(ctx, 4, {x: inputs[x] for x in _IMAGE_INPUTS[:6]}, "R", "depth")
         shapes = {"x": (height, width), "y": (height, width), "slope": (height, width)}
         shapes |= {"rows": (4, height, less_wide), "maps": (3, less_high, less_wide), "blurred": (3, less_high, width)}
         planes = {name: rgb.new_empty(*shape, 3) for name, shape in shapes.items()}
@@ -245,16 +245,22 @@ def by_pixel(x: Tensor) -> Tensor:
     return x if is_dense or (x.ndim == 2 and x.shape[1] not in (3, 4)) else x.contiguous()
 
 
-def gradient_buffer(ctx: Any, inputs: dict[str, Tensor], *zeroed: str) -> tuple[Tensor, dict[str, Tensor]]:
-    """One tensor for the gradients of all inputs, and its parts by name; zeros for the named ones, which come first."""
+def gradient_buffer(
+    ctx: Any, n_sums: int, inputs: dict[str, Tensor], *zeroed: str
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Memory for `n_sums` sums and the gradients of all inputs, in one piece.
+
+    Returns:
+        Sums, with zeros; all gradients as one tensor for `scaled`; and these by name, with zeros for the named ones.
+    """
     order = [*zeroed, *(name for name in inputs if name not in zeroed)]
     ctx.shapes = {name: inputs[name].shape for name in order}
     ctx.order = list(inputs)
     n_zeros = sum(inputs[name].numel() for name in zeroed)
-    kept = inputs[order[0]].new_empty(sum(x.numel() for x in inputs.values()))
-    if n_zeros:
-        kept[:n_zeros].zero_()
-    return kept, _parts(kept, ctx.shapes)
+    whole = inputs[order[0]].new_empty(n_sums + sum(x.numel() for x in inputs.values()))
+    whole[: n_sums + n_zeros].zero_()
+    kept = whole[n_sums:]
+    return whole[:n_sums], kept, _parts(kept, ctx.shapes)
 
 
 def _parts(kept: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
@@ -315,9 +321,8 @@ class _GaussianTerms(torch.autograd.Function):
         inputs |= {name: by_pixel(x) for name, x in inputs.items() if isinstance(x, Tensor)}
         inputs["t"] = inputs["t"][None]
         sdf, threads = inputs["sdf"], runtime.whole_warps(len(inputs["sdf"]))
-        kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in _GAUSSIAN_INPUTS[:7]}, "R", "t")
-        terms, magnitudes = sdf.new_zeros(3), torch.empty_like(sdf)
-        seen = torch.zeros(1, dtype=torch.int32, device=sdf.device)
+        sums, kept, gradients = gradient_buffer(ctx, 4, {x: inputs[x] for x in _GAUSSIAN_INPUTS[:7]}, "R", "t")
+        terms, seen, magnitudes = sums[:3], sums[3:].view(torch.int32), torch.empty_like(sdf)
         with runtime.stream(sdf.device):
             runtime.launch(gaussian_losses.count_seen, threads, sdf, inputs["weight"], magnitudes, seen)
             inputs |= {"median": magnitudes.median(), "seen": seen}
@@ -351,8 +356,7 @@ class _MaterialTerms(torch.autograd.Function):
         names = ("features", "alpha", "photo", "mask")
         inputs: dict[str, Tensor] = dict(zip(names, (by_pixel(x) for x in args), strict=True))
         alpha, (height, width) = inputs["alpha"], inputs["alpha"].shape
-        kept, gradients = gradient_buffer(ctx, {x: inputs[x] for x in names[:2]})
-        terms = alpha.new_zeros(2)
+        terms, kept, gradients = gradient_buffer(ctx, 2, {x: inputs[x] for x in names[:2]})
         scales = 1 / max(1, 4 * height * (width - 1)), 1 / max(1, 4 * (height - 1) * width)
         with runtime.stream(alpha.device):
             threads = runtime.whole_warps(height * width)
