@@ -117,8 +117,11 @@ class _Rasterize(torch.autograd.Function):
         with runtime.stream(means.device):
             prepared = record, depth, n_tiles
             runtime.launch(projection.project_forward, n, *geometry, camera, height, width, *prepared)
-            limit = _limit(means.device, height, width) if any(ctx.needs_input_grad) else None
-            starts, listed = _bin(*prepared, height, width, limit)
+            limit = _limit(means.device, height, width)
+            trains = any(ctx.needs_input_grad)
+            if not trains:
+                limit.look()
+            starts, listed = _bin(*prepared, height, width, limit if trains else None)
             drawing = record, _packed(corners), camera, mask.expand(height, width), starts, listed, height, width
             kernel = compositing.forward(channels)
             runtime.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
@@ -162,14 +165,19 @@ def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
     return (len(starts) - 1) * TILE * TILE
 
 
+LOOK_EVERY = 64
+"""Views after which the host asks a GPU for the number of pairs again."""
+
+
 @dataclass
 class PairLimit:
     """Length of the lists of tiles for views of one size in training, so that the host need not wait for the true one.
 
     Lists are at least twice as long as those of the first view of as many Gaussians. The device keeps the length of the
-    longest since; the host looks at it after 1, 2, 4, 8, ... views, at least every `LOOK_EVERY`, and makes lists longer
-    that were more than half full. Had a view more pairs than its lists could hold, those of the Gaussians farthest from
-    the camera were left out; then a warning says so. Views without gradients have lists of the true length.
+    longest since; the host looks at it after 1, 2, 4, 8, ... views, at least every `LOOK_EVERY`, and before each view
+    without gradients, whose lists have the true length. Lists that were more than half full become longer. Had a view
+    more pairs than its lists could hold, those of the Gaussians farthest from the camera were left out of it; then a
+    warning says so.
     """
 
     capacity: int = 0
@@ -184,20 +192,21 @@ class PairLimit:
     def room(self, ends: Int64[Tensor, " n"]) -> tuple[int, Int32[Tensor, "1"]]:
         """Capacity for a view whose i-th Gaussian by depth has its pairs before `ends[i]`, and `longest`."""
         if len(ends) != self.n or self.longest is None:
+            self.look()
             self.n, self.views, self.longest = len(ends), 0, _int32(ends, 1).zero_()
             self.capacity = _power_of_two(2 * int(ends[-1]))
         elif self.views & (self.views - 1) == 0 or self.views % LOOK_EVERY == 0:
-            found = int(self.longest)
-            if found > self.capacity:
-                lost = f"{found - self.capacity} of {found} pairs of a tile and a Gaussian"
-                warnings.warn(f"a training view left out {lost}, far from the camera", RuntimeWarning, stacklevel=2)
-            self.capacity = max(self.capacity, _power_of_two(2 * found))
+            self.look()
         self.views += 1
         return self.capacity, self.longest
 
-
-LOOK_EVERY = 64
-"""Views after which the host asks a GPU for the number of pairs again."""
+    def look(self) -> None:
+        """Wait for the number of pairs of the view with most of them, and make lists longer if need be."""
+        found = int(self.longest) if self.longest is not None else 0
+        if found > self.capacity:
+            lost = f"{found - self.capacity} of {found} pairs of a tile and a Gaussian"
+            warnings.warn(f"a training view left out {lost}, far from the camera", RuntimeWarning, stacklevel=2)
+        self.capacity = max(self.capacity, _power_of_two(2 * found))
 
 
 @cache
