@@ -2,14 +2,17 @@
 
 Within `simulated_gpu() as gpu`, the device `DEVICE` has such tensors. As on a GPU, an operation on tensors of two
 devices is an error, and numpy cannot read them. `gpu.waits` records what the host would have to wait for (values and
-shapes that Python asks for, copies to the host), `gpu.copies` the copies from the host to the device.
+shapes that Python asks for, copies to the host), `gpu.copies` the copies from the host to the device, and
+`gpu.operations` counts what the device would be asked to run: torch's operations and the kernels of `backends.cuda`.
 
 The device's name is torch's "meta", because a torch without CUDA knows no other device with gradients. Nothing else of
 torch's meta tensors is used.
 """
 
+import importlib.util
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -30,6 +33,8 @@ DEVICE = torch.device("meta")
 """The simulated device."""
 WAITING = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_consecutive", "unique_dim"}
 """Operations whose result, or its shape, is a value that the host has to wait for."""
+NO_WORK = {"empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided", "_local_scalar_dense"}
+"""Operations that run nothing on a device, besides views."""
 MIXING = {"copy_", "index", "index_put_", "_index_put_impl_", "_to_copy", "is_pinned", "set_"}
 """Operations that accept tensors of both devices."""
 
@@ -66,7 +71,7 @@ class SimulatedGpu(TorchDispatchMode):
         super().__init__()
         self.waits: list[str] = []
         self.copies: list[str] = []
-        self.paused = False
+        self.operations = Counter[str]()
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -80,6 +85,10 @@ class SimulatedGpu(TorchDispatchMode):
             if here:
                 raise RuntimeError(f"{name}: tensors of {[tuple(x.shape) for x in here]} are not on the device")
         self._record(name, target, there, tensors)
+        result = function._schema.returns[0].alias_info if function._schema.returns else None
+        is_view = result is not None and not result.is_write
+        if (there or target == DEVICE.type) and not is_view and name not in NO_WORK:
+            self.operations[name] += 1
         if target == DEVICE.type:
             kwargs["device"] = torch.device("cpu")
         inner = tree_map(lambda x: x.inner if isinstance(x, OnDevice) else x, (args, kwargs))
@@ -92,8 +101,6 @@ class SimulatedGpu(TorchDispatchMode):
 
     def _record(self, name: str, target: str | None, there: list[OnDevice], tensors: list[torch.Tensor]) -> None:
         """Note what an operation waits for or copies."""
-        if self.paused:
-            return
         indexed = name.startswith(("index", "_index_put")) and any(
             x.dtype in (torch.bool, torch.uint8) for x in tensors[1:]
         )
@@ -117,41 +124,68 @@ def _caller() -> str:
 
 
 class Kernels:
-    """The kernels of the CPU; with gradients, which these cannot hand on to the device's tensors, the reference."""
-
-    def __init__(self, gpu: SimulatedGpu) -> None:
-        self._gpu = gpu
+    """Those of a step are the ones for a GPU, which Warp runs on the CPU; the others are those of the CPU."""
 
     def __getattr__(self, verb: str) -> Callable[..., Any]:
         if not hasattr(cuda, verb):
             raise AttributeError(f"the kernels of a GPU include no {verb}")
 
         def call(*arguments: Any) -> Any:
-            if torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in arguments):
-                return self._differentiable(verb, *arguments)
-            inner = [x.inner.detach() if isinstance(x, OnDevice) else x for x in arguments]
-            result = getattr(backends.load("cpu"), verb)(*inner)
+            moving = (isinstance(x, torch.Tensor) and x.requires_grad for x in tree_flatten(arguments)[0])
+            if verb == "adam" or (torch.is_grad_enabled() and any(moving)):
+                return getattr(cuda if WITH_WARP else backends.load("reference"), verb)(*arguments)
+            result = getattr(backends.load("cpu"), verb)(*on_host(arguments))
             return tree_map(lambda x: OnDevice(x) if isinstance(x, torch.Tensor) else x, result)
 
         return call
 
-    def _differentiable(self, verb: str, *arguments: Any) -> Any:
-        """What kernels in Warp replace is not recorded."""
-        self._gpu.paused = verb in ("rasterize", "build", "trace", "visible", "blockers", "shade")
-        try:
-            return getattr(backends.load("reference"), verb)(*arguments)
-        finally:
-            self._gpu.paused = False
+
+WITH_WARP = importlib.util.find_spec("warp") is not None
+"""Without it the reference takes the place of the kernels."""
+
+
+def on_host(values: Any) -> Any:
+    """A tree of values with the tensors that hold those of the device."""
+    return tree_map(lambda x: x.inner.detach() if isinstance(x, OnDevice) else x, values)
+
+
+@contextmanager
+def kernels_on(gpu: SimulatedGpu) -> Iterator[None]:
+    """Warp's launches with the values of the device's tensors, counted as its operations."""
+    if not WITH_WARP:
+        yield
+        return
+    import warp
+
+    from tumble.backends._warp import runtime
+
+    launch, from_torch, sort = runtime.launch, warp.from_torch, warp.utils.radix_sort_pairs
+
+    def launched(kernel: Any, threads: Any, *arguments: Any) -> None:
+        gpu.operations[kernel.key] += 1
+        launch(kernel, threads, *on_host(arguments))
+
+    def sorted_pairs(*arguments: Any, **options: Any) -> None:
+        gpu.operations["radix_sort_pairs"] += 1
+        sort(*arguments, **options)
+
+    with (
+        patch.object(runtime, "launch", launched),
+        patch.object(runtime, "stream", lambda device: warp.ScopedDevice("cpu")),
+        patch.object(warp, "from_torch", lambda x, *rest, **options: from_torch(on_host(x), *rest, **options)),
+        patch.object(warp.utils, "radix_sort_pairs", sorted_pairs),
+    ):
+        yield
 
 
 @contextmanager
 def simulated_gpu() -> Iterator[SimulatedGpu]:
-    """The simulated device, with the kernels of the reference backend."""
+    """The simulated device with its kernels."""
     choose: Callable[..., Any] = backends.choose
     gpu = SimulatedGpu()
 
     def chosen(device: torch.device, dtype: torch.dtype) -> Any:
-        return Kernels(gpu) if device == DEVICE else choose(device, dtype)
+        return Kernels() if device == DEVICE else choose(device, dtype)
 
     # These two make the tensor without a dispatch, which a meta tensor's values do not survive.
     make, make_like = torch.tensor, torch.Tensor.new_tensor
@@ -166,7 +200,6 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
         return make(data, **({"dtype": like.dtype} | options)).to(DEVICE)
 
     patches = (
-        patch("torch.optim.optimizer._get_fused_kernels_supported_devices", lambda: ["cpu", "cuda", DEVICE.type]),
         patch.object(backends, "choose", chosen),
         patch.object(torch, "tensor", tensor),
         patch.object(torch.Tensor, "new_tensor", new_tensor),
@@ -175,4 +208,5 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
     with ExitStack() as stack:
         for each in patches:
             stack.enter_context(each)
+        stack.enter_context(kernels_on(gpu))
         yield stack.enter_context(gpu)

@@ -17,7 +17,7 @@ import torch
 
 from tests import test_pipeline
 from tests.inverse_rendering.test_refine import textured_sphere
-from tests.simulated_gpu import DEVICE, SimulatedGpu, simulated_gpu
+from tests.simulated_gpu import DEVICE, WITH_WARP, SimulatedGpu, simulated_gpu
 from tumble import actions, backends, pipeline, recipes
 from tumble.engine import loop, optim
 from tumble.export import asset as export
@@ -133,20 +133,17 @@ def test_a_stage_on_a_device_goes_on_from_its_checkpoint(
 
 
 @pytest.mark.gpu
-def test_steps_on_a_gpu_wait_for_it_only_where_they_say(stages: list[Any]) -> None:
-    """A view waits for the number of pairs of a tile and a Gaussian, and stage 3 for the pixels that show the object.
-
-    Everything else runs ahead of the GPU. The tests of the simulated device count the same without kernels.
-    """
+def test_steps_on_a_gpu_run_ahead_of_it(stages: list[Any]) -> None:
+    """The tests of the simulated device count the same."""
     gpu = torch.device("cuda")
     if reason := backends.load("cuda").ready(gpu, torch.float32):
         pytest.skip(reason)
     for stage, cfg, inputs, _ in stages:
         inputs = on_device(inputs, gpu)
         state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
-        for _ in range(2):
+        for _ in range(3):  # the first steps fill caches, and the host looks at the lengths of lists
             stage.step(cfg, inputs, state)
-            state.step += 1  # the first steps fill caches
+            state.step += 1
         torch.cuda.set_sync_debug_mode("warn")
         try:
             with warnings.catch_warnings(record=True) as caught:
@@ -154,8 +151,7 @@ def test_steps_on_a_gpu_wait_for_it_only_where_they_say(stages: list[Any]) -> No
                 stage.step(cfg, inputs, state)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-        waits = {Path(w.filename).name for w in caught if "synchroniz" in str(w.message)}
-        assert waits <= {"cuda.py"} | ({"decompose.py"} if stage is decompose else set())
+        assert not [f"{w.filename}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)]
 
 
 @each_stage
@@ -171,25 +167,32 @@ def test_steps_with_the_kernels_for_a_gpu_are_those_of_the_cpu(
         assert b == pytest.approx(a, rel=2e-3, abs=1e-5)
 
 
-def test_steps_never_wait_for_the_device_and_copy_nothing_to_it(gpu: SimulatedGpu) -> None:
+def test_steps_never_wait_for_the_device_copy_nothing_to_it_and_ask_it_for_little(gpu: SimulatedGpu) -> None:
+    """Steps with everything that the recipes switch on; in plain torch they are ten times as many operations."""
+    if not WITH_WARP:
+        pytest.skip("needs NVIDIA Warp: pip install 'tumble[cuda]'")
     _, true, taken = textured_sphere()
     inputs = on_device(refine.Inputs(taken, Trajectory(true, "camera")))
-    cfg = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200)
+    recipe = recipes.known_poses(recipes.DRAFT)
+    cfg = dataclasses.replace(recipe.refine, points=200, shadow_start=0.0)
     state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
 
-    def recorded(stage: Any, cfg: Any, inputs: Any, state: Any) -> tuple[list[str], list[str]]:
-        stage.step(cfg, inputs, state)
-        state.step += 1  # the first step fills caches
+    def recorded(stage: Any, cfg: Any, inputs: Any, state: Any) -> int:
+        for _ in range(3):  # the first steps fill caches, and the host looks at the lengths of lists
+            stage.step(cfg, inputs, state)
+            state.step += 1
         gpu.waits.clear()
         gpu.copies.clear()
+        gpu.operations.clear()
         stage.step(cfg, inputs, state)
-        return [x.split()[-1] for x in gpu.waits], [x.split()[-1] for x in gpu.copies]
+        assert ([x.split()[-1] for x in gpu.waits], [x.split()[-1] for x in gpu.copies]) == ([], [])
+        return gpu.operations.total()
 
-    assert recorded(refine, cfg, inputs, state) == ([], [])
+    assert recorded(refine, cfg, inputs, state) <= 100
     third = decompose.Inputs(inputs.capture, refine.finish(cfg, inputs, state))
-    cfg = dataclasses.replace(recipes.known_poses(RECIPE).decompose, fit_specular=False)
+    cfg = dataclasses.replace(recipe.decompose, fit_specular=False, warmup=0)
     state = decompose.init(cfg, third, torch.Generator().manual_seed(0))
-    assert recorded(decompose, cfg, third, state) == ([], [])
+    assert recorded(decompose, cfg, third, state) <= 150
 
 
 def test_a_gradient_on_a_device_that_is_not_finite_changes_nothing_and_is_named_later(gpu: SimulatedGpu) -> None:

@@ -9,11 +9,12 @@ import ctypes
 import hashlib
 import importlib
 import math
+import pkgutil
 import re
 import struct
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
@@ -22,8 +23,8 @@ from typing import Any
 import warp
 from torch import Tensor
 
-from tumble import backends
-from tumble.backends import _cache, _native, _warp, _warp_composite
+from tumble.backends import _cache, _native, _warp
+from tumble.backends._warp import compositing, runtime
 
 HERE = Path(__file__).parent
 UNUSED_HEADERS = ("crt", "deterministic", "hashgrid", "matnn", "mesh", "noise", "svd", "texture", "tile*", "volume*")
@@ -31,6 +32,7 @@ UNUSED_HEADERS = ("crt", "deterministic", "hashgrid", "matnn", "mesh", "noise", 
 TILES = "namespace wp { struct tile_shared_storage_t { static void init() {} }; }"
 """What is left of Warp's tiles."""
 FLAGS = ("-std=c++17", "-w", "-fPIC", "-march=native", "-fno-omit-frame-pointer", "-U_FORTIFY_SOURCE")
+FLAGS += ("-D__assert_fail=emulated_assert_fail",)  # an assertion of Warp stops a launch, not the process
 KERNEL_FLAGS = ("-O1", "-fsanitize=thread", "-fno-optimize-sibling-calls", "-fno-thread-jumps")
 """Optimisations may neither join nor copy the calls of collectives."""
 
@@ -42,10 +44,10 @@ class EmulationError(Exception):
 @cache
 def ptx_files() -> list[Path]:
     """Every module of the kernels as compiled for a GPU by Warp, in the cache; its source lies beside it."""
-    names = [f"tumble.backends.{path.stem}" for path in Path(backends.__file__).parent.glob("_warp_*.py")]
+    names = [f"{_warp.__name__}.{found.name}" for found in pkgutil.iter_modules(_warp.__path__)]
     modules = [warp.get_module(importlib.import_module(name).__name__) for name in sorted(names)]
-    factories = _warp_composite.forward, _warp_composite.adjoint
-    modules += [make(channels).module for make in factories for channels in _warp_composite.WIDTHS]
+    factories = compositing.forward, compositing.adjoint
+    modules += [make(channels).module for make in factories for channels in compositing.WIDTHS]
     folder = _cache.of_warp() / "ptx"
     found = [warp.compile_aot_module(x, arch=90, module_dir=folder, use_ptx=True) for x in modules if x.kernels]
     return [path for paths in found for path in paths]
@@ -57,33 +59,41 @@ def cuda_sources() -> list[str]:
 
 
 def compiled(sources: Sequence[str], folder: Path) -> ctypes.CDLL:
-    """The library of the kernels in CUDA sources, which is compiled into a folder unless it is there.
+    """The library of the kernels in CUDA sources; what is not yet there is compiled into a folder.
 
     Raises:
         CannotCompile: There is no compiler.
     """
     compiler = _native.find_compiler()
     emulation = [(HERE / f"warp_emulation.{suffix}").read_text("utf-8") for suffix in ("h", "cpp")]
-    parts = [warp.__version__, compiler, *FLAGS, *KERNEL_FLAGS, *emulation, *sources]
-    library = folder / f"emulated-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:16]}.so"
+    common = [warp.__version__, compiler, *FLAGS, *KERNEL_FLAGS, *emulation]
+
+    def named(suffix: str, *parts: str) -> Path:
+        return folder / f"emulated-{hashlib.sha256(chr(0).join([*common, *parts]).encode()).hexdigest()[:16]}{suffix}"
+
+    library = named(".so", *sources)
     if library.exists():
         return ctypes.CDLL(str(library))
+    objects = [named(".o", source) for source in sources]
     with tempfile.TemporaryDirectory(dir=folder) as name:
         build = Path(name)
         _write_headers(build)
         command = [compiler, *FLAGS, "-c", "-o"]
         runs = [subprocess.Popen([*command, build / "emulation.o", "-O2", HERE / "warp_emulation.cpp"])]
-        for number, source in enumerate(sources):
-            path = build / f"{number}.cpp"
-            path.write_text(source + "".join(ENTRY.format(name) for name in kernel_names(source)), "utf-8")
+        missing = {path: source for path, source in zip(objects, sources, strict=True) if not path.exists()}
+        for path, source in missing.items():
+            text = (build / path.name).with_suffix(".cpp")
+            text.write_text(source + "".join(ENTRY.format(name) for name in kernel_names(source)), "utf-8")
             includes = "-include", HERE / "warp_emulation.h", "-I", build
-            runs.append(subprocess.Popen([*command, path.with_suffix(".o"), *KERNEL_FLAGS, *includes, path]))
+            runs.append(subprocess.Popen([*command, build / path.name, *KERNEL_FLAGS, *includes, text]))
         if any([run.wait() for run in runs]):
             raise EmulationError("the compiler refuses a source; see above")
+        for path in missing:
+            (build / path.name).rename(path)
         partial = build / library.name
         # Modules define the same operators of the same structs.
         link = "-shared", "-Wl,--allow-multiple-definition"
-        subprocess.run([compiler, *link, *build.glob("*.o"), "-o", partial], check=True)
+        subprocess.run([compiler, *link, build / "emulation.o", *objects, "-o", partial], check=True)
         partial.rename(library)
     return ctypes.CDLL(str(library))
 
@@ -119,16 +129,17 @@ class EmulatedGpu:
         pointer, number = ctypes.c_void_p, ctypes.c_uint
         library.emulation_launch.argtypes = [ctypes.c_char_p, pointer, pointer, number, ctypes.c_int, number]
 
-    def launch(self, kernel: Any, threads: int | tuple[int, int], *arguments: Tensor | float) -> None:
-        """Takes the place of `_warp.launch`."""
+    def launch(self, kernel: Any, threads: int | tuple[int, int], *arguments: runtime.Argument) -> None:
+        """Takes the place of `runtime.launch`."""
         parameters = kernel.adj.args
         shape = threads if isinstance(threads, tuple) else (threads,)
         n = math.prod(shape)
         # Warp's `launch_bounds_t`: shape, number of threads, threads of the same index.
         packed: list[Any] = [ctypes.create_string_buffer(struct.pack(f"@{len(shape)}IQQ", *shape, n, 1))]
+        arrays = {}
         for parameter, value in zip(parameters, arguments, strict=True):
-            packed.append(_packed(parameter.type, _warp._argument(parameter, value)))
-        arrays = {p.label: x for p, x in zip(parameters, arguments, strict=True) if isinstance(x, Tensor)}
+            packed.append(_packed(parameter.type, runtime.packed(parameter.type, value)))
+            arrays |= _tensors(parameter.label, value)
         opaque = any(p.type is warp.uint64 for p in parameters)
         self.run(f"{kernel.get_mangled_name()}_cuda_kernel_forward", packed, n, arrays, opaque=opaque)
 
@@ -161,8 +172,21 @@ class EmulatedGpu:
 def _packed(kind: Any, value: Any) -> Any:
     """The argument of a kernel as a value of ctypes."""
     scalars = {int: ctypes.c_int32, float: ctypes.c_float, warp.int32: ctypes.c_int32, warp.float32: ctypes.c_float}
-    scalars[warp.uint64] = ctypes.c_uint64
-    return scalars[kind](value) if kind in scalars else value
+    scalars |= {warp.uint64: ctypes.c_uint64, warp.float64: ctypes.c_double}
+    if kind in scalars:
+        return scalars[kind](value)
+    return value.__ctype__() if hasattr(value, "__ctype__") else value
+
+
+def _tensors(label: str, value: Any) -> dict[str, Tensor]:
+    """All tensors of an argument, by name."""
+    if isinstance(value, Tensor):
+        return {label: value}
+    if isinstance(value, Mapping):
+        return {name: x for key, each in value.items() for name, x in _tensors(f"{label}.{key}", each).items()}
+    if isinstance(value, list | tuple):
+        return {f"{label}[{k}]": x for k, x in enumerate(value) if isinstance(x, Tensor)}
+    return {}
 
 
 def _extent(x: Tensor) -> int:

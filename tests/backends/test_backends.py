@@ -718,26 +718,38 @@ def test_activations_and_their_gradients_are_those_of_the_reference(backend: bac
     assert torch.autograd.gradcheck(lambda *y: reference.activate(*y), [y.requires_grad_() for y in x])
 
 
-@pytest.mark.parametrize("count", [1, 50])
+@pytest.mark.parametrize(("count", "n"), [(0, 4), (49, 19)])
 def test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none(
-    backend: backends.Backend, count: int
+    backend: backends.Backend, count: int, n: int
 ) -> None:
     rng = torch.Generator().manual_seed(count)
-    shapes = (), (7, 3), (40, 4, 3), (0, 3)
+    shapes = [(), (7, 3), (40, 4, 3), (0, 3), *[(k, 3) for k in range(4, n)]]
     values = [[torch.rand(shape, generator=rng) for _ in range(4)] for shape in shapes]
 
-    def run(by: backends.Backend, dtype: torch.dtype, broken: float = 0.0) -> list[torch.Tensor]:
-        leaves = [backends.Leaf(*(x.to(dtype, copy=True) for x in each), 0.1, count) for each in values]
+    def run(
+        by: backends.Backend, dtype: torch.dtype, broken: float = 0.0, loss: float = 1.0, failed: float = 0.0
+    ) -> list[torch.Tensor]:
+        steps = torch.full((n,), float(count)).unbind()
+        leaves = [
+            backends.Leaf(*(x.to(dtype, copy=True) for x in each), steps[k].clone(), 0.01 * (k + 1))
+            for k, each in enumerate(values)
+        ]
         leaves[2].gradient[3, 1, 2] += broken
-        assert by.adam(leaves, 0.9, 0.999, 1e-15) == math.isfinite(broken)
-        return [x for leaf in leaves for x in (leaf.value, leaf.first, leaf.second)]
+        told = torch.tensor(failed)
+        by.adam(leaves, torch.tensor(loss).to(dtype), told, 0.9, 0.999, 1e-15)
+        assert told == (not (math.isfinite(broken) and math.isfinite(loss)) or failed)
+        return [x for leaf in leaves for x in (leaf.value, leaf.first, leaf.second, leaf.count)]
 
     _compare(backend, run)
-    for broken in (math.nan, math.inf, -math.inf):
-        unchanged = run(backend, torch.float32, broken)
-        assert all(
-            torch.equal(a, b) for a, b in zip(unchanged, [x for v in values for x in (v[0], *v[2:])], strict=True)
-        )
+    assert run(backend, torch.float32)[3] == count + 1
+    before = [x for value, _, *moments in values for x in (value, *moments, torch.tensor(float(count)))]
+    for bad in (math.nan, math.inf, -math.inf):
+        for unchanged in (
+            run(backend, torch.float32, broken=bad),
+            run(backend, torch.float32, loss=bad),
+            run(backend, torch.float32, failed=1.0),
+        ):
+            assert all(torch.equal(a, b) for a, b in zip(unchanged, before, strict=True))
 
 
 @pytest.mark.parametrize(("n", "d", "p"), [(60, 100, 70), (0, 48, 17)])

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_leaves, tree_map
 
 from tests.backends import cases
 from tests.backends import test_backends as conformance
@@ -31,19 +31,49 @@ KERNEL_CASES = [
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 256, 7, (0.03, 0.6)),
     (conformance.test_shading_and_its_gradients_are_those_of_the_reference, 1, 3, (0.5, 0.5)),
     (conformance.test_a_sphere_in_uniform_light_matches_the_integrated_brdf, 0.3),
+    *[
+        (conformance.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference, n, shadowed)
+        for n, shadowed in ((133, True), (133, False), (0, True))
+    ],
+    *[(conformance.test_bounces_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
+    *[
+        (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, height, width, box, *weights)
+        for height, width, box, weights in (
+            (40, 50, (slice(8, 30), slice(12, 40)), (0.2, 25.0)),
+            (37, 51, (slice(None), slice(None)), (1.0, 0.0)),
+            (11, 13, (slice(0, 9), slice(3, None)), (0.2, 25.0)),
+        )
+    ],
+    *[
+        (conformance.test_terms_of_materials_and_their_gradients_are_those_of_the_reference, *size)
+        for size in ((19, 37), (1, 5), (4, 1))
+    ],
+    *[
+        (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, n, gamma)
+        for n, gamma in ((333, 8.0), (332, 100.0), (1, 8.0))
+    ],
+    *[
+        (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, *sizes)
+        for sizes in ((9, 16, 200), (1, 1, 20), (2, 5, 0))
+    ],
+    (conformance.test_lookups_at_the_poles_are_means_of_their_rows_and_have_no_gradient,),
+    *[
+        (conformance.test_the_term_of_shaded_pixels_and_its_gradients_are_those_of_the_reference, *sizes)
+        for sizes in ((60, 100, 70), (0, 48, 17))
+    ],
+    *[
+        (conformance.test_convolutions_of_maps_and_their_gradients_are_those_of_the_reference, *size)
+        for size in ((8, 24), (6, 30))
+    ],
+    (conformance.test_activations_and_their_gradients_are_those_of_the_reference,),
+    *[(conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, n) for n in (0, 75)],
+    (conformance.test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none, 0, 4),
+    (conformance.test_steps_of_adam_are_those_of_the_reference_and_those_that_are_not_finite_are_none, 49, 19),
 ]
 CONFORMANCE = [
     *KERNEL_CASES,
-    (conformance.test_lookups_and_their_gradients_are_those_of_the_reference, 9, 16, 200),
-    (conformance.test_shading_by_harmonics_and_its_gradients_are_those_of_the_reference, 133, True),
-    *[
-        (conformance.test_terms_of_images_and_their_gradients_are_those_of_the_reference, 40, 50, box, 0.2, 25.0)
-        for box in ((slice(8, 30), slice(12, 40)), (slice(None), slice(None)))
-    ],
-    (conformance.test_features_of_corners_and_their_gradients_are_those_of_the_reference, 75),
-    (conformance.test_bounces_and_their_gradients_are_those_of_the_reference, 75),
-    (conformance.test_terms_of_materials_and_their_gradients_are_those_of_the_reference, 19, 37),
-    (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 333, 8.0),
+    (conformance.test_terms_of_gaussians_and_their_gradients_are_those_of_the_reference, 0, 8.0),
+    (conformance.test_convolutions_of_maps_and_their_gradients_are_those_of_the_reference, 64, 80),
 ]
 every_case = pytest.mark.parametrize(
     "case", CONFORMANCE, ids=lambda case: "-".join([case[0].__name__, *map(str, case[1:])])
@@ -79,21 +109,70 @@ def test_hits_of_rays_along_the_axes_are_those_of_brute_force(kernels: Any) -> N
     assert cases.difference(hits.transmittance, truth.transmittance) < conformance.RELATIVE
 
 
+def projected(scene: cases.Scene, factor: int) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], int, int]:
+    """Records, depths and numbers of tiles of the Gaussians of a scene in a view of `factor` times its size."""
+    from tumble.backends._warp import projection, runtime
+
+    height, width = factor * scene.height, factor * scene.width
+    *gaussians, _, R, t, focal = scene.inputs
+    camera, n = torch.cat([R.flatten(), t, factor * focal]).float(), len(gaussians[0])
+    prepared = torch.empty(n, 8, 4), torch.empty(n), torch.empty(n, dtype=torch.int32)
+    with runtime.stream(camera.device):
+        inputs = [x.float().contiguous() for x in gaussians]
+        runtime.launch(projection.project_forward, n, *inputs, camera, height, width, *prepared)
+    return prepared, height, width
+
+
+def lists(scene: cases.Scene, factor: int, limit: cuda.PairLimit | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    from tumble.backends._warp import runtime
+
+    prepared, height, width = projected(scene, factor)
+    with runtime.stream(prepared[0].device):
+        return cuda._bin(*prepared, height, width, limit)
+
+
+def test_tile_lists_with_room_for_more_are_the_same_and_those_with_too_little_say_so(kernels: Any) -> None:
+    """The limit is that of the first view of as many Gaussians, which is looked at after 1, 2, 4, ... views."""
+    near, far = cases.hard(), cases.hard()
+    far.inputs[7][2] += 30  # some hundred pairs less
+    limit = cuda.PairLimit()
+    for scene in (near, far, near):
+        (starts, listed), (true_starts, true_listed) = lists(scene, 8, limit), lists(scene, 8)
+        assert torch.equal(starts, true_starts)
+        assert torch.equal(listed[: len(true_listed)], true_listed)
+    n_pairs = len(lists(near, 8)[1])
+    assert 2 * n_pairs <= limit.capacity < 4 * n_pairs
+    limit = cuda.PairLimit()
+    small = len(lists(far, 8, limit)[1])
+    assert small < n_pairs
+    starts, listed = lists(near, 8, limit)
+    assert starts[-1] == small
+    # Of every tile the first ones: the farthest Gaussians are left out.
+    true_starts, true_listed = lists(near, 8)
+    for tile, start in enumerate(starts[:-1]):
+        kept = listed[start : starts[tile + 1]]
+        assert torch.equal(kept, true_listed[true_starts[tile] :][: len(kept)])
+    with pytest.warns(RuntimeWarning, match=f"left out {n_pairs - small} of {n_pairs} pairs"):
+        starts, listed = lists(near, 8, limit)
+    assert torch.equal(starts, true_starts)
+    limit = cuda.PairLimit()
+    for scene in (far, near):
+        lists(scene, 8, limit)
+    with pytest.warns(RuntimeWarning, match=f"left out {n_pairs - small} of {n_pairs} pairs"):
+        lists(cases.easy(), 8, limit)  # another number of Gaussians
+    for _ in range(20):
+        lists(far, 8, limit)
+    limit.look()  # without a warning, as before each view without gradients
+    assert limit.views == 20
+
+
 def test_tile_lists_hold_all_overlapping_tiles_and_hardly_any_other(kernels: Any) -> None:
     """Compared with the response of every Gaussian at every pixel."""
-    from tumble.backends import _warp, _warp_project
-
     scene = cases.hard()
-    height, width = 8 * scene.height, 8 * scene.width
+    (_, depth, _), height, width = projected(scene, 8)
+    starts, listed = lists(scene, 8)
     means, quats, scales, opacity, sh, _, R, t, focal = scene.inputs
-    camera = torch.cat([R.flatten(), t, 8 * focal]).float()
     n = len(means)
-    record, depth, n_tiles = torch.empty(n, 8, 4), torch.empty(n), torch.empty(n, dtype=torch.int32)
-    with _warp.stream(means.device):
-        gaussians = [x.float().contiguous() for x in (means, quats, scales, opacity, sh)]
-        prepared = record, depth, n_tiles
-        _warp.launch(_warp_project.project_forward, n, *gaussians, camera, height, width, *prepared)
-        starts, listed = cuda._bin(*prepared, height, width)
     across, down = -(-width // 16), -(-height // 16)
     in_list = torch.zeros(across * down, n, dtype=torch.bool)
     in_list[torch.repeat_interleave(torch.arange(across * down), starts.diff().long()), listed.long()] = True
@@ -158,8 +237,12 @@ class OnGpu:
 
     def __getattr__(self, verb: str) -> Callable[..., Any]:
         def call(*arguments: Any) -> Any:
-            there = (x.to(GPU) if isinstance(x, torch.Tensor) else x for x in arguments)
+            there = tree_map(lambda x: x.to(GPU) if isinstance(x, torch.Tensor) else x, arguments)
             result = getattr(cuda, verb)(*there)
+            if verb == "adam":  # which changes its arguments
+                for mine, changed in zip(tree_leaves(arguments), tree_leaves(there), strict=True):
+                    if isinstance(mine, torch.Tensor):
+                        mine.copy_(changed)
             if verb == "build":
                 return result
             return tree_map(lambda x: x.cpu() if isinstance(x, torch.Tensor) else x, result)

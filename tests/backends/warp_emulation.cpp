@@ -3,8 +3,9 @@
 //   - a shuffle from a lane that has ended or is not in the mask,
 //   - an access outside the arrays of the launch, or to a stack of another lane,
 //   - a race: two threads access the same four bytes, one of them writes, not both are atomic, and no barrier orders
-//     them (`__syncwarp`, `__syncthreads`; shuffles and votes order nothing in memory).
-// The last check keeps a cell of the last accesses for every four bytes of every array.
+//     them (`__syncwarp`, `__syncthreads`; shuffles and votes order nothing in memory),
+//   - a failed assertion of Warp.
+// The check for races keeps a cell of the last accesses for every four bytes of every array.
 
 #include <algorithm>
 #include <cstdarg>
@@ -326,6 +327,10 @@ void fail(const char* what) { failf("%s", what); }
 using namespace emulation;
 
 extern "C" {
+
+[[noreturn]] void emulated_assert_fail(const char* what, const char*, unsigned, const char*) noexcept {
+    failf("finds that not %s", what);
+}
 
 // Say that a launch may access an array.
 void emulation_allow(uintptr_t begin, size_t bytes, const char* name) {

@@ -97,10 +97,10 @@ class Leaf(NamedTuple):
     """Running mean of the gradient."""
     second: Tensor
     """Running mean of the gradient's square."""
+    count: Float[Tensor, ""]
+    """Number of steps so far, in float32; advanced in place."""
     rate: float
     """Learning rate."""
-    count: int
-    """Number of steps, this one included."""
 
 
 @runtime_checkable
@@ -413,13 +413,13 @@ class Backend(Protocol):
         """
         ...
 
-    def adam(self, leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
-        """One step of Adam (Kingma and Ba 2015) on all leaves at once, unless a gradient is not finite.
+    def adam(
+        self, leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float
+    ) -> None:
+        """One step of Adam (Kingma and Ba 2015) on all leaves at once; the host does not wait for it.
 
-        With bias-corrected moments m and v, a value moves by -rate m / (sqrt(v) + eps).
-
-        Returns:
-            Whether all gradients were finite; if not, nothing was changed. A host waits for this of a GPU.
+        With bias-corrected moments m and v, a value moves by -rate m / (sqrt(v) + eps). `failed`, a float32, is set to
+        1 if the loss or a gradient is not finite. If it is 1, nothing else is changed.
         """
         ...
 

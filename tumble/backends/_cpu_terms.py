@@ -524,14 +524,22 @@ _ACTIVATION = ("log_scales", "sdf", "gamma", "scales", "opacity")
 
 
 @torch.no_grad()
-def adam(leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float) -> None:
     """See `Backend.adam`."""
+    if failed.item() or not math.isfinite(loss.item()):
+        failed.fill_(1)
+        return
     rows = []
     for leaf in leaves:
-        corrections = leaf.rate / (1 - beta_1**leaf.count), math.sqrt(1 - beta_2**leaf.count)
+        count = int(leaf.count) + 1
+        corrections = leaf.rate / (1 - beta_1**count), math.sqrt(1 - beta_2**count)
         rows.append((*(x.data_ptr() for x in leaf[:4]), leaf.value.numel(), *corrections))
     rates = {"beta_2": beta_2, "rest_1": 1 - beta_1, "rest_2": 1 - beta_2, "eps": eps}
     struct = AdamStep(n_leaves=len(rows), threads=threads(), **rates)
     array = (AdamLeaf * len(rows))(*rows)
     struct.leaves = ctypes.addressof(array)
-    return bool(_native.library().adam(ctypes.byref(struct)))
+    if not _native.library().adam(ctypes.byref(struct)):
+        failed.fill_(1)
+        return
+    for leaf in leaves:
+        leaf.count.add_(1)

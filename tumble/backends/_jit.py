@@ -2,7 +2,8 @@
 
 The kernels become the preamble of a Warp module. The result is not linked to any library, so the only Warp kernel of
 the module exchanges addresses: it receives those of the system's thread functions and returns those of the entry
-points. Warp caches the object file by the source text, its own version and the processor, in the folder set in `_warp`.
+points. Warp caches the object file by the source text, its own version and the processor, in the folder that
+`_warp/runtime.py` sets.
 """
 
 import ctypes
@@ -11,8 +12,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from tumble.backends import _warp
 from tumble.backends._cache import SOURCES
+from tumble.backends._warp import runtime
 
 ENTRY_POINTS = (
     *("lanes", "sizes", "raster_prepare", "raster_forward", "raster_adjoint", "bvh_build"),
@@ -53,12 +54,12 @@ wp.set_module_options(
     "".join(f"tumble::{x} = (decltype(tumble::{x}))given.data[{i}];\n" for i, x in enumerate(_used))
     + "".join(f"taken.data[{i}] = (uint64_t)&tumble::{x};\n" for i, x in enumerate(ENTRY_POINTS))
 )
-@_warp.no_type_check
+@runtime.no_type_check
 def _swap(given: wp.array[wp.uint64], taken: wp.array[wp.uint64]): ...
 
 
 @wp.kernel
-@_warp.no_type_check
+@runtime.no_type_check
 def _exchange(given: wp.array[wp.uint64], taken: wp.array[wp.uint64]):
     _swap(given, taken)
 

@@ -1,13 +1,14 @@
-"""CUDA backend: float32 kernels written in NVIDIA Warp (`_warp*.py`).
+"""CUDA backend: float32 kernels written in NVIDIA Warp (the folder `_warp`).
 
 This file wraps the kernels in `autograd.Function`s. Warp is an optional package and is imported at the first call, when
 it compiles the kernels within seconds and caches them. Gradients are summed by atomic additions, so that two runs on a
 GPU differ by rounding errors. The kernels run on the device of the tensors; on the CPU they are slow and serve tests.
-Shading by spherical harmonics, lookups, materials and loss terms have no kernel yet: they are those of the reference.
 """
 
 import importlib.util
-from functools import partial
+import warnings
+from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
@@ -15,19 +16,17 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tumble.backends import Hits, Lobes, Rendering
-from tumble.backends.reference import (
+from tumble.backends import Hits, Rendering
+from tumble.backends._cuda_shading import lookup, prefilter, shade, shading_term
+from tumble.backends._cuda_terms import (
     activate,
     adam,
     bounce,
     corner_features,
     gaussian_terms,
     image_terms,
-    lookup,
     material_terms,
-    prefilter,
     sh_shade,
-    shading_term_by,
 )
 
 __all__ = [
@@ -78,13 +77,14 @@ def rasterize(
     mask: Float[Tensor, "#h #w"],
 ) -> Rendering:
     """One view of the Gaussians; see `Backend.rasterize`. Many features are rendered in several passes."""
-    from tumble.backends._warp_composite import WIDTHS
+    from tumble.backends._warp.compositing import WIDTHS
 
     camera = torch.cat([R_cam_obj.flatten(), t_cam_obj, fx_fy_cx_cy])
     views = []
     for group in corners.split(max(WIDTHS), 2):
         channels = min(x for x in WIDTHS if x >= group.shape[2])
-        gaussians = means, quats, scales, opacity, sh, pad(group, (0, channels - group.shape[2]))
+        padded = pad(group, (0, channels - group.shape[2])) if channels > group.shape[2] else group
+        gaussians = means, quats, scales, opacity, sh, padded
         pixels, weight, touched, dominant = _Rasterize.apply(*gaussians, camera, height, width, mask)
         rgb, alpha, depth, depth_var, normal, features = pixels.split([3, 1, 1, 1, 3, channels], -1)
         alpha, depth, depth_var = alpha[..., 0], depth[..., 0], depth_var[..., 0]
@@ -98,28 +98,33 @@ def rasterize(
 class _Rasterize(torch.autograd.Function):
     """(means, quats, scales, opacity, sh, corners, camera, height, width, mask) -> pixels, weight, touched, dominant.
 
-    The layouts of camera and pixels are those of `_warp_project` and `_warp_composite`.
+    The layouts of camera and pixels are those of `_warp`.
     """
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[Tensor, ...]:
-        from tumble.backends import _warp, _warp_composite, _warp_project
+        from tumble.backends._warp import compositing, projection, runtime
 
         *inputs, height, width, mask = args
         inputs = [x.contiguous() for x in inputs]
         *geometry, corners, camera = inputs
         means, n, channels = geometry[0], len(corners), corners.shape[2]
-        record = means.new_empty(n, _warp_project.RECORD, 4)
+        record = means.new_empty(n, projection.RECORD, 4)
         depth, n_tiles = means.new_empty(n), _int32(means, n)
-        pixels = means.new_zeros(height * width, _warp_composite.FIXED + channels)
-        statistics = means.new_zeros(n), torch.zeros_like(n_tiles), _int32(means, height * width).fill_(-1)
-        with _warp.stream(means.device):
+        pixels = means.new_empty(height * width, compositing.FIXED + channels)
+        weight, touched = means.new_zeros(2, n).unbind()
+        statistics = weight, touched.view(torch.int32), _int32(means, height * width)
+        with runtime.stream(means.device):
             prepared = record, depth, n_tiles
-            _warp.launch(_warp_project.project_forward, n, *geometry, camera, height, width, *prepared)
-            starts, listed = _bin(*prepared, height, width)
+            runtime.launch(projection.project_forward, n, *geometry, camera, height, width, *prepared)
+            limit = _limit(means.device, height, width)
+            trains = any(ctx.needs_input_grad)
+            if not trains:
+                limit.look()
+            starts, listed = _bin(*prepared, height, width, limit if trains else None)
             drawing = record, _packed(corners), camera, mask.expand(height, width), starts, listed, height, width
-            kernel = _warp_composite.forward(channels)
-            _warp.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
+            kernel = compositing.forward(channels)
+            runtime.launch(kernel, _threads(starts), *drawing, pixels, *statistics)
         ctx.size = height, width
         ctx.save_for_backward(*inputs, record, n_tiles, starts, listed, pixels)
         ctx.mark_non_differentiable(*statistics)
@@ -128,23 +133,23 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, v_pixels: Tensor, *_: Any) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        from tumble.backends import _warp, _warp_composite, _warp_project
+        from tumble.backends._warp import compositing, projection, runtime
 
         means, quats, scales, _, sh, corners, camera, record, n_tiles, starts, listed, pixels = ctx.saved_tensors
         n, channels = len(means), corners.shape[2]
-        sums = means.new_zeros(n, _warp_project.CORNERS + 4 * channels)
-        v_means, v_quats, v_scales, v_sh = (torch.zeros_like(x) for x in (means, quats, scales, sh))
-        v_camera = camera.new_zeros(1, len(camera))
-        with _warp.stream(means.device):
+        width = projection.CORNERS + 4 * channels
+        v_camera, sums = means.new_zeros(len(camera) + n * width).split([len(camera), n * width])
+        v_camera, sums = v_camera[None], sums.view(n, width)
+        v_means, v_quats, v_scales, v_sh = (torch.empty_like(x) for x in (means, quats, scales, sh))
+        with runtime.stream(means.device):
             drawn = record, _packed(corners), camera, starts, listed, *ctx.size, pixels
-            kernel = _warp_composite.adjoint(channels)
-            _warp.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
+            kernel = compositing.adjoint(channels)
+            runtime.launch(kernel, _threads(starts), *drawn, v_pixels.reshape(pixels.shape).contiguous(), sums)
             gradients = v_means, v_quats, v_scales, v_sh, v_camera
-            n_threads = -(-n // _warp.LANES) * _warp.LANES
             inputs = means, quats, scales, sh, camera, n_tiles
-            _warp.launch(_warp_project.project_adjoint, n_threads, *inputs, sums, *gradients)
-        v_opacity = sums[:, _warp_project.OPACITY]
-        v_corners = sums[:, _warp_project.CORNERS :].view(n, 4, channels)
+            runtime.launch(projection.project_adjoint, runtime.whole_warps(n), *inputs, sums, *gradients)
+        v_opacity = sums[:, projection.OPACITY]
+        v_corners = sums[:, projection.CORNERS :].view(n, 4, channels)
         return v_means, v_quats, v_scales, v_opacity, v_sh, v_corners, v_camera[0], None, None, None
 
 
@@ -155,29 +160,109 @@ def _packed(corners: Float[Tensor, "n 4 c"]) -> Float[Tensor, "n 4 c1"]:
 
 def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
     """Number of threads of the blending kernels, one per pixel of all tiles."""
-    from tumble.backends._warp_project import TILE
+    from tumble.backends._warp.projection import TILE
 
     return (len(starts) - 1) * TILE * TILE
 
 
+LOOK_EVERY = 64
+"""Views after which the host asks a GPU for the number of pairs again."""
+
+
+@dataclass
+class PairLimit:
+    """Length of the lists of tiles for views of one size in training, so that the host need not wait for the true one.
+
+    Lists are at least twice as long as those of the first view of as many Gaussians. The device keeps the length of the
+    longest since; the host looks at it after 1, 2, 4, 8, ... views, at least every `LOOK_EVERY`, and before each view
+    without gradients, whose lists have the true length. Lists that were more than half full become longer. Had a view
+    more pairs than its lists could hold, those of the Gaussians farthest from the camera were left out of it; then a
+    warning says so.
+    """
+
+    capacity: int = 0
+    """Pairs of a tile and a Gaussian that the lists hold."""
+    n: int = -1
+    """Number of Gaussians for which this was found."""
+    views: int = 0
+    """Views of as many Gaussians so far."""
+    longest: Int32[Tensor, "1"] | None = None
+    """Number of pairs of the view with most of them, on the device."""
+
+    def room(self, ends: Int64[Tensor, " n"]) -> tuple[int, Int32[Tensor, "1"]]:
+        """Capacity for a view whose i-th Gaussian by depth has its pairs before `ends[i]`, and `longest`."""
+        if len(ends) != self.n or self.longest is None:
+            self.look()
+            self.n, self.views, self.longest = len(ends), 0, _int32(ends, 1).zero_()
+            self.capacity = _power_of_two(2 * int(ends[-1]))
+        elif self.views & (self.views - 1) == 0 or self.views % LOOK_EVERY == 0:
+            self.look()
+        self.views += 1
+        return self.capacity, self.longest
+
+    def look(self) -> None:
+        """Wait for the number of pairs of the view with most of them, and make lists longer if need be."""
+        found = int(self.longest) if self.longest is not None else 0
+        if found > self.capacity:
+            lost = f"{found - self.capacity} of {found} pairs of a tile and a Gaussian"
+            warnings.warn(f"a training view left out {lost}, far from the camera", RuntimeWarning, stacklevel=2)
+        self.capacity = max(self.capacity, _power_of_two(2 * found))
+
+
+@cache
+def _limit(device: torch.device, height: int, width: int) -> PairLimit:
+    """The limit for views of a size."""
+    return PairLimit()
+
+
+def _power_of_two(n: int) -> int:
+    """The smallest power of two that is at least n."""
+    return 1 << max(0, n - 1).bit_length()
+
+
 def _bin(
-    record: Float[Tensor, "n 8 4"], depth: Float[Tensor, " n"], n_tiles: Int32[Tensor, " n"], height: int, width: int
+    record: Float[Tensor, "n 8 4"],
+    depth: Float[Tensor, " n"],
+    n_tiles: Int32[Tensor, " n"],
+    height: int,
+    width: int,
+    limit: PairLimit | None,
 ) -> tuple[Int32[Tensor, " tiles_1"], Int32[Tensor, " pairs"]]:
-    """Start of the list of each tile (and end of the last), and all lists: Gaussians by depth, ties by index."""
+    """Start of the list of each tile (and end of the last), and all lists: Gaussians by depth, ties by index.
+
+    Args:
+        record: See `projection`.
+        depth: Sorting depth.
+        n_tiles: Number of tiles of each Gaussian.
+        height: Rows of the image.
+        width: Columns of the image.
+        limit: Length of the lists; the host waits for the true one if it is None.
+    """
     import warp
 
-    from tumble.backends import _warp, _warp_project
+    from tumble.backends._warp import projection, runtime
 
     order = torch.argsort(depth, stable=True)
     ends = n_tiles[order].cumsum(0)
-    n_pairs = int(ends[-1]) if len(ends) else 0
-    # The second half of both is workspace of the sort, which is stable and so keeps the depth order within a tile.
-    tiles, listed = _int32(depth, 2 * n_pairs), _int32(depth, 2 * n_pairs)
-    _warp.launch(_warp_project.list_tiles, len(order), order, ends, record, n_tiles, height, width, tiles, listed)
-    n_all = -(-height // _warp_project.TILE) * -(-width // _warp_project.TILE)
-    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), n_pairs, end_bit=n_all.bit_length())
-    all_tiles = torch.arange(n_all + 1, dtype=torch.int32, device=depth.device)
-    return torch.searchsorted(tiles[:n_pairs], all_tiles, out_int32=True), listed[:n_pairs]
+    if limit is None or not len(ends):
+        room, longest = int(ends[-1]) if len(ends) else 0, _int32(depth, 1)
+    else:
+        room, longest = limit.room(ends)
+    n_all = -(-height // projection.TILE) * -(-width // projection.TILE)
+    # Places without a pair count for a tile behind the last. The second half of both is workspace of the sort, which is
+    # stable and so keeps the depth order within a tile.
+    tiles, listed = _int32(depth, 2 * room).fill_(n_all), _int32(depth, 2 * room)
+    pairs = tiles[:room], listed[:room]
+    runtime.launch(projection.list_tiles, len(order), order, ends, record, n_tiles, height, width, *pairs, longest)
+    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), room, end_bit=n_all.bit_length())
+    starts = torch.searchsorted(pairs[0], _all_tiles(n_all, depth.device), out_int32=True)
+    return starts, pairs[1]
+
+
+@cache
+def _all_tiles(n: int, device: torch.device) -> Int32[Tensor, " n_1"]:
+    """Indices of n tiles, and n."""
+    return torch.arange(n + 1, dtype=torch.int32, device=device)
 
 
 class WarpBvh(NamedTuple):
@@ -186,7 +271,7 @@ class WarpBvh(NamedTuple):
     boxes: Any
     """Bounding boxes of the Gaussians as a `warp.Bvh`."""
     record: Float[Tensor, "n 4 4"]
-    """Records of the Gaussians, see `_warp_trace`."""
+    """Records of the Gaussians, see `tracing`."""
     low: Float[Tensor, "n 3"]
     """Lower corners of the boxes, to which `boxes` points."""
     high: Float[Tensor, "n 3"]
@@ -203,15 +288,15 @@ def build(
     """See `Backend.build`."""
     import warp
 
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     # Warp's tree cannot be empty, so that without Gaussians it holds one box that no ray reaches.
     n = max(len(means), 1)
     record = means.new_zeros(n, 4, 4)
-    low, high = means.new_full((n, 3), _warp_trace.UNREACHABLE), means.new_full((n, 3), _warp_trace.UNREACHABLE)
-    with _warp.stream(means.device):
+    low, high = means.new_full((n, 3), tracing.UNREACHABLE), means.new_full((n, 3), tracing.UNREACHABLE)
+    with runtime.stream(means.device):
         gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
-        _warp.launch(_warp_trace.enclose, len(means), *gaussians, record, low, high)
+        runtime.launch(tracing.enclose, len(means), *gaussians, record, low, high)
         boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3))
     return WarpBvh(boxes, record, low, high)
 
@@ -224,13 +309,13 @@ def trace(
     radiance: Float[Tensor, "m 3"],
 ) -> Hits:
     """See `Backend.trace`."""
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     n = len(origins)
     hits = Hits(origins.new_empty(n), origins.new_empty(n, 3), _int32(origins, n))
-    with _warp.stream(origins.device):
+    with runtime.stream(origins.device):
         rays = [x.contiguous() for x in (radiance, origins, directions)]
-        _warp.launch(_warp_trace.trace_rays, n, bvh.boxes.id, bvh.record, *rays, *hits)
+        runtime.launch(tracing.trace_rays, n, bvh.boxes.id, bvh.record, *rays, *hits)
     return hits
 
 
@@ -242,13 +327,13 @@ def visible(
     directions: Float[Tensor, "d 3"],
 ) -> Int32[Tensor, "p words"]:
     """See `Backend.visible`."""
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     words = -(-len(directions) // 32)
     bits = _int32(points, len(points), words)
-    with _warp.stream(points.device):
+    with runtime.stream(points.device):
         inputs = [x.contiguous() for x in (points, normals, directions)]
-        _warp.launch(_warp_trace.trace_visibility, (words, len(points)), bvh.boxes.id, bvh.record, *inputs, bits)
+        runtime.launch(tracing.trace_visibility, (words, len(points)), bvh.boxes.id, bvh.record, *inputs, bits)
     return bits
 
 
@@ -261,74 +346,15 @@ def blockers(
     visibility: Int32[Tensor, "p words"],
 ) -> Int32[Tensor, "p d"]:
     """See `Backend.blockers`."""
-    from tumble.backends import _warp, _warp_trace
+    from tumble.backends._warp import runtime, tracing
 
     blocker = _int32(points, len(points), len(directions))
-    with _warp.stream(points.device):
+    with runtime.stream(points.device):
         inputs = [x.contiguous() for x in (points.new_zeros(0, 3), points, normals, directions, visibility)]
         threads = len(directions), len(points)
-        _warp.launch(_warp_trace.find_blockers, threads, bvh.boxes.id, bvh.record, *inputs, blocker)
+        runtime.launch(tracing.find_blockers, threads, bvh.boxes.id, bvh.record, *inputs, blocker)
     return blocker
 
 
 def _int32(like: Tensor, *shape: int) -> Int32[Tensor, "..."]:
     return torch.empty(shape, dtype=torch.int32, device=like.device)
-
-
-def shade(
-    normal: Float[Tensor, "p 3"],
-    roughness: Float[Tensor, " p"],
-    view: Float[Tensor, "p 3"],
-    directions: Float[Tensor, "d 3"],
-    radiance: Float[Tensor, "d 3"],
-    visibility: Int32[Tensor, "q words"],
-    blocker: Int32[Tensor, "#q #d"],
-    rows: Int64[Tensor, " p"],
-    blocker_radiance: Float[Tensor, "m 3"],
-) -> Lobes:
-    """See `Backend.shade`."""
-    blocker = blocker[rows] if len(blocker) > 1 else blocker
-    rest = directions, radiance, visibility[rows], blocker, blocker_radiance
-    values = _Shade.apply(normal, roughness, view, *rest)
-    visible, total = values[:, 6:].detach().unbind(1)
-    return Lobes(values[:, :3], values[:, 3:6], visible / total.clamp(min=torch.finfo(total.dtype).tiny))
-
-
-shading_term = partial(shading_term_by, shade)
-"""See `Backend.shading_term`; only its `shade` is a kernel."""
-
-
-class _Shade(torch.autograd.Function):
-    """`shade` with positional arguments in the same order; the last two results are visible and total weight."""
-
-    @staticmethod
-    def forward(ctx: Any, *args: Tensor) -> Tensor:
-        from tumble.backends import _warp, _warp_shade
-
-        tensors = [x.contiguous() for x in args]
-        n, d = len(tensors[0]), len(tensors[3])
-        tensors[6] = tensors[6].expand(n, d)
-        out = tensors[0].new_zeros(n, 8)
-        with _warp.stream(out.device):
-            _warp.launch(_warp_shade.shade_forward, (n, _warp.LANES), *tensors, out)
-        ctx.save_for_backward(*tensors)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        from tumble.backends import _warp, _warp_shade
-
-        *surface, directions, radiance, visibility, blocker, blocker_radiance = ctx.saved_tensors
-        v_diffuse, v_specular = v_out[:, :3].contiguous(), v_out[:, 3:6].contiguous()
-        n, groups = len(v_out), -(-len(v_out) // _warp_shade.POINTS)
-        v_points = v_out.new_zeros(n, 7)
-        v_radiance, v_blocker_radiance = torch.zeros_like(radiance), torch.zeros_like(blocker_radiance)
-        with _warp.stream(v_out.device):
-            inputs = *surface, directions, radiance, visibility, blocker, blocker_radiance
-            _warp.launch(_warp_shade.shade_adjoint, (n, _warp.LANES), *inputs, v_diffuse, v_specular, v_points)
-            inputs = *surface, directions, visibility, blocker
-            threads = groups, len(directions)
-            gradients = v_radiance, v_blocker_radiance
-            _warp.launch(_warp_shade.light_adjoint, threads, *inputs, v_diffuse, v_specular, *gradients)
-        v_normal, v_view, v_roughness = v_points.split([3, 3, 1], 1)
-        return v_normal, v_roughness[:, 0], v_view, None, v_radiance, None, None, v_blocker_radiance

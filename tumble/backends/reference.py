@@ -5,8 +5,7 @@ frame, `W` whitening matrix, `d` ray direction with z = 1, `peak` the point of a
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -35,7 +34,6 @@ from tumble.backends import (
     T_MIN,
     UNKNOWN,
     Leaf,
-    Lobes,
     Rendering,
     SampledView,
     ShadingLight,
@@ -453,16 +451,20 @@ def activate(
 
 
 @torch.no_grad()
-def adam(leaves: Sequence[Leaf], beta_1: float, beta_2: float, eps: float) -> bool:
+def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, beta_2: float, eps: float) -> None:
     """See `Backend.adam`."""
-    if not all(bool(leaf.gradient.isfinite().all()) for leaf in leaves):
-        return False
+    finite = torch.stack([loss.isfinite(), *(leaf.gradient.isfinite().all() for leaf in leaves)]).all()
+    failed.copy_(torch.maximum(failed, 1 - finite.to(failed)))
+    moves = failed == 0
     for leaf in leaves:
-        leaf.first.lerp_(leaf.gradient, 1 - beta_1)
-        leaf.second.mul_(beta_2).addcmul_(leaf.gradient, leaf.gradient, value=1 - beta_2)
-        root = leaf.second.sqrt() / math.sqrt(1 - beta_2**leaf.count) + eps
-        leaf.value.addcdiv_(leaf.first, root, value=-leaf.rate / (1 - beta_1**leaf.count))
-    return True
+        leaf.count.add_(1 - failed)
+        count, gradient = leaf.count.double(), leaf.gradient
+        first = leaf.first.lerp(gradient, 1 - beta_1)
+        second = (leaf.second * beta_2).addcmul(gradient, gradient, value=1 - beta_2)
+        root = second.sqrt() / (1 - beta_2**count).sqrt() + eps
+        value = leaf.value - leaf.rate / (1 - beta_1**count) * first / root
+        for old, new in ((leaf.value, value), (leaf.first, first), (leaf.second, second)):
+            old.copy_(torch.where(moves, new, old))
 
 
 def corner_features(
@@ -487,8 +489,7 @@ def bounce(
     return albedo / math.pi * _irradiance(transfer.detach(), coefficients, albedo)
 
 
-def shading_term_by(
-    shade_by: Callable[..., Lobes],
+def shading_term(
     view: SampledView,
     light: ShadingLight,
     R_cam_obj: Float[Tensor, "3 3"],
@@ -496,7 +497,7 @@ def shading_term_by(
     fx_fy_cx_cy: Float[Tensor, "4"],
     f0: Float[Tensor, "3"],
 ) -> Float[Tensor, ""]:
-    """`Backend.shading_term` with the function `shade` of a backend."""
+    """See `Backend.shading_term`."""
     counted, pixels, width = (view.pixels >= 0)[:, None], view.pixels.clamp(min=0), view.alpha.shape[1]
     albedo, roughness, offset = view.features.flatten(0, 1)[pixels].split([3, 1, 3], -1)
     normal = normalize(view.normal.flatten(0, 1)[pixels] + offset, dim=-1)
@@ -511,7 +512,7 @@ def shading_term_by(
     bounced = bounce(light.albedo, light.transfer, light.directions, sky) if len(light.albedo) else sky[:0]
     rows = view.dominant.flatten()[pixels].clamp(min=0).long()
     seen = light.visibility, light.blocker, rows, bounced
-    lobes = shade_by(normal, roughness[:, 0], towards, light.directions, sky, *seen)
+    lobes = shade(normal, roughness[:, 0], towards, light.directions, sky, *seen)
     at = torch.cat(
         [2 * (roughness.clamp(min=ROUGHNESS_MIN) - ROUGHNESS_MIN) / (1 - ROUGHNESS_MIN), 2 * n_v.clamp(0, 1)], -1
     )
@@ -522,10 +523,6 @@ def shading_term_by(
     reflected = albedo * lobes.diffuse + f0 * torch.lerp(narrow, lobes.specular, wide)
     srgb, image = _as_captured(reflected * view.alpha.flatten()[pixels, None], view.photo.flatten(0, 1)[pixels])
     return ((srgb - image).abs() * counted).mean()
-
-
-shading_term = partial(shading_term_by, shade)
-"""See `Backend.shading_term`."""
 
 
 def _as_captured(linear: Float[Tensor, "*b 3"], photo: UInt8[Tensor, "*b 3"]) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,6 @@ The *moments* are Adam's running means of the gradient and of its square. *Regro
 transfer the moments and return a new tree, whose leaves replace the old ones in the optimizer.
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,8 +54,8 @@ class Adam:
     """Constant against division by zero."""
     state: dict[Tensor, dict[str, Tensor]] = field(default_factory=dict)
     """Moments and number of steps (`step`) of each leaf that has had a gradient."""
-    found_inf: Tensor | None = None
-    """On a GPU: 1 since the first loss or gradient that was not finite, from which on no leaf moves; else 0."""
+    failed: Tensor | None = None
+    """1 since the first loss or gradient that was not finite, from which on no leaf moves; else 0."""
 
     def state_of(self, leaf: Tensor) -> dict[str, Tensor]:
         """State of a leaf, which begins with zeros."""
@@ -67,53 +66,18 @@ class Adam:
         return self.state[leaf]
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor | None]) -> bool:
-        """Move every leaf that has a gradient, unless one is not finite; whether all were."""
-        moved = [(g, x) for g, x in zip(self.param_groups, gradients, strict=True) if x is not None]
-        states = [self.state_of(group["params"][0]) for group, _ in moved]
-        leaves = []
-        for (group, x), state in zip(moved, states, strict=True):
-            first, second = (state[key] for key in MOMENTS)
-            leaves.append(backends.Leaf(group["params"][0], x, first, second, group["lr"], int(state["step"]) + 1))
-        if not leaves:
-            return True
-        backend = backends.choose(leaves[0].value.device, leaves[0].value.dtype)
-        if not backend.adam(leaves, *self.betas, self.eps):
-            return False
-        for state in states:
-            state["step"] += 1
-        return True
-
-    @torch.no_grad()
-    def step_without_waiting(self, gradients: Sequence[Tensor | None]) -> None:
-        """`step` on a device, which moves nothing if `found_inf` is set.
-
-        Raises:
-            RuntimeError: torch has no fused kernel for the device.
-        """
-        assert self.found_inf is not None, "a GPU is told whether the gradients are finite"
-        for group, gradient in zip(self.param_groups, gradients, strict=True):
-            if gradient is None:
-                continue
-            leaf = group["params"][0]
-            state = self.state_of(leaf)
-            state["step"] += 1 - self.found_inf
-            torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
-                [leaf],
-                [gradient],
-                [state["exp_avg"]],
-                [state["exp_avg_sq"]],
-                [],
-                [state["step"]],
-                lr=group["lr"],
-                beta1=self.betas[0],
-                beta2=self.betas[1],
-                weight_decay=0.0,
-                eps=self.eps,
-                amsgrad=False,
-                maximize=False,
-                found_inf=self.found_inf,
-            )
+    def step(self, gradients: Sequence[Tensor | None], loss: Float[Tensor, ""]) -> None:
+        """Move every leaf that has a gradient, unless `failed` is or becomes 1; the host waits for no device."""
+        if self.failed is None:
+            self.failed = torch.zeros((), dtype=torch.float32, device=loss.device)
+        moved = []
+        for group, x in zip(self.param_groups, gradients, strict=True):
+            if x is not None:
+                leaf = group["params"][0]
+                state = self.state_of(leaf)
+                first, second = (state[key] for key in MOMENTS)
+                moved.append(backends.Leaf(leaf, x, first, second, state["step"], group["lr"]))
+        backends.choose(loss.device, loss.dtype).adam(moved, loss, self.failed, *self.betas, self.eps)
 
 
 def leaves(tree: T) -> T:
@@ -182,29 +146,18 @@ def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     leaves = [group["params"][0] for group in optimizer.param_groups]
     found = torch.autograd.grad(loss, leaves, allow_unused=True)
     gradients = [None if x is None else x.contiguous() for x in found]
-    if loss.device.type != "cpu":
-        _step_without_waiting(loss.detach(), gradients, optimizer, step)
-    elif not (math.isfinite(loss.item()) and optimizer.step(gradients)):
-        _raise_if_not_finite(loss, gradients, optimizer, step)
-
-
-def _step_without_waiting(loss: Tensor, gradients: Sequence[Tensor | None], optimizer: Adam, step: int) -> None:
-    """One optimizer step on a device, which changes nothing from the first loss or gradient that is not finite."""
-    found = [x for x in gradients if x is not None]
-    largest = torch.nn.utils.get_total_norm(found, norm_type=float("inf"))
-    bad = (~torch.isfinite(torch.stack([largest, loss])).all()).float()
-    if optimizer.found_inf is not None:
-        bad = torch.maximum(bad, optimizer.found_inf)
-    optimizer.found_inf = bad
-    optimizer.step_without_waiting(gradients)
-    if (step + 1) % CHECK_EVERY == 0 and bool(bad):
+    optimizer.step(gradients, loss.detach())
+    free = loss.device.type == "cpu"
+    if (free or (step + 1) % CHECK_EVERY == 0) and optimizer.failed is not None and bool(optimizer.failed):
+        if free:
+            optimizer.failed = None  # nothing was changed: the caller may go on
         _raise_if_not_finite(loss, gradients, optimizer, step)
         check_steps(optimizer, step)
 
 
 def check_steps(optimizer: Adam, step: int) -> None:
     """Raise `NotFinite` if `descend` has left out steps on a device since a loss or a gradient was not finite."""
-    if optimizer.found_inf is not None and bool(optimizer.found_inf):
+    if optimizer.failed is not None and bool(optimizer.failed):
         raise NotFinite(f"the loss or a gradient in one of the last {CHECK_EVERY} steps", step)
 
 

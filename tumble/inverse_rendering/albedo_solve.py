@@ -50,11 +50,11 @@ def _projected_back(
     asset: Asset, albedo: Float[Tensor, "n 4 3"], frame: lit_frames.LitFrame
 ) -> tuple[Float[Tensor, "n 4 3"], Float[Tensor, "n 4 3"]]:
     """A frame's weighted residuals and weights, summed for every corner over the pixels that it contributes to."""
-    corners = albedo.clone().requires_grad_()
+    corners, T_cam_obj = albedo.clone().requires_grad_(), tree.to(frame.T_cam_obj, albedo.device)
     shown = torch.where(torch.from_numpy(frame.usable).to(albedo.device).flatten())[0]
     with torch.enable_grad():
-        view = rasterize(asset.gaussians, asset.gamma, frame.T_cam_obj, asset.camera, {"albedo": corners})
-        points = surface(view, frame.T_cam_obj, asset.camera, pixels=shown)
+        view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, asset.camera, {"albedo": corners})
+        points = surface(view, T_cam_obj, asset.camera, pixels=shown)
         rendered = points.sample(view.features["albedo"])
     images = (torch.from_numpy(x).to(albedo) for x in (frame.photo, frame.diffuse, frame.specular))
     with torch.no_grad():

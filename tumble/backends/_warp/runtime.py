@@ -9,7 +9,7 @@ Compiled kernels are cached in the folder of the CPU kernels unless $WARP_CACHE_
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 
@@ -46,15 +46,51 @@ def stream(device: torch.device) -> AbstractContextManager[Any]:
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
 
 
-def launch(kernel: Any, threads: int | tuple[int, int], *arguments: Tensor | float | wp.uint64) -> None:
-    """Launch a kernel on tensors; must be called within `stream`."""
-    wp.launch(kernel, threads, inputs=[_argument(p, x) for p, x in zip(kernel.adj.args, arguments, strict=True)])
+Argument = Tensor | float | wp.uint64 | Sequence[Any] | Mapping[str, Any]
+"""Argument of a kernel: a tensor for an array, a mapping for a struct, a sequence of numbers for a vector or of tensors
+for `Addresses`, or a number."""
 
 
-def _argument(parameter: Any, value: Tensor | float | wp.uint64) -> Any:
-    if not isinstance(value, Tensor):
-        return value
-    return wp.from_torch(value.detach(), parameter.type.dtype, requires_grad=False, return_ctype=True)
+def launch(kernel: Any, threads: int | tuple[int, int], *arguments: Argument) -> None:
+    """Launch a kernel; must be called within `stream`."""
+    wp.launch(kernel, threads, inputs=[packed(p.type, x) for p, x in zip(kernel.adj.args, arguments, strict=True)])
+
+
+def packed(kind: Any, value: Argument) -> Any:
+    """An argument of a kernel as Warp takes it, without copies."""
+    if isinstance(value, Tensor):
+        array = value.detach() if value.ndim else value.detach()[None]
+        return wp.from_torch(array, kind.dtype, requires_grad=False, return_ctype=True)
+    if isinstance(value, Mapping):
+        fields = {name: packed(variable.type, value[name]) for name, variable in kind.vars.items()}
+        return _PackedStruct(kind.ctype(**fields))
+    if isinstance(value, Sequence):
+        numbers = [x.data_ptr() if isinstance(x, Tensor) else x for x in value]
+        return kind(*numbers, *[numbers[-1]] * (kind._length_ - len(numbers)))
+    return value
+
+
+class _PackedStruct:
+    """What Warp asks of a struct."""
+
+    def __init__(self, value: Any) -> None:
+        self.__ctype__ = lambda: value
+
+
+Addresses = wp.types.vector(length=16, dtype=wp.uint64)
+"""Addresses of tensors of float32, which `numbers` reads; a shorter list ends with repetitions of its last one."""
+
+
+@wp.func
+@no_type_check
+def numbers(address: wp.uint64) -> wp.array[float]:
+    """The numbers of a contiguous tensor from its address on."""
+    return wp.array(ptr=address, shape=(1 << 30,), dtype=float)  # type: ignore
+
+
+def whole_warps(n: int) -> int:
+    """The number of threads, at least n, that fills warps."""
+    return -(-n // LANES) * LANES
 
 
 vec32 = wp.types.vector(length=LANES, dtype=float)

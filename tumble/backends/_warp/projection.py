@@ -27,7 +27,7 @@ The adjoint computes gradients of the Gaussians and the camera from the sums; `v
 import warp as wp
 
 from tumble.backends import ALPHA_MIN, CORNER, FACING, NEAR, NEAR_SIGMAS
-from tumble.backends._warp import add_row, no_type_check, vec32
+from tumble.backends._warp.runtime import add_row, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 
@@ -353,10 +353,16 @@ def list_tiles(
     width: int,
     tiles: wp.array[int],
     gaussians: wp.array[int],
+    longest: wp.array[int],
 ):
-    """Write pairs of a tile and a Gaussian; those of the i-th Gaussian by depth end before ends[i]."""
+    """Write pairs of a tile and a Gaussian as far as there is room; those of the i-th by depth end before ends[i].
+
+    `longest` becomes the number of pairs if that is larger.
+    """
     rank = wp.tid()
     i = int(order[rank])
+    if rank == order.shape[0] - 1:
+        wp.atomic_max(longest, 0, int(ends[rank]))
     if n_tiles[i] == 0:
         return
     across = (width + TILE - 1) // TILE
@@ -365,8 +371,9 @@ def list_tiles(
     for row in range(rows[0], rows[1]):
         columns = tile_columns(record, i, row, width)
         for column in range(columns[0], columns[1]):
-            tiles[pair] = row * across + column
-            gaussians[pair] = i
+            if pair < tiles.shape[0]:
+                tiles[pair] = row * across + column
+                gaussians[pair] = i
             pair += 1
 
 
@@ -464,6 +471,12 @@ def project_adjoint(
         v_means[i] = wp.transpose(o.R_cam_obj) * v_p
         v_q = rotation_adjoint(o.quat, v_R_obj_local)
         v_quats[i] = (v_q - wp.dot(v_q, o.quat) * o.quat) * o.quat_scale
+    elif i < means.shape[0]:
+        v_means[i] = wp.vec3()
+        v_quats[i] = wp.vec4()
+        v_scales[i] = wp.vec3()
+        for j in range(sh.shape[1]):
+            v_sh[i, j] = wp.vec3()
     add_row(v_camera, 0, 0, 16, v_cam)
 
 

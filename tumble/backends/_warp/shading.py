@@ -11,7 +11,7 @@ import math
 import warp as wp
 
 from tumble.backends import ROUGHNESS_MIN
-from tumble.backends._warp import LANES, add_row, no_type_check, vec32
+from tumble.backends._warp.runtime import LANES, add_row, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,7 +109,7 @@ BLACK = wp.constant(-2)
 def source_of(
     visibility: wp.array2d[int], blocker: wp.array2d[int], blocker_radiance: wp.array[wp.vec3], i: int, j: int
 ) -> int:
-    """Source of the light at point i from direction j: UNBLOCKED, BLACK, or the index of a blocker."""
+    """Source of the light at points of row i from direction j: UNBLOCKED, BLACK, or the index of a blocker."""
     if (visibility[i, j // 32] >> (j % 32)) & 1 == 1:
         return UNBLOCKED
     if blocker_radiance.shape[0] == 0:
@@ -147,6 +147,7 @@ def shade_forward(
     radiance: wp.array[wp.vec3],
     visibility: wp.array2d[int],
     blocker: wp.array2d[int],
+    rows: wp.array[wp.int64],
     blocker_radiance: wp.array[wp.vec3],
     out: wp.array2d[float],
 ):
@@ -157,7 +158,7 @@ def shade_forward(
     bb = wp.max(p.aa, 0.25 * math.pi / float(directions.shape[0]))
     for j in range(lane, directions.shape[0], LANES):
         n_w = wp.dot(p.n, directions[j])
-        source = source_of(visibility, blocker, blocker_radiance, i, j)
+        source = source_of(visibility, blocker, blocker_radiance, int(rows[i]), j)
         c = wp.dot(mirrored, directions[j])
         if n_w > 0.0 and c > 0.0:
             t = 0.5 * (1.0 - c) + bb * 0.5 * (1.0 + c)
@@ -244,6 +245,7 @@ def shade_adjoint(
     radiance: wp.array[wp.vec3],
     visibility: wp.array2d[int],
     blocker: wp.array2d[int],
+    rows: wp.array[wp.int64],
     blocker_radiance: wp.array[wp.vec3],
     v_diffuse: wp.array[wp.vec3],
     v_specular: wp.array[wp.vec3],
@@ -257,7 +259,7 @@ def shade_adjoint(
     seed_diffuse = v_diffuse[i] * (4.0 / float(directions.shape[0]))
     for j in range(lane, directions.shape[0], LANES):
         n_w = wp.dot(p.n, directions[j])
-        source = source_of(visibility, blocker, blocker_radiance, i, j)
+        source = source_of(visibility, blocker, blocker_radiance, int(rows[i]), j)
         if n_w > 0.0 and source != BLACK:
             L = arriving(source, radiance, blocker_radiance, j)
             o = lobe_at(p, directions[j], n_w)
@@ -279,6 +281,7 @@ def light_adjoint(
     directions: wp.array[wp.vec3],
     visibility: wp.array2d[int],
     blocker: wp.array2d[int],
+    rows: wp.array[wp.int64],
     v_diffuse: wp.array[wp.vec3],
     v_specular: wp.array[wp.vec3],
     v_radiance: wp.array[wp.vec3],
@@ -290,7 +293,7 @@ def light_adjoint(
     for i in range(POINTS * group, wp.min(POINTS * group + POINTS, normal.shape[0])):
         p = point_at(normal, roughness, view, i)
         n_w = wp.dot(p.n, directions[j])
-        source = source_of(visibility, blocker, v_blocker_radiance, i, j)
+        source = source_of(visibility, blocker, v_blocker_radiance, int(rows[i]), j)
         if n_w > 0.0 and source != BLACK:
             f = lobe_at(p, directions[j], n_w).f
             v_L = n_w * (INV_PI * v_diffuse[i] + f * v_specular[i])

@@ -12,8 +12,8 @@ many directions at one point.
 import warp as wp
 
 from tumble.backends import ALPHA_MAX, ALPHA_MIN, TRACE_SIGMAS, TRACE_T_MIN, VISIBLE
-from tumble.backends._warp import no_type_check
-from tumble.backends._warp_project import rotation
+from tumble.backends._warp.projection import rotation
+from tumble.backends._warp.runtime import no_type_check
 
 wp.set_module_options({"enable_backward": False})
 

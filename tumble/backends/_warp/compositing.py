@@ -4,7 +4,7 @@
 
 With s_i = dL/dw_i, the Gaussians behind Gaussian i contribute rem = dL/dout . out - sum_{j <= i} w_j s_j, so that
 neither a reversed list nor a state per pixel is stored. Formulas and the layouts of records and sums are in
-`_warp_project.py`.
+`projection.py`.
 
 A *pixel* is rgb, alpha, depth, variance of depth, normal, features. A tile is a block of 256 threads; the 32 lanes of a
 warp cover 8 x 4 pixels and traverse the list of the tile together.
@@ -15,8 +15,8 @@ from functools import cache
 import warp as wp
 
 from tumble.backends import ALPHA_MAX, ALPHA_MIN, T_MIN
-from tumble.backends._warp import add_lanes, add_row, any_lane, count_lanes, no_type_check, vec32
-from tumble.backends._warp_project import CORNERS, SUMS, TILE
+from tumble.backends._warp.projection import CORNERS, SUMS, TILE
+from tumble.backends._warp.runtime import add_lanes, add_row, any_lane, count_lanes, no_type_check, vec32
 
 wp.set_module_options({"enable_backward": False})
 
@@ -129,11 +129,11 @@ def blend(b: Blend, w: float, p: Peak, record: wp.array2d[wp.vec4], g: int) -> B
 @wp.func
 @no_type_check
 def write_pixel(pixels: wp.array2d[float], i: int, b: Blend, alpha: float, z_0: float):
-    """Write all numbers of a pixel except the features."""
-    inv = 1.0 / alpha
+    """Write all numbers of a pixel except the features; alpha is 0 or at least ALPHA_MIN."""
+    inv = 1.0 / wp.max(alpha, ALPHA_MIN)
     mean = b.z * inv
     pixels[i, 3] = alpha
-    pixels[i, 4] = z_0 + mean
+    pixels[i, 4] = wp.where(alpha > 0.0, z_0 + mean, 0.0)
     pixels[i, 5] = b.zz * inv - mean * mean
     for ch in range(3):
         pixels[i, ch] = b.rgb[ch]
@@ -192,12 +192,12 @@ def forward(channels: int) -> wp.Kernel:
                     T -= w
                 add_lanes(weight, g, w)
                 count_lanes(touched, g, on and counted)
-        if winner >= 0:
+        if inside:
             i = at[1] * width + at[0]
             dominant[i] = winner
             write_pixel(pixels, i, b, 1.0 - T, camera[11])
             for ch in range(channels):
-                pixels[i, FIXED + ch] = features[ch] / (1.0 - T)
+                pixels[i, FIXED + ch] = features[ch] / wp.max(1.0 - T, ALPHA_MIN)
 
     return composite
 
