@@ -112,7 +112,7 @@ class Config:
     relocalizations: int = 2
     """Number of relocalizations of an attempt, each followed by rounds of adjustment."""
     max_corrections: int = 4
-    """Maximum number of rounds of corrections at the end: by colours, loop closures and relocalization, then adjusted."""
+    """Maximum number of rounds of corrections at the end (`CheckSettled`)."""
     frontier_weight: float = 12.0
     """Weight of an observation of a frontier point, relative to an observation of a track.
 
@@ -178,7 +178,10 @@ class AlignTexture:
 
 @dataclass(frozen=True)
 class CheckSettled:
-    """Skip all further steps if the last round of corrections changed the rotations by less than `SETTLED_ANGLE`."""
+    """Start a round of corrections: by colours, loop closures and relocalization, then all frames are adjusted.
+
+    If no rotation has changed by `SETTLED_ANGLE` since the last check, this and all further rounds are skipped.
+    """
 
 
 @dataclass(frozen=True)
