@@ -20,7 +20,11 @@ from tumble.scene.match import Match
 
 SIZE, DISTANCE = 96, 4.4
 QUICK = stage.Config(
-    window_sizes=(6,), window_scales=(3.0, 1.0, 0.5), global_scales=(3.0, 2.0, 1.0, 0.7, 0.5), relocalizations=0
+    window_sizes=(6,),
+    window_scales=(3.0, 1.0, 0.5),
+    global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
+    relocalizations=0,
+    max_corrections=0,
 )
 
 

@@ -50,7 +50,8 @@ def predict_views(
     if alignment is None or truth.trajectory is None or not len(truth):
         return prediction
     views = alignment.to_prediction(truth.trajectory)
-    buffers = _gbuffers(asset, views, capture, "rendering maps of the evaluation views")
+    indices = progress.track(range(len(views)), "rendering maps of the evaluation views", len(views))
+    buffers = [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in indices]
     coverage = torch.stack([view.alpha for view in buffers])
     # Maps extend beyond the silhouette to all pixels with a usable value; `masks` holds the silhouette.
     known = coverage >= cfg.alpha_min
@@ -64,7 +65,7 @@ def predict_views(
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
         masks=coverage >= MIN_OBJECT_COVERAGE,
         images=_rendered_views(cfg, asset, geometry, buffers, estimated_light, views, capture, "the estimated light"),
-        relit=_relit_views(cfg, asset, geometry, albedo, alignment, capture, truth),
+        relit=_relit_views(cfg, asset, geometry, buffers, albedo, alignment, capture, truth),
         elsewhere=None
         if truth.elsewhere is None
         else _views_elsewhere(cfg, asset, geometry, alignment, truth.elsewhere),
@@ -124,6 +125,7 @@ def _relit_views(
     cfg: relight.Config,
     asset: Asset,
     geometry: relight.TracedGeometry,
+    buffers: Sequence[Buffers],
     albedo: Float[Tensor, "v h w 3"],
     alignment: Similarity,
     capture: Capture,
@@ -132,9 +134,8 @@ def _relit_views(
     """The views under the truth's lights (true object frame), rendered with the scaled albedo."""
     if truth.albedo is None or truth.trajectory is None:
         return {}
-    scaled = relight.scale_albedo(asset, metrics.albedo_scale(albedo, truth.albedo, truth.foreground))
+    scaled, buffers = relight.scale_albedo(asset, buffers, metrics.albedo_scale(albedo, truth.albedo, truth.foreground))
     views = Trajectory(alignment.to_prediction(truth.trajectory).T_cam_obj, "object")
-    buffers = _gbuffers(scaled, views, capture, "rendering maps with the scaled albedo")
     R_pred_true = alignment.R_true_pred.inverse().matrix()
     return {
         name: _rendered_views(cfg, scaled, geometry, buffers, light.rotated(R_pred_true), views, capture, name)
@@ -157,12 +158,6 @@ def _views_elsewhere(
         buffers = [antialiased_gbuffer(asset, view.T_cam_obj[0], camera)]
         images += relight.relight(cfg, asset, light, view, camera, geometry=geometry, buffers=buffers)
     return torch.stack(images)
-
-
-def _gbuffers(asset: Asset, views: Trajectory, capture: Capture, task: str) -> list[Buffers]:
-    """Buffers of the views, which do not depend on the light."""
-    indices = progress.track(range(len(views)), task, len(views))
-    return [antialiased_gbuffer(asset, views.T_cam_obj[i], capture.camera) for i in indices]
 
 
 def _rendered_views(

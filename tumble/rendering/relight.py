@@ -25,6 +25,9 @@ SURFACE_VIEWS = 64
 VISIBILITY_DIRECTIONS = 512
 """Number of directions over which light is integrated at each Gaussian, and in which its visibility is traced."""
 
+MAX_ALBEDO = 0.999
+"""Largest albedo after scaling."""
+
 
 @dataclass(frozen=True)
 class Config:
@@ -163,12 +166,19 @@ def turntable(reference: Trajectory, n: int, elevation: float) -> tuple[Float[Te
     return tilt, Trajectory(T_cam_gl @ T_gl_obj, "camera")
 
 
-def scale_albedo(asset: Asset, albedo_scale: Float[Tensor, "3"]) -> Asset:
-    """The asset with its albedo multiplied by a factor per channel, limited to 0.999."""
+def scale_albedo(
+    asset: Asset, buffers: Sequence[Buffers], albedo_scale: Float[Tensor, "3"]
+) -> tuple[Asset, list[Buffers]]:
+    """The asset, and its buffers, with their albedo multiplied by a factor per channel, limited to `MAX_ALBEDO`."""
     material = asset.material
-    albedo = (material.albedo * albedo_scale).clamp(1e-4, 0.999)
-    logits = TEMPERATURE * torch.logit(albedo)
-    return replace(asset, material=replace(material, albedo_logits=logits))
+    logits = TEMPERATURE * torch.logit((material.albedo * albedo_scale).clamp(1e-4, MAX_ALBEDO))
+    scaled = [
+        replace(
+            view, features=view.features | {"albedo": (view.features["albedo"] * albedo_scale).clamp(max=MAX_ALBEDO)}
+        )
+        for view in buffers
+    ]
+    return replace(asset, material=replace(material, albedo_logits=logits)), scaled
 
 
 def _transfer(asset: Asset, tracer: Tracer) -> Float[Tensor, "n 9"]:

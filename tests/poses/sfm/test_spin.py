@@ -39,22 +39,22 @@ def albedo(x: Tensor) -> Tensor:
     return torch.where(dark, 0.25, 0.8)
 
 
-def film(painted: bool = True) -> tuple[Capture, Trajectory]:
+def film(painted: bool = True, frames: int = FRAMES) -> tuple[Capture, Trajectory]:
     """The ellipsoid turns about its axis by 8 degrees a frame, while the axis swings in the image and in depth."""
-    k = torch.arange(FRAMES) / FRAMES
+    k = torch.arange(frames) / FRAMES
     swing = torch.stack([1.5 + 0.4 * (6 * k).sin(), 0.2 * (4 * k).cos(), 0.5 * (5 * k).sin()], -1)
-    about_z = torch.tensor([0.0, 0.0, 1.0]) * torch.deg2rad(8.0 * torch.arange(FRAMES))[:, None]
+    about_z = torch.tensor([0.0, 0.0, 1.0]) * torch.deg2rad(8.0 * torch.arange(frames))[:, None]
     T = SE3.from_rotation(SO3.exp(swing) @ SO3.exp(about_z), torch.tensor([0.0, 0.0, DISTANCE]))
     rng = torch.Generator().manual_seed(0)
     images, masks = [], []
-    for i in range(FRAMES):
+    for i in range(frames):
         x, hit = intersect(T[i], CAMERA.pixel_centers())
         normal = torch.nn.functional.normalize(T.rotation[i] @ (x / RADII.square()), dim=-1)
         grey = (albedo(x) if painted else 0.8) * (0.5 + 0.5 * (normal @ LIGHT).clamp_min(0))
         grey = (255 * grey.clamp(0, 1) + torch.randn(grey.shape, generator=rng)).clamp(0, 255) * hit
         images.append(grey[..., None].expand(-1, -1, 3).to(torch.uint8))
         masks.append(torch.where(hit, OBJECT, BACKGROUND).to(torch.uint8))
-    names = tuple(f"{i}.png" for i in range(FRAMES))
+    names = tuple(f"{i}.png" for i in range(frames))
     return Capture(torch.stack(images), torch.stack(masks), CAMERA, names, "camera"), Trajectory(T, "camera")
 
 
@@ -98,6 +98,22 @@ def test_the_spin_is_found_from_little_texture(filmed: tuple[Capture, Trajectory
     assert error(wrong.T_cam_obj, truth) > 10
     # A cell of the maps is 2 degrees wide.
     assert error(found.surface.turned(wrong, found.angle).T_cam_obj, truth) < 2
+
+
+def test_a_part_of_the_motion_is_enough_to_contradict_the_poses() -> None:
+    """The last six of forty frames slip by 5 degrees each, which changes the mean correlation of all frames little."""
+    capture, truth = film(frames=40)
+    T, z = truth.T_cam_obj, torch.tensor([0.0, 0.0, 1.0])
+    slip = torch.deg2rad(-5.0 * (torch.arange(40) - 34).clamp_min(0))[:, None] * z
+    wrong = replace(truth, T_cam_obj=SE3.from_rotation(T.rotation @ SO3.exp(slip), T.xyz))
+    found = symmetry.estimate_spin(capture, wrong)
+    assert found is not None
+    assert float(found.given_correlation.mean() / found.correlation.mean()) > 0.8
+    assert found.is_better
+    corrected = found.surface.turned(wrong, found.angle).T_cam_obj
+    assert math.degrees(float(angle_between(corrected.rotation[-1], corrected.rotation[0]))) == pytest.approx(
+        math.degrees(float(angle_between(T.rotation[-1], T.rotation[0]))), abs=3
+    )
 
 
 def test_right_poses_are_not_contradicted(filmed: tuple[Capture, Trajectory]) -> None:

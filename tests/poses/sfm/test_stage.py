@@ -18,7 +18,11 @@ from tumble.scene.capture import Capture
 from tumble.scene.match import Match
 
 QUICK = stage.Config(
-    window_sizes=(6,), window_scales=(3.0, 1.0, 0.5), global_scales=(3.0, 2.0, 1.0, 0.7, 0.5), relocalizations=0
+    window_sizes=(6,),
+    window_scales=(3.0, 1.0, 0.5),
+    global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
+    relocalizations=0,
+    max_corrections=0,
 )
 
 
@@ -133,6 +137,24 @@ def test_an_attempt_is_mended_before_it_is_compared_unless_it_has_converged(scen
     assert float(deviation(state.params.R, true_R)[10]) < math.radians(3)
 
 
+def test_corrections_are_repeated_until_no_rotation_changes_by_a_degree(scene: Tumble) -> None:
+    """One frame that still moves is enough for another round; after a round without, all further steps do nothing."""
+    cfg = replace(QUICK, max_corrections=4)
+    steps = [step.phase for step in stage.schedule(cfg)]
+    checks = [k for k, phase in enumerate(steps) if phase == stage.CheckSettled()]
+    inputs = stage.gather(scene.capture, (), "mixed")
+    state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
+    for state.step, degrees, settled in zip(checks, (30.0, 1.2, 0.8, 0.8), (False, False, True, True), strict=True):
+        R = state.params.R.clone()
+        R[3] = SO3.exp(torch.tensor([0.0, math.radians(degrees), 0.0], dtype=torch.float64)).matrix() @ R[3]
+        state.params = replace(state.params, R=R)
+        stage.step(cfg, inputs, state)
+        assert bool(state.memory["settled"]) == settled
+    state.step = checks[-1] + 2
+    assert steps[state.step] == stage.CloseLoops()
+    assert stage.step(cfg, inputs, state) == {}
+
+
 def test_no_object_is_an_error(scene: Tumble) -> None:
     blank = replace(scene.capture, masks=torch.zeros_like(scene.capture.masks))
     with pytest.raises(ValueError, match="no mask has an object pixel"):
@@ -148,7 +170,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(scene: Tumble, tmp_path: Path
         names=scene.capture.names[:6],
     )
     inputs = stage.gather(few, tuple(m for m in matches(scene) if m.j < 6), "mixed")
-    short = replace(QUICK, global_scales=(3.0, 1.0), relocalizations=1, relocalized_scales=(1.0,))
+    short = replace(QUICK, global_scales=(3.0, 1.0), relocalizations=1, max_corrections=2, relocalized_scales=(1.0,))
     whole = drive(stage, short, inputs, seed=3)
 
     def stop(progress: Progress) -> None:

@@ -8,7 +8,8 @@ and the better result is kept. Frames whose contour contradicts the others are r
 rotations.
 
 What contours do not show is corrected by texture: the rotation of a body of revolution about its axis, and turns of a
-part of the motion that leave the visual hull as it is (`symmetry`).
+part of the motion that leave the visual hull as it is (`symmetry`). These corrections are repeated until the poses
+settle.
 
 A capture that has not converged is attempted again with the settings in `Config.fallbacks`, and the best result is
 kept. A focal length that is only assumed is estimated as well whenever all frames are adjusted together.
@@ -16,6 +17,7 @@ kept. A focal length that is only assumed is estimated as well whenever all fram
 Unit of length until `finish`: the mean distance between camera and object.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -47,7 +49,7 @@ from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
 from tumble.scene import Trajectory
 
-VERSION = 17
+VERSION = 18
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -70,6 +72,9 @@ BOUNDING_RADIUS_FACTOR = 1.3
 """Radius of a sphere about the origin that safely contains the object, over the object's approximate radius."""
 RELOCALIZATION_SCALE = 0.7
 """Scale of the Cauchy loss in relocalization [pixels]."""
+SETTLED_ANGLE = math.radians(1.0)
+"""Largest change of a frame's rotation by a round of corrections below which no more rounds follow [radians]. A frame
+that is relocated or turned moves farther, one that is only adjusted less."""
 NO_ROTATION_WEIGHT = 0.01
 """Weight of the prior that the object does not rotate between consecutive frames [weight of one inlier match]."""
 
@@ -105,7 +110,9 @@ class Config:
     disagreement_scales: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
     """Scale of the Cauchy loss in each round of the two fits that rely mainly on tracks or on contours [pixels]."""
     relocalizations: int = 2
-    """Number of relocalizations, each followed by rounds of adjustment."""
+    """Number of relocalizations of an attempt, each followed by rounds of adjustment."""
+    max_corrections: int = 4
+    """Maximum number of rounds of corrections at the end (`CheckSettled`)."""
     frontier_weight: float = 12.0
     """Weight of an observation of a frontier point, relative to an observation of a track.
 
@@ -170,6 +177,14 @@ class AlignTexture:
 
 
 @dataclass(frozen=True)
+class CheckSettled:
+    """Start a round of corrections: by colours, loop closures and relocalization, then all frames are adjusted.
+
+    If no rotation has changed by `SETTLED_ANGLE` since the last check, this and all further rounds are skipped.
+    """
+
+
+@dataclass(frozen=True)
 class AlignColours:
     """Turn a part of the motion by a rotation that silhouettes do not show, where colours say so (`symmetry.turns`)."""
 
@@ -198,6 +213,7 @@ Phase = (
     | AdjustAll
     | KeepBest
     | AlignTexture
+    | CheckSettled
     | AlignColours
     | CloseLoops
     | Relocalize
@@ -234,8 +250,8 @@ def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
         steps += [Step(phase, attempt) for phase in (*phases, *([keep] if attempt == 0 else []))]
         steps += [Step(phase, attempt, mends=True) for phase in (*relocalization * cfg.relocalizations, keep)]
     steps.append(Step(AlignTexture()))
-    for _ in range(cfg.relocalizations):
-        steps += map(Step, (AlignColours(), CloseLoops(), *relocalization))
+    for _ in range(cfg.max_corrections):
+        steps += map(Step, (CheckSettled(), AlignColours(), CloseLoops(), *relocalization))
     return steps
 
 
@@ -251,6 +267,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     best = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
     best["posed"] = torch.ones(len(R), dtype=torch.bool)
     best["confirmed"] = torch.full((len(R),), -1)
+    best["checked"] = torch.full_like(R, torch.nan)  # rotations at the last check, before which there are none
+    best["settled"] = torch.tensor(False)
     best["steady"] = torch.ones(len(inputs.tracks), dtype=torch.bool)
     return State(
         0, Poses(R, t, log_focal), None, rng, best | {f"loop_{name}": x for name, x in vars(NO_TRACKS).items()}
@@ -259,10 +277,12 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 @torch.no_grad()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
-    """Carry out the next step of the schedule; mending and further attempts are skipped once the loss has converged."""
+    """Carry out the next step of the schedule, unless the loss has converged or the poses have settled before it."""
     now = schedule(cfg, hidden=inputs.hidden)[state.step]
     cfg = _weighted(cfg, inputs)
     if (now.attempt > 0 or now.mends) and float(state.memory["loss"]) < cfg.converged_loss:
+        return {}
+    if bool(state.memory["settled"]):
         return {}
     if now.attempt > 0 and not isinstance(now.phase, KeepBest):
         cfg = replace(cfg, frontier_weight=cfg.fallbacks[now.attempt - 1].frontier_weight)
@@ -287,6 +307,8 @@ def _run_phase(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "Phas
             return _keep_best(cfg, inputs, state, scale)
         case AlignTexture():
             return _align_texture(inputs, state)
+        case CheckSettled():
+            return _check_settled(state)
         case AlignColours():
             return _align_colours(inputs, state)
         case CloseLoops():
@@ -407,6 +429,14 @@ def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
     trajectory = found.surface.turned(_in_unit_sphere(inputs, state.params), found.angle)
     state.memory["steady"] = symmetry.steady_observations(inputs.capture, trajectory, found.surface, inputs.tracks)
     return _from_unit_sphere(inputs, state.params, trajectory), {"turned": found.angle.abs().median()}
+
+
+def _check_settled(state: State) -> PhaseResult:
+    """Compare the rotations with those of the last check."""
+    R = state.params.R
+    change = angle_between(SO3.from_matrix(R), SO3.from_matrix(state.memory["checked"])).max()
+    state.memory |= {"checked": R, "settled": change < SETTLED_ANGLE}
+    return state.params, {"changed": change} if bool(change.isfinite()) else {}
 
 
 def _align_colours(inputs: Inputs, state: State) -> PhaseResult:

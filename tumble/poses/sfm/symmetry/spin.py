@@ -51,10 +51,13 @@ STEP_PENALTY = 0.006
 """Penalty on a change of the given spin between consecutive frames, which decides where a frame shows no texture
 [mean correlation / degree]."""
 MIN_CORRELATION = 0.3
-"""Minimum mean correlation of frames near in time, with the spin found, for the texture to show it; shading and noise
-alone reach 0.27."""
+"""Minimum mean correlation of a frame with those near in time, with the spin found, for its texture to show the spin;
+shading and noise alone reach 0.28."""
 CONTRADICTION = 0.8
 """Ratio of the correlation for another spin to that for the spin found below which texture contradicts that one."""
+MIN_CONTRADICTED = 4
+"""Number of frames that contradict the given poses from which these are wrong; the first or last two may do so by
+noise, as they are compared with few others."""
 MAX_SLIP = 1.5
 """Largest distance of a track's observations from one surface point [pixels]."""
 
@@ -93,18 +96,19 @@ class Spin:
     angle: Float[Tensor, " t"]
     """By what the object is turned about the axis, before the given pose, to agree with the other frames [radians]; its
     median is 0."""
-    given_correlation: float
-    """Mean correlation of the maps of frames at most `NEAR` apart in time, at the given poses."""
-    correlation: float
+    given_correlation: Float[Tensor, " t"]
+    """Mean correlation of every frame's map with those of frames at most `NEAR` away in time, at the given poses."""
+    correlation: Float[Tensor, " t"]
     """The same after the turn."""
-    static_correlation: float
+    static_correlation: Float[Tensor, " t"]
     """The same if the object is turned so that it does not spin before the camera, as shading does not."""
 
     @property
     def is_better(self) -> bool:
-        """Whether texture, not shading, contradicts the given poses."""
-        others = max(self.given_correlation, self.static_correlation)
-        return self.correlation > MIN_CORRELATION and others < CONTRADICTION * self.correlation
+        """Whether texture, not shading, contradicts the given poses of several frames."""
+        others = torch.maximum(self.given_correlation, self.static_correlation)
+        contradicted = (self.correlation > MIN_CORRELATION) & (others < CONTRADICTION * self.correlation)
+        return int(contradicted.sum()) >= MIN_CONTRADICTED
 
 
 def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
@@ -119,11 +123,9 @@ def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
         return None
     score = _correlations(*_unwrapped(capture, trajectory, surface))
     shift = _best_shifts(score)
-    i, j = torch.triu_indices(len(shift), len(shift), 1)
-    i, j = i[j - i <= NEAR], j[j - i <= NEAR]
     towards_camera = (trajectory.T_cam_obj.inverse().xyz - surface.centre) @ surface.axes.mT
     static = (torch.atan2(towards_camera[:, 1], towards_camera[:, 0]) / (2 * math.pi) * ANGLES).round().long()
-    correlations = [float(score[i, j, (s[j] - s[i]) % ANGLES].mean()) for s in (0 * shift, shift, static)]
+    correlations = [_correlations_near(score, s) for s in (0 * shift, shift, static)]
     return Spin(surface, (shift - shift.median()) * (2 * math.pi / ANGLES), *correlations)
 
 
@@ -198,6 +200,15 @@ def _correlations(contrast: Float[Tensor, "t a z"], weight: Float[Tensor, "t a z
     common = (correlate(energy, w).clamp_min(0) * correlate(w, energy).clamp_min(0)).sqrt()
     typical = common[:, :, 0].diagonal().median()
     return correlate(product, product) / (common + MIN_CONTRAST * typical).clamp_min(1e-6)
+
+
+def _correlations_near(score: Float[Tensor, "t t a"], shift: Int64[Tensor, " t"]) -> Float[Tensor, " t"]:
+    """Mean correlation of every frame with the others at most `NEAR` away in time, for given shifts [cells]."""
+    frames = torch.arange(len(shift))
+    correlation = score[frames[:, None], frames, (shift - shift[:, None]) % ANGLES]
+    apart = (frames - frames[:, None]).abs()
+    near = ((apart > 0) & (apart <= NEAR)).float()
+    return (correlation * near).sum(1) / near.sum(1)
 
 
 def _best_shifts(score: Float[Tensor, "t t a"]) -> Int64[Tensor, " t"]:
