@@ -72,7 +72,7 @@ NO_LOBE = -200.0
 """Logarithmic specular scale of an object without a specular lobe: its exponential is 0, as are all gradients."""
 TRIAL_STEPS = 200
 """Maximum number of steps after which an object with and one without a specular lobe are compared."""
-MIN_EXPLAINED = 0.1
+MIN_EXPLAINED = 0.07
 """Smallest part of the photometric error without a specular lobe that a lobe must explain, or the object has none."""
 BLOCKERS = f"{CACHE}blocker"
 """Name of the blockers of all sets in the state's memory: gigabytes at 100,000 Gaussians, so that no checkpoint has
