@@ -115,7 +115,7 @@ def measure(pixels: int, gaussians: int, frames: int, directions: int) -> Row:
     recipe, row = known_poses(DRAFT), {}
     growth = replace(recipe.refine.densification, max_gaussians=2 * gaussians)
     second = replace(recipe.refine, points=gaussians, densification=growth)
-    third = replace(recipe.decompose, directions=directions, sets=SETS, fit_specular=False)
+    third = replace(recipe.decompose, directions=directions, sets=SETS, try_matte=False)
 
     def hull() -> None:
         cells = visual_hull.carve(capture, trajectory, resolution=second.hull)

@@ -123,7 +123,7 @@ def measure(path: Path) -> dict[str, Any]:
         inputs,
         clock,
         curve,
-        lambda s: _decompose_scores(decompose.absorb_specular_scale(s.params), capture, truth),
+        lambda s: _decompose_scores(decompose.absorbed(s.params), capture, truth),
     )
     parts["decompose"] = _part_seconds(clock, total - seconds)
     return {

@@ -75,7 +75,7 @@ def decompose_given(capture: Capture, truth: Any, refined: refine.Refined, given
     rates = cfg.rates
     if given in ("roughness", "both", "all"):
         rough = float(truth.roughness[truth.foreground].mean())
-        cfg, rates = replace(cfg, roughness=rough), replace(rates, roughness=0.0)
+        cfg, rates = replace(cfg, roughness=rough), replace(rates, roughness=0.0, roughness_shift=0.0)
     if given in ("light", "both", "all"):
         cfg, rates = replace(cfg, rows=ROWS, doublings=0), replace(rates, light=0.0)
     if given in ("geometry", "all"):
@@ -83,15 +83,16 @@ def decompose_given(capture: Capture, truth: Any, refined: refine.Refined, given
     light: Environment = truth.light.resampled(ROWS, 2 * ROWS)
 
     def init(cfg: decompose.Config, inputs: decompose.Inputs, rng: torch.Generator) -> State:
-        state = decompose.init(cfg, inputs, rng)
-        if given in ("light", "both", "all"):
+        lit = given in ("light", "both", "all")
+        state = decompose.init(replace(cfg, try_matte=not lit), inputs, rng)
+        if lit:
             with torch.no_grad():
                 environment, albedo_logits = state.params.environment, state.params.material.albedo_logits
                 # The product of albedo and light stays the same in each channel.
                 albedo = state.params.material.albedo * environment.integral() / light.integral()
                 albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*decompose.ALBEDO_RANGE)))
                 environment.log_radiance.copy_(light.log_radiance)
-            decompose.fit_specular(cfg, inputs, state)
+            decompose.choose_start(cfg, inputs, state)
         return state
 
     stage: Any = SimpleNamespace(**vars(decompose) | {"init": init})

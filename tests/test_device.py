@@ -85,7 +85,7 @@ def stages() -> list[tuple[Any, Any, Any, list[dict[str, float]]]]:
     cfg_2 = dataclasses.replace(recipes.known_poses(RECIPE).refine, points=200, start="sphere")
     refined, of_second = steps(refine, cfg_2, second, 2)
     third = decompose.Inputs(taken, refined)
-    cfg_3 = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, fit_specular=False)
+    cfg_3 = dataclasses.replace(recipes.known_poses(RECIPE).decompose, warmup=1, try_matte=False)
     _, of_third = steps(decompose, cfg_3, third, 2)
     return [(refine, cfg_2, second, of_second), (decompose, cfg_3, third, of_third)]
 
@@ -190,7 +190,7 @@ def test_steps_never_wait_for_the_device_copy_nothing_to_it_and_ask_it_for_littl
 
     assert recorded(refine, cfg, inputs, state) <= 100
     third = decompose.Inputs(inputs.capture, refine.finish(cfg, inputs, state))
-    cfg = dataclasses.replace(recipe.decompose, fit_specular=False, warmup=0)
+    cfg = dataclasses.replace(recipe.decompose, try_matte=False, warmup=0)
     state = decompose.init(cfg, third, torch.Generator().manual_seed(0))
     assert recorded(decompose, cfg, third, state) <= 150
 

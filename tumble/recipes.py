@@ -119,10 +119,12 @@ STANDARD = replace(
         steps=10_000,
         warmup=1_000,
         doublings=3,
-        fit_specular=True,
+        try_matte=True,
         solve_albedo=True,
-        weights=inverse_rendering.decompose.Weights(light=0.005, material=0.02, mask=MASK),
-        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.03, light=0.03, specular_scale=0.03),
+        weights=inverse_rendering.decompose.Weights(light=0.005, material=0.02, mask=MASK, specular=0.0),
+        rates=inverse_rendering.decompose.Rates(
+            albedo=0.02, roughness=0.03, roughness_shift=0.03, light=0.03, specular_scale=0.03
+        ),
     ),
 )
 
@@ -152,10 +154,12 @@ DRAFT = replace(
         warmup=100,
         directions=256,
         doublings=1,
-        fit_specular=True,
+        try_matte=True,
         solve_albedo=True,
-        weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK),
-        rates=inverse_rendering.decompose.Rates(albedo=0.02, roughness=0.05, light=0.05, specular_scale=0.1),
+        weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK, specular=0.0),
+        rates=inverse_rendering.decompose.Rates(
+            albedo=0.02, roughness=0.05, roughness_shift=0.05, light=0.05, specular_scale=0.1
+        ),
     ),
     relight=replace(OURS.relight, brdf_samples=128, light_samples=128),
 )
@@ -259,8 +263,8 @@ def recap(lights: int, recipe: Recipe) -> Recipe:
 
     As in ReCap opacity is a free parameter and there are no shadows and no indirect light.
     """
-    recipe = no_sdf(static_colour(recipe))
-    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False, fit_specular=False)
+    recipe = no_specular_fit(no_sdf(static_colour(recipe)))
+    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False)
     # The light of a block is trained in few of the steps.
     rates = replace(_faster(base.rates, light=4.0), poses=0.0)
     return replace(recipe, decompose=inverse_rendering.separate_lights.Config(replace(base, rates=rates), lights))
@@ -295,14 +299,13 @@ def irgs(recipe: Recipe) -> Recipe:
 
 def _static_method(recipe: Recipe, *, rows: int, **changes: Any) -> Recipe:
     """What SVG-IR and IRGS have in common; their light has `rows` rows from the start."""
-    recipe = no_sdf(static_colour(recipe))
+    recipe = no_specular_fit(no_sdf(static_colour(recipe)))
     stage = _decompose_of(recipe)
     common = {
         "bounce": "average",
         "lobes": "sum",
         "sets": 8,
         "doublings": 0,
-        "fit_specular": False,
         "solve_albedo": False,
     }
     # Differences of neighbouring texels shrink with their distance; this keeps the same smoothness per solid angle.
@@ -319,9 +322,12 @@ def no_albedo_solve(recipe: Recipe) -> Recipe:
 
 
 def no_specular_fit(recipe: Recipe) -> Recipe:
-    """Ablation: roughness and F0 start at the paper's values and are only optimised, without the grid search of
-    `specular_fit`."""
-    return _replace_decompose(recipe, fit_specular=False)
+    """Ablation: no trial whether the object has a specular lobe but a penalty on it, and the roughness of a corner
+    depends only on the pixels that show it."""
+    stage = _decompose_of(recipe)
+    weights = replace(stage.weights, specular=inverse_rendering.decompose.Weights().specular)
+    rates = replace(stage.rates, roughness_shift=0.0)
+    return _replace_decompose(recipe, try_matte=False, roughness=0.4, weights=weights, rates=rates)
 
 
 def progressive_poses(recipe: Recipe) -> Recipe:
@@ -466,7 +472,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "cached-visibility": ("decompose.shadows",),
     "split-sum": ("decompose.lobes",),
     "frame-bounce": ("decompose.bounce",),
-    "specular-grid": ("decompose.fit_specular",),
+    "specular-fit": ("decompose.try_matte", "decompose.rates.roughness_shift"),
     "albedo-solve": ("decompose.solve_albedo",),
 }
 """Our departures from the paper, in the order of the ladder: by name, the settings that are ours from there on."""

@@ -121,8 +121,8 @@ def _read_checkpoint(path: Path) -> Snapshot:
         colours = {"albedo": srgb_from_linear(torch.sigmoid(params["points.albedo_logits"]))} | _normals(gaussians)
         return Snapshot(f"stage 2, step {step}", gaussians, gamma, None, colours)
     material, environment = Material(**parts["material"]), Environment(**parts["environment"])
-    trained = decompose.Params(gaussians, gamma, material, environment, params["poses"], params["log_specular_scale"])
-    ended = decompose.absorb_specular_scale(trained)
+    of_object = (params["poses"], params["log_specular_scale"], params["roughness_shift"])
+    ended = decompose.absorbed(decompose.Params(gaussians, gamma, material, environment, *of_object))
     colours = _maps(gaussians, ended.material)
     return Snapshot(f"stage 3, step {step}", gaussians, gamma, None, colours, environment=ended.environment)
 

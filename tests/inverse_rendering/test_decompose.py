@@ -24,7 +24,8 @@ def params(log_specular_scale: Tensor) -> decompose.Params:
     gaussians = sphere(20)
     material = Material.constant(20, torch.tensor([0.6, 0.3, 0.05]), 0.5)
     light = Environment.from_radiance(torch.tensor([1.0, 2.0, 0.5]).expand(8, 16, 3))
-    return decompose.Params(gaussians, torch.tensor(30.0), material, light, torch.zeros(1, 6), log_specular_scale)
+    no_pose, no_shift = torch.zeros(1, 6), torch.zeros(())
+    return decompose.Params(gaussians, torch.tensor(30.0), material, light, no_pose, log_specular_scale, no_shift)
 
 
 def colours(p: decompose.Params) -> tuple[Tensor, Tensor]:
@@ -36,7 +37,7 @@ def colours(p: decompose.Params) -> tuple[Tensor, Tensor]:
 def test_the_colour_of_the_specular_scale_moves_into_the_light() -> None:
     """The specular lobe becomes grey under a light that is 3 times as bright in green and 1.5 times in red."""
     before = params(torch.tensor([1.5, 3.0, 0.5]).log())
-    after = decompose.absorb_specular_scale(before)
+    after = decompose.absorbed(before)
     for old, new in zip(colours(before), colours(after), strict=True):
         torch.testing.assert_close(new, old, rtol=1e-5, atol=0)
     assert after.material.f0.item() == pytest.approx(DIELECTRIC)
@@ -45,7 +46,7 @@ def test_the_colour_of_the_specular_scale_moves_into_the_light() -> None:
 
 def test_an_object_without_a_specular_lobe_keeps_an_albedo_below_one() -> None:
     before = params(torch.full((3,), math.log(0.01)))
-    after = decompose.absorb_specular_scale(before)
+    after = decompose.absorbed(before)
     torch.testing.assert_close(colours(after)[0], colours(before)[0], rtol=1e-5, atol=0)
     # The lobe is too faint for its colour to be used: still 0.6, 0.3, 0.05, scaled to the largest allowed albedo.
     torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.9, 0.45, 0.075]), rtol=1e-5, atol=0)
@@ -86,7 +87,7 @@ def test_checkpoints_have_no_blockers_which_are_computed_again_from_the_traced_g
     recipe = recipes.known_poses(recipes.SMOKE)
     start = refine.init(recipe.refine, second, generator)
     inputs = decompose.Inputs(taken, refine.finish(recipe.refine, second, start))
-    cfg = replace(recipe.decompose, fit_specular=False)
+    cfg = replace(recipe.decompose, try_matte=False)
     state = decompose.init(cfg, inputs, generator)
     loop._save(state, tmp_path / "checkpoint", "", 0.0)
     names = {name.rpartition("/")[2] for name in loop._read(tmp_path / "checkpoint")[1]}

@@ -22,7 +22,7 @@ BASE = replace(
     pixels=128,
     visibility=False,
     bounce="none",
-    fit_specular=False,
+    try_matte=False,
 )
 
 

@@ -1,9 +1,10 @@
-"""Grid search of the specular lobe: right on images by Mitsuba, robust to outliers, None if not determined."""
+"""Specular scale by least squares, and the roughness of the object by gradient descent."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.learning.scene import CAPTURE
 from tests.learning.true_asset import true_asset
@@ -11,101 +12,70 @@ from tumble.datasets import folder
 from tumble.inverse_rendering import decompose, specular_fit
 from tumble.inverse_rendering.refine import Refined
 from tumble.inverse_rendering.sh_lighting import SHLight
-from tumble.inverse_rendering.specular_fit import Samples, SpecularFit
+from tumble.inverse_rendering.specular_fit import Samples
 from tumble.recipes import DRAFT
-from tumble.rendering import gbuffer
-from tumble.scene.capture import OBJECT, UNKNOWN
+from tumble.rendering import render_gbuffer
+from tumble.scene import OBJECT, UNKNOWN
 
 
-def fit(samples: Samples, n: int) -> SpecularFit:
-    best = specular_fit.fit(samples, n, 0, 0.5)
-    assert best is not None
-    return best
-
-
-def synthetic_samples(scale: float, *, true: int = 1, dark: float = 0.0, n: int = 200, per: int = 20) -> Samples:
-    """Pixels of Gaussians with random albedos, a fraction `dark` of them black, under random light.
-
-    There are candidate lobes of three widths, of which number `true` is the true one; wider lobes have lower peaks.
-    """
-    rng = torch.Generator().manual_seed(0)
-    albedo = torch.rand(n, 3, generator=rng) * 0.6 * (torch.rand(n, 1, generator=rng) >= dark)
-    gaussian = torch.arange(n).repeat_interleave(per)
-    diffuse = 0.3 + 0.4 * torch.rand(n * per, 3, generator=rng)
-    off = torch.rand(n * per, 1, generator=rng)
-    specular = torch.stack(
-        [0.05 / width * torch.exp(-((off / width) ** 2)) * torch.ones(3) for width in (0.3, 0.5, 0.8)]
-    )
-    return Samples(gaussian, diffuse, specular, albedo[gaussian] * diffuse + scale * specular[true])
-
-
-@pytest.mark.parametrize(("glossy", "near"), [(True, {0.3, 0.4}), (False, {0.6})])
-def test_the_roughness_of_mitsubas_images_is_found(glossy: bool, near: set[float]) -> None:
-    """The figure of `tests.learning` with its true shape and light, from roughness 0.5. Its body has 0.25, the rest 0.7
-    and only one of the two is shown to the fit. The grid goes from 0.3 to 0.6. Seen: 0.3 and 0.6."""
+@pytest.mark.parametrize(("glossy", "true"), [(True, 0.25), (False, 0.7)])
+def test_the_roughness_of_mitsubas_images_is_found(glossy: bool, true: float) -> None:
+    """The figure of `tests.learning` with its true shape, albedo and light, from roughness 0.5 in few steps. Its body
+    has 0.25, the rest 0.7, and only one of the two is shown. Seen: 0.37 and 0.59."""
     asset, taken = true_asset(2500), folder.load(CAPTURE)
     assert taken.trajectory is not None
     masks = []
     for i in range(len(taken)):
-        roughness = gbuffer.render_gbuffer(asset, taken.trajectory.T_cam_obj[i], taken.camera).features["roughness"]
+        roughness = render_gbuffer(asset, taken.trajectory.T_cam_obj[i], taken.camera).features["roughness"]
         shown = (roughness[..., 0] < 0.4) if glossy else (roughness[..., 0] > 0.55)
         masks.append(torch.where(shown & (taken.masks[i] == OBJECT), OBJECT, UNKNOWN).to(torch.uint8))
     capture = replace(taken, masks=torch.stack(masks))
-    albedo, light = torch.full_like(asset.gaussians.means, 0.5), SHLight.constant(0.4, asset.gamma)
+    albedo, light = asset.material.albedo.mean(1), SHLight.constant(0.4, asset.gamma)
     refined = Refined(asset.gaussians, asset.gamma, albedo, light, taken.trajectory)
-    cfg = replace(DRAFT.decompose, fit_specular=False, roughness=0.5, pixels=512, sets=2)
+    rates = replace(DRAFT.decompose.rates, light=0.0)
+    brightest = float(albedo.amax(-1).quantile(0.95))
+    cfg = replace(DRAFT.decompose, try_matte=False, steps=150, warmup=150, pixels=512, sets=2, rates=rates)
+    cfg = replace(cfg, initial_albedo=brightest)  # as true as the light
     inputs = decompose.Inputs(capture, refined)
     state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
     state.params = replace(state.params, environment=asset.environment)
-    decompose.fit_specular(cfg, inputs, state)
-    found = state.params.material.roughness.detach().unique()
-    assert {round(x, 3) for x in found.tolist()} <= near
+    for state.step in range(cfg.steps):
+        decompose.step(cfg, inputs, state)
+    found = float(decompose.absorbed(state.params).material.roughness.detach().mean())
+    assert abs(found - true) < 0.15, found
 
 
-def test_a_tenth_of_outliers_hardly_affects_the_fit() -> None:
-    samples = synthetic_samples(1.0)
+def random_samples(scale: float, dark: float = 0.0, n: int = 200, per: int = 20) -> tuple[Samples, Tensor]:
+    """Pixels of `n` Gaussians of random albedos, a part `dark` of them black, and how bright their lobes are."""
+    rng = torch.Generator().manual_seed(0)
+    albedo = torch.rand(n, 3, generator=rng) * 0.6 * (torch.rand(n, 1, generator=rng) >= dark)
+    gaussian = torch.arange(n).repeat_interleave(per)[torch.randperm(n * per, generator=rng)]
+    ratio = 0.1 + 0.4 * torch.rand(n, 1, generator=rng)
+    diffuse, glint = 0.3 + 0.4 * torch.rand(n * per, 3, generator=rng), torch.rand(n * per, 1, generator=rng)
+    specular = ratio[gaussian] * diffuse * (0.5 + glint)
+    return Samples(gaussian, diffuse, specular, albedo[gaussian] * diffuse + scale * specular), ratio
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.7])
+def test_the_scale_is_found_in_spite_of_a_tenth_of_outliers(scale: float) -> None:
+    samples, _ = random_samples(scale)
     outlier = torch.rand(len(samples.gaussian), generator=torch.Generator().manual_seed(1)) < 0.1
     samples.photo[outlier] *= 0.3
-    found = fit(samples, 200)
-    assert found.roughness_index == 1
-    assert abs(found.specular_scale - 1.0) < 0.11  # a step of the grid
+    assert specular_fit.fit(samples, 200).specular_scale == pytest.approx(scale, rel=0.03)
 
 
-def test_noise_on_dark_texture_does_not_bias_the_scale() -> None:
-    """Half of the surface is black, and the noise is multiplicative: non-negative albedos would give a scale of 0.9."""
-    samples = synthetic_samples(1.0, dark=0.5)
-    noise = 1 + 0.3 * torch.randn(samples.photo.shape, generator=torch.Generator().manual_seed(2))
-    noisy = Samples(samples.gaussian, samples.diffuse, samples.specular, samples.photo * noise.clamp(0.2))
-    assert abs(fit(noisy, 200).specular_scale - 1.0) < 0.06
+def test_noise_on_dark_texture_hardly_biases_the_scale() -> None:
+    """Half of the surface is black, and the noise is multiplicative."""
+    samples, _ = random_samples(1.0, dark=0.5)
+    noise = 1 + 0.2 * torch.randn(samples.photo.shape, generator=torch.Generator().manual_seed(2))
+    noisy = replace(samples, photo=samples.photo * noise.clamp(0.2))
+    assert specular_fit.fit(noisy, 200).specular_scale == pytest.approx(1, abs=0.08)
 
 
-def test_a_specular_lobe_proportional_to_the_diffuse_lobe_is_rejected() -> None:
-    samples = synthetic_samples(1.0)
-    proportional = Samples(samples.gaussian, samples.diffuse, 0.2 * samples.diffuse[None], samples.photo)
-    assert specular_fit.fit(proportional, 200, 0, 0.5) is None
-
-
-def test_an_optimum_at_the_end_of_the_grid_is_rejected() -> None:
-    assert specular_fit.fit(synthetic_samples(3.0), 200, 0, 0.5) is None
-
-
-def test_a_small_improvement_is_rejected() -> None:
-    samples = synthetic_samples(1.0)
-    noise = 1 + 0.1 * torch.randn(samples.photo.shape, generator=torch.Generator().manual_seed(2))
-    noisy = Samples(samples.gaussian, samples.diffuse, samples.specular, samples.photo * noise)
-    assert specular_fit.fit(noisy, 200, 1, 1.05) is None
-    found = specular_fit.fit(noisy, 200, 1, 0.5)
-    assert found is not None
-    assert found.roughness_index == 1
-
-
-def test_albedo_per_scale_preserves_the_radiance_of_the_pixels() -> None:
-    """For nearly proportional lobes, an exchange of one for the other hardly changes the pixels."""
-    samples = synthetic_samples(1.0)
-    specular = 0.2 * samples.diffuse * (1 + 0.3 * (torch.arange(len(samples.gaussian)) % 2 - 0.5))[:, None]
-    photo = 0.4 * samples.diffuse + specular
-    both = Samples(samples.gaussian, samples.diffuse, torch.stack([specular, 2 * specular]), photo)
-    found = fit(both, 201).albedo_per_scale
-    torch.testing.assert_close(found[0, :200].mean(0), torch.full((3,), 0.2), atol=0.02, rtol=0)
-    torch.testing.assert_close(found[1], 2 * found[0])
-    assert (found[:, 200] == 0).all(), "no pixel shows the last Gaussian"
+def test_albedo_per_scale_is_the_mean_ratio_of_the_lobes() -> None:
+    """Their ratio in a pixel is 0.5 to 1.5 times that of the Gaussian."""
+    samples, ratio = random_samples(1.0)
+    samples.photo[samples.gaussian == 3] = 1.0  # clipped
+    found = specular_fit.fit(samples, 201).albedo_per_scale
+    assert ((found[:200] / ratio)[ratio[:, 0] != ratio[3, 0]] - 1).abs().mean() < 0.1
+    assert (found[[3, 200]] == 0).all(), "no usable pixel shows them"

@@ -14,7 +14,7 @@ from tumble.inverse_rendering.decompose import Inputs
 
 SMOKE = recipes.known_poses(recipes.SMOKE)
 SECOND = replace(SMOKE.refine, steps=60, rates=replace(SMOKE.refine.rates, light=0.05))
-THIRD = replace(SMOKE.decompose, steps=60, warmup=61, pixels=128, fit_specular=False, visibility=False, bounce="none")
+THIRD = replace(SMOKE.decompose, steps=60, warmup=61, pixels=128, try_matte=False, visibility=False, bounce="none")
 
 
 def without_turns(inputs: Inputs) -> Inputs:

@@ -57,7 +57,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 18
+VERSION = 19
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -65,9 +65,15 @@ PENALTY_SCALE = 0.2
 ALBEDO_RANGE = (0.003, 0.98)
 """Range of the initial albedo. The lower limit is that of saturated colours: logits would need long to reach it."""
 FIT_FRAMES = 64
-"""Maximum number of frames in the grid search of the specular lobe."""
+"""Maximum number of frames by which albedos are fitted before the first step (`specular_fit`)."""
 FIT_PIXELS = 2
-"""Pixels per frame in the grid search of the specular lobe, as a multiple of the pixels of a step."""
+"""Pixels per frame in this fit, as a multiple of the pixels of a step."""
+NO_LOBE = -200.0
+"""Logarithmic specular scale of an object without a specular lobe: its exponential is 0, as are all gradients."""
+TRIAL_STEPS = 200
+"""Maximum number of steps after which an object with and one without a specular lobe are compared."""
+MIN_EXPLAINED = 0.07
+"""Smallest part of the photometric error without a specular lobe that a lobe must explain, or the object has none."""
 BLOCKERS = f"{CACHE}blocker"
 """Name of the blockers of all sets in the state's memory: gigabytes at 100,000 Gaussians, so that no checkpoint has
 them."""
@@ -87,8 +93,8 @@ class Weights:
     """Weight of the silhouette term, as in stage 2. Without it, dark grooves become translucent while geometry is
     optimised."""
     specular: float = 0.01
-    """Weight of the penalty on the specular lobe, which hardly depends on the lobe's scale. It keeps a Lambertian
-    object from a lobe that compensates for errors of the light, and is 0 if the grid search has found a lobe."""
+    """Weight of the penalty on the specular lobe, which hardly depends on the lobe's scale. Without a trial
+    (`Config.try_matte`) it keeps a Lambertian object from a lobe that compensates for errors of the light."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,8 @@ class Rates:
     """Learning rate of the albedo logits."""
     roughness: float = 0.025
     """Learning rate of the roughness logits."""
+    roughness_shift: float = 0.0
+    """Learning rate of the common shift of all roughness logits; the paper has none."""
     normal: float = 1e-3
     """Learning rate of the normal offsets."""
     specular_scale: float = 0.0
@@ -138,10 +146,10 @@ class Config:
     """Initial number of rows of the environment map (appendix A)."""
     doublings: int = 6
     """How often the environment map's resolution is doubled, at even intervals (appendix A: up to 1024 rows)."""
-    roughness: float = 0.4
-    """Initial roughness. It is only weakly determined: a narrower lobe under a blurrier light fits nearly as well."""
-    fit_specular: bool = False
-    """Whether roughness and specular scale are initialised by a grid search (`specular_fit.fit`)."""
+    roughness: float = 0.5
+    """Initial roughness: that of the lobe in stage 2 (`sh_lighting.GLOSSY_FALLOFF`), for which its light is made."""
+    try_matte: bool = False
+    """Whether a trial before the first step decides if the object has a specular lobe (`choose_start`)."""
     initial_albedo: float = 0.8
     """95 % quantile of the initial albedo. The factor goes into the light, since stage 2 determines only the product of
     albedo and light."""
@@ -184,6 +192,9 @@ class Params:
     """Natural logarithm of the specular lobe's scale per channel. The diffuse lobe determines only the product of
     albedo and light; the specular lobe depends on the light alone and so resolves the ambiguity. As one parameter per
     channel it converges faster than the texels of the light would."""
+    roughness_shift: Float[Tensor, ""]
+    """Added to all roughness logits: the roughness of the object. Every pixel contributes to its gradient, so it moves
+    at once, while the logits of a corner, which few pixels show, hardly leave their start."""
     pose_network: dict[str, Tensor] = field(default_factory=dict)
     """Network that predicts the tangents of the poses (`pose_network`); empty if there is none."""
 
@@ -218,29 +229,63 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         environment=Environment.from_radiance(light.radiance / factor),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
         log_specular_scale=(scale if cfg.rates.specular_scale else torch.zeros_like(scale)).repeat(3),
+        roughness_shift=torch.zeros_like(scale),
         pose_network=_first_network(cfg, refined, rng),
     )
     params = optim.leaves(params)
     sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
-    memory = {
-        "directions": torch.stack(sets),
-        "specular_penalty": cfg.weights.specular * torch.ones_like(params.gamma),
-    }
-    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, memory)
+    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, {"directions": torch.stack(sets)})
     _trace_visibility(cfg, inputs, state)
-    if cfg.fit_specular and refined.light.log_specular_scale.exp() > specular_fit.MIN_REFINED_SCALE:
-        fit_specular(cfg, inputs, state)
+    if cfg.try_matte:
+        choose_start(cfg, inputs, state)
     return state
 
 
-@torch.no_grad()
-def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Set roughness, specular scale and albedos to the best fit under the current light, and remove the penalty.
+def choose_start(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Start with or without a specular lobe, whichever explains the frames better after some steps of both.
 
-    Leaves the state unchanged if no fit is clearly better than the current one (`specular_fit.fit`).
+    Albedos make up for a change of the lobe, so that neither is ahead, and both take the same steps with their own
+    light. A lobe that explains less than `MIN_EXPLAINED` of the error compensates for errors of light and shape. One
+    that is brighter than that of a dielectric and than in stage 2 would compensate for them, too.
     """
+    params = state.params
+    before = params.log_specular_scale.detach().exp()
+    fitted = specular_fit.fit(_samples(cfg, inputs, state), len(params.gaussians.means))
+    scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
+    glossy = _start(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
+    matte = _start(params, before * fitted.albedo_per_scale, NO_LOBE)
+    has_lobe = _trial_error(cfg, inputs, state, glossy) < (1 - MIN_EXPLAINED) * _trial_error(cfg, inputs, state, matte)
+    chosen = glossy if has_lobe else matte
+    with torch.no_grad():
+        params.material.albedo_logits.copy_(chosen.material.albedo_logits)
+        params.log_specular_scale.copy_(chosen.log_specular_scale)
+
+
+@torch.no_grad()
+def _start(params: Params, brighter: Float[Tensor, "n 3"], log_scale: float) -> Params:
+    """The parameters with brighter albedos and another scale of the specular lobe."""
+    albedo = (params.material.albedo + brighter[:, None]).clamp(*ALBEDO_RANGE)
+    material = replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo))
+    return replace(params, material=material, log_specular_scale=torch.full_like(params.log_specular_scale, log_scale))
+
+
+def _trial_error(cfg: Config, inputs: Inputs, state: State, start: Params) -> float:
+    """Mean photometric term in the second half of a trial, which leaves the state as it is."""
+    steps = min(cfg.steps, TRIAL_STEPS)
+    cfg = replace(cfg, warmup=steps, doublings=0)
+    params, rng = optim.leaves(start), torch.Generator()
+    rng.set_state(state.rng.get_state())
+    trial = State(0, params, optim.adam(params, learning_rates(cfg)), rng, dict(state.memory))
+    errors = []
+    for trial.step in range(steps):
+        errors.append(step(cfg, inputs, trial)["render"])
+    return float(torch.stack(errors[steps // 2 :]).mean())
+
+
+@torch.no_grad()
+def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
+    """Pixels of the object in several frames with both lobes under the current light."""
     params, capture, parts = state.params, inputs.capture, []
-    roughnesses = sorted({cfg.roughness, *specular_fit.ROUGHNESSES})
     bounce, light = _bounce(cfg, state, params, corner_features(params.material)[1]), prefilter(params.environment)
     for frame in range(0, len(capture), -(-len(capture) // FIT_FRAMES)):
         T_cam_obj = pose(params, inputs, frame)
@@ -250,26 +295,11 @@ def fit_specular(cfg: Config, inputs: Inputs, state: State) -> None:
         pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view.alpha, inner > 0.5, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels[pixels >= 0])
         R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
-        gaussian, like = _dominant_gaussian(view, points), points.normals[:, :1]
+        gaussian, rough = _dominant_gaussian(view, points), torch.full_like(points.normals[:, :1], cfg.roughness)
         visible = _pixel_visibility(cfg, state, params, points, gaussian)
-        rough = [torch.full_like(like, r) for r in roughnesses]
-        lobes = [split_lobes(points, r, light, R_env_obj, visible, bounce=bounce) for r in rough]
-        specular = DIELECTRIC * torch.stack([specular for _, specular in lobes])
-        parts.append((gaussian, lobes[0][0], specular, points.sample(truth.image)))
-    gaussian, diffuse, specular, photo = zip(*parts, strict=True)
-    samples = (torch.cat(gaussian), torch.cat(diffuse), torch.cat(specular, 1), linear_from_srgb(torch.cat(photo)))
-    scale, initial, n = params.log_specular_scale.exp(), roughnesses.index(cfg.roughness), len(params.gaussians.means)
-    best = specular_fit.fit(specular_fit.Samples(*samples), n, initial, float(scale.mean()))
-    if best is None:
-        return
-    before = scale * best.albedo_per_scale[initial]
-    after = best.albedo_per_scale[best.roughness_index]
-    albedo = params.material.albedo + (before - best.specular_scale * after)[:, None]
-    roughness = torch.tensor(roughnesses[best.roughness_index])
-    params.material.albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*ALBEDO_RANGE)))
-    params.material.roughness_logits.fill_(TEMPERATURE * torch.logit(roughness))
-    params.log_specular_scale.fill_(math.log(best.specular_scale))
-    state.memory["specular_penalty"] = torch.zeros_like(params.gamma)
+        diffuse, specular = split_lobes(points, rough, light, R_env_obj, visible, bounce=bounce)
+        parts.append((gaussian, diffuse, DIELECTRIC * specular, linear_from_srgb(points.sample(truth.image))))
+    return specular_fit.Samples(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
 
 def _learns_network(cfg: Config) -> bool:
@@ -297,6 +327,7 @@ def learning_rates(cfg: Config) -> dict[str, float]:
     return {
         "material.albedo_logits": rates.albedo,
         "material.roughness_logits": rates.roughness,
+        "roughness_shift": rates.roughness_shift,
         "material.normal_offset": rates.normal,
         "material.f0_logit": 0.0,
         "environment": rates.light,
@@ -371,6 +402,12 @@ def without_corners(params: Params) -> Params:
     return replace(params, material=material)
 
 
+def shifted_material(params: Params) -> Material:
+    """The material with the common shift of its roughness, which an object without a specular lobe does not have."""
+    material, has_lobe = params.material, (params.log_specular_scale.detach() > NO_LOBE).any()
+    return replace(material, roughness_logits=material.roughness_logits + has_lobe * params.roughness_shift)
+
+
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """One optimisation step on random pixels of a random frame; the weighted loss terms."""
@@ -384,7 +421,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         params = replace(params, **fixed, pose_network={})
     frame = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, frame)
-    corners, mean_albedo = corner_features((params if cfg.corners else without_corners(params)).material)
+    corners, mean_albedo = corner_features(shifted_material(params if cfg.corners else without_corners(params)))
     view = rasterize_material(params, corners, T_cam_obj, capture.camera)
     photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
     shown = _Shown(
@@ -400,8 +437,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         "light": cfg.weights.light * _light_smoothness(cfg, params.environment),
         "mask": cfg.weights.mask * of_view["mask"],
         "material": cfg.weights.material * of_view["material"],
-        "specular": state.memory["specular_penalty"]
-        * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
+        "specular": cfg.weights.specular * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
     }
     decayed = cfg.rates.decay ** (state.step / cfg.steps)
     later = decayed * (state.step >= cfg.warmup)
@@ -530,17 +566,21 @@ def _upsample_light(cfg: Config, state: State) -> None:
     state.params = replace(state.params, environment=environment)
 
 
-def absorb_specular_scale(params: Params) -> Params:
-    """Equivalent parameters with a specular scale of 1, see `specular_fit.absorb_specular_scale`."""
-    material, log_gain = specular_fit.absorb_specular_scale(params.material, params.log_specular_scale)
+def absorbed(params: Params) -> Params:
+    """Equivalent parameters without shift of the roughness and with a specular scale of 1.
+
+    See `specular_fit.absorb_specular_scale`.
+    """
+    material, log_gain = specular_fit.absorb_specular_scale(shifted_material(params), params.log_specular_scale)
     environment = Environment(params.environment.log_radiance + log_gain)
-    return replace(params, material=material, environment=environment, log_specular_scale=torch.zeros_like(log_gain))
+    none = {"log_specular_scale": torch.zeros_like(log_gain), "roughness_shift": torch.zeros_like(params.gamma)}
+    return replace(params, material=material, environment=environment, **none)
 
 
 @torch.no_grad()
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable asset."""
-    params = absorb_specular_scale(state.params if cfg.corners else without_corners(state.params))
+    params = absorbed(state.params if cfg.corners else without_corners(state.params))
     T_cam_obj = _correction(params, inputs, slice(None)) @ inputs.refined.trajectory.T_cam_obj
     return Asset(
         gaussians=params.gaussians,
