@@ -192,7 +192,7 @@ def test_steps_never_wait_for_the_device_copy_nothing_to_it_and_ask_it_for_littl
     third = decompose.Inputs(inputs.capture, refine.finish(cfg, inputs, state))
     cfg = dataclasses.replace(recipe.decompose, try_matte=False, warmup=0)
     state = decompose.init(cfg, third, torch.Generator().manual_seed(0))
-    assert recorded(decompose, cfg, third, state) <= 150
+    assert recorded(decompose, cfg, third, state) <= 155
 
 
 def test_a_gradient_on_a_device_that_is_not_finite_changes_nothing_and_is_named_later(gpu: SimulatedGpu) -> None:
