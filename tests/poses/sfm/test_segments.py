@@ -73,6 +73,31 @@ def test_segments_before_and_after_a_change_of_grip_are_joined(scene: Tumble, po
     assert scores["rotation_below_5_percent"] == 100
 
 
+def test_features_of_the_hand_pose_only_what_features_of_the_object_left(
+    scene: Tumble, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two parts that nothing joins: the second pass, whose features a change of grip misleads, leaves both alone."""
+    T = scene.T_cam_obj
+
+    def part(first: int, end: int) -> Partial:
+        frames = list(range(first, end))
+        return Partial(tuple(frames), T.rotation.matrix()[frames].double(), T.xyz[frames].double())
+
+    found = [[part(0, 9), part(18, 24)], []]
+    asked: list[set[int]] = []
+
+    def wanted_frames(observed: object, R: torch.Tensor, wanted: torch.Tensor, rng: object) -> list[Partial]:
+        asked.append(set(torch.nonzero(wanted)[:, 0].tolist()))
+        return found[len(asked) - 1]
+
+    monkeypatch.setattr(segments, "_segments", wanted_frames)
+    monkeypatch.setattr(segments, "join", lambda observed, parts, known: parts)
+    monkeypatch.setattr(segments, "grow", lambda observed, grown: grown)
+    R = T.rotation.matrix().double()
+    segments.segmented_poses(QUICK, inputs, list(inputs.matches), R, torch.Generator().manual_seed(0))
+    assert asked == [set(range(N)), set(range(9, 18)) | set(range(24, N))]
+
+
 def test_frames_without_a_pose_are_lost_and_stay_out_of_the_adjustment(posed: tuple) -> None:
     part, inputs = posed
     state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))

@@ -6,8 +6,8 @@ mirror image explains the observations worse and neighbouring windows agree. Run
 poses are adjusted on their own. Matches between frames far apart in time then join segments that show the same side,
 and add the frames between them. Frames that nothing confirms get no pose.
 
-This is done twice: with features of which at least one frame shows that they lie on the object, then, for what remains,
-with all features of the object and the hand, which moves with the object while its grip lasts.
+This is done twice: with features of which at least one frame shows that they lie on the object, then, for frames that
+are in none of these segments, with all features of the object and the hand, which moves with it while its grip lasts.
 """
 
 import math
@@ -77,7 +77,7 @@ def segmented_poses(
     for tracks in (inputs.tracks, tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)):
         observed = sure if tracks is inputs.tracks else _observed(cfg, inputs, tracks, wide)
         posed = torch.zeros(len(R), dtype=torch.bool)
-        posed[list(parts[0].frames) if parts else []] = True
+        posed[[frame for part in parts for frame in part.frames]] = True
         if int((~posed).sum()) < MIN_NEW_FRAMES:
             break
         parts = join(sure, [*parts, *_segments(observed, R, ~posed, rng)], known)
