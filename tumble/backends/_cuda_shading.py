@@ -9,7 +9,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from tumble.backends import Lobes, SampledView, ShadingLight, reference
-from tumble.backends._cuda_terms import by_pixel, gradient_buffer, scaled
+from tumble.backends._cuda_terms import by_pixel, gradient_buffer, scaled, split_by_name
 
 
 def shade(
@@ -187,12 +187,11 @@ def _arrays(p: int, d: int, n: int, like: Tensor) -> dict[str, Tensor]:
 
     sums = {"lobes": (p, 8), "v_points": (p, 7), "v_light": (d + p, 3), "v_bounced": (n, 3)}
     sums |= {"coefficients": (1, COEFFICIENTS), "v_coefficients": (1, COEFFICIENTS)}
-    flat = like.new_zeros(sum(a * b for a, b in sums.values())).split([a * b for a, b in sums.values()])
+    arrays = split_by_name(like.new_zeros(sum(a * b for a, b in sums.values())), sums)
     others = {name: (p, 3) for name in ("normal", "view", "v_diffuse", "v_specular")}
     others |= {"roughness": (p,), "v_own": (p, 2), "bounced": (n, 3)}
-    others |= {"looked": (d + p, 3), "light": (d + p, 3), "v_looked": (d + p, 3), "levels": (d + p,)}
-    others |= {"v_levels": (d + p,)}
-    arrays = {name: part.view(shape) for (name, shape), part in zip(sums.items(), flat, strict=True)}
+    others |= {"looked": (d + p, 3), "light": (d + p, 3), "v_looked": (d + p, 3)}
+    others |= {"levels": (d + p,), "v_levels": (d + p,)}
     arrays |= {name: like.new_empty(shape) for name, shape in others.items()}
     return arrays | {"rows": torch.empty(p, dtype=torch.int64, device=like.device)}
 

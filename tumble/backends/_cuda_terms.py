@@ -3,7 +3,8 @@
 A kernel that adds to a result needs whole warps of threads and a result of zeros.
 """
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -260,11 +261,12 @@ def gradient_buffer(
     whole = inputs[order[0]].new_empty(n_sums + sum(x.numel() for x in inputs.values()))
     whole[: n_sums + n_zeros].zero_()
     kept = whole[n_sums:]
-    return whole[:n_sums], kept, _parts(kept, ctx.shapes)
+    return whole[:n_sums], kept, split_by_name(kept, ctx.shapes)
 
 
-def _parts(kept: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
-    parts = kept.split([shape.numel() for shape in shapes.values()])
+def split_by_name(flat: Tensor, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    """Views of consecutive parts of a one-dimensional tensor, with these shapes."""
+    parts = flat.split([math.prod(shape) for shape in shapes.values()])
     return {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
 
 
@@ -277,7 +279,7 @@ def scaled(ctx: Any, v_terms: Tensor) -> tuple[Tensor | None, ...]:
     terms = [ctx.of_term[name] for name in ctx.shapes]
     with runtime.stream(kept.device):
         runtime.launch(image_losses.scale, len(kept), kept, ends, terms, v_terms.contiguous(), out)
-    gradients = _parts(out, ctx.shapes)
+    gradients = split_by_name(out, ctx.shapes)
     return *(gradients[name] for name in ctx.order), *[None] * (len(ctx.needs_input_grad) - len(ctx.order))
 
 
