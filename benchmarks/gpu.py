@@ -186,7 +186,7 @@ def kernel_times(plan: Plan, row: Row) -> None:
     sizes = [(1000, 64)] if plan.dry else SIZES
     where: Row = {"device": plan.device}
     rows = row["rows"] = kernels.measure(backends.load(fast), fast, 1, sizes, **where)
-    rows += kernels.image_loss_rows(backends.load(fast), fast, 1, **where)
+    rows += kernels.step_rows(backends.load(fast), fast, 1, **where)
     # Plain torch stores every pair of a pixel and a nearby Gaussian, hence the single size.
     reference = backends.load("reference")
     one = [(1000, 64)] if plan.dry else [(10_000, 256)]
@@ -194,7 +194,7 @@ def kernel_times(plan: Plan, row: Row) -> None:
     rows += kernels.shade_rows(reference, "reference", 1, **where)
     threads = os.cpu_count() or 1
     rows += kernels.measure(backends.load("cpu"), "cpu", threads, sizes)
-    rows += kernels.image_loss_rows(backends.load("cpu"), "cpu", threads)
+    rows += kernels.step_rows(backends.load("cpu"), "cpu", threads)
 
 
 def draft(plan: Plan, row: Row) -> None:

@@ -1,7 +1,8 @@
-"""Speed of the CPU kernels on a closed shell of Gaussians that fits the image, compared with the reference backend.
+"""Speed of the CPU kernels, mostly on a closed shell of Gaussians that fits the image.
 
-`python -m benchmarks.kernels` prints a table of medians and writes `benchmarks/kernels.json`. A single thread is timed
-by its processor time, which other work on the machine hardly affects; several threads by the wall clock.
+`python -m benchmarks.kernels` prints a table of medians, beside a few of the reference backend, and writes
+`benchmarks/kernels.json`. A single thread is timed by its processor time, which other work on the machine hardly
+affects; several threads by the wall clock.
 """
 
 import argparse
@@ -30,6 +31,8 @@ FEATURES = 16
 """Feature channels of the larger of the two rasterization cases."""
 DIRECTIONS = 256
 """Directions of the visibility and shading cases."""
+GAUSSIANS = 16_000
+"""Gaussians of the kernels of a step, as in DRAFT."""
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (50_000, 128), (50_000, 256), (50_000, 512)]
 """Rasterization cases: number of Gaussians, and image width [pixels]."""
 
@@ -44,7 +47,7 @@ def main() -> None:
     for threads in arguments.threads:
         torch.set_num_threads(threads)
         rows += measure(backends.load("cpu"), "cpu", threads, SIZES)
-        rows += image_loss_rows(backends.load("cpu"), "cpu", threads)
+        rows += step_rows(backends.load("cpu"), "cpu", threads)
     machine_info = machine()  # Peak memory is read before the reference runs, which needs gigabytes.
     if not arguments.no_reference:
         torch.set_num_threads(1)
@@ -150,20 +153,112 @@ def shade_rows(backend: Backend, name: str, threads: int, *, device: torch.devic
     ]
 
 
-def image_loss_rows(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
-    """Milliseconds of the image terms of stage 2 and their gradients."""
+def step_rows(backend: Backend, name: str, threads: int, *, device: torch.device = CPU) -> list[dict[str, Any]]:
+    """Milliseconds of the other kernels of a step of stages 2 and 3, and of their gradients where they have any."""
     rows = []
-    for size in (128, 256):
-        images = [torch.rand(size, size, *more, device=device).requires_grad_() for more in ((3,), (), (), (), (3,))]
-        photo = torch.randint(0, 256, (size, size, 3), dtype=torch.uint8, device=device)
-        mask = torch.full((size, size), backends.OBJECT, dtype=torch.uint8, device=device)
-        camera = torch.eye(3, device=device), torch.tensor([1.5 * size, 1.5 * size, size / 2, size / 2], device=device)
-        loss = partial(backend.image_terms, *images, photo, mask, *camera, 0.2, 25.0)
-        forward = median_seconds(loss, threads, RUNS, device)
-        adjoint = partial(torch.autograd.grad, loss().sum(), images, retain_graph=True)
+    for what, call, tensors in [*_image_cases(backend), *_gaussian_cases(backend), *_light_cases(backend)]:
+        inputs = [x.to(device) for x in tensors]
+        leaves = [x.requires_grad_() for x in inputs if x.is_floating_point()]
+        forward = median_seconds(lambda call=call, inputs=inputs: call(*inputs), threads, RUNS, device)
+        total = sum((x.sum() for x in _tensors(call(*inputs))), torch.zeros((), device=device))
+        adjoint = partial(torch.autograd.grad, total, leaves, retain_graph=True, allow_unused=True)
         backward = median_seconds(adjoint, threads, RUNS, device)
-        rows.append(row(f"image terms, {size} px", name, threads, "ms", forward * 1e3, backward * 1e3))
-    return rows
+        rows.append(row(what, name, threads, "ms", forward * 1e3, backward * 1e3))
+    zero = torch.zeros((), device=device)
+    values = [torch.randn(GAUSSIANS, k, device=device) for k in (3, 4, 3, 12, 4, 12)]
+    moved = [backends.Leaf(x, x.clone(), x * 0, x * 0, zero.clone(), 1e-3) for x in values]
+    adam = median_seconds(lambda: backend.adam(moved, zero, zero.clone(), 0.9, 0.999, 1e-15), threads, RUNS, device)
+    return [*rows, row(f"Adam {GAUSSIANS // 1000}k", name, threads, "ms", adam * 1e3)]
+
+
+Kernel = tuple[str, Callable[..., Any], list[Tensor]]
+"""A kernel for a row of the table: its title, a call, and the arguments of the call, of which the floating-point ones
+get gradients."""
+
+
+def _tensors(result: Any) -> list[Tensor]:
+    """The tensors that a kernel returns."""
+    return [result] if isinstance(result, Tensor) else list(result)
+
+
+def _image_cases(backend: Backend) -> list[Kernel]:
+    """Loss terms of images."""
+    cases: list[Kernel] = []
+    for size in (128, 256):
+        photo = torch.randint(0, 256, (size, size, 3), dtype=torch.uint8)
+        mask = torch.full((size, size), backends.OBJECT, dtype=torch.uint8)
+        view = [torch.rand(size, size, *more) for more in ((3,), (), (), (), (3,))]
+        image = partial(backend.image_terms, ssim_weight=0.2, crease=25.0)
+        R, _, intrinsics = camera(size)
+        cases.append((f"image terms, {size} px", image, [*view, photo, mask, R, intrinsics]))
+        material = [torch.rand(size, size, 7), torch.ones(size, size), photo, mask]
+        cases.append((f"material terms, {size} px", backend.material_terms, material))
+    return cases
+
+
+def _gaussian_cases(backend: Backend) -> list[Kernel]:
+    """What is computed of every Gaussian."""
+    n, rng = GAUSSIANS, torch.Generator().manual_seed(0)
+    means, quats, scales, _ = shell(n)
+    log_scales, sdf, gamma = scales.log(), 0.01 * torch.randn(n, generator=rng), torch.tensor(60.0)
+    transfer, sky = torch.rand(n, 9, generator=rng), fibonacci(DIRECTIONS)
+    harmonics = [
+        means,
+        quats,
+        torch.randn(n, 3, generator=rng),
+        torch.randn(2, 16, 3, generator=rng),
+        torch.tensor(1.0),
+    ]
+    reflectance, T = torch.rand(6, generator=rng), camera(256)
+    logits = [torch.randn(n, 4, *more, generator=rng) for more in ((3,), (), (3,))]
+    terms = partial(backend.gaussian_terms, floor=0.005, reach=0.1)
+    measured = [means, quats, log_scales, sdf, gamma, torch.rand(n, generator=rng), torch.full((256, 256), 2.0), *T]
+    k = f"{n // 1000}k"
+    return [
+        (f"activate {k}", backend.activate, [log_scales, sdf, gamma]),
+        (f"Gaussian terms {k}", terms, measured),
+        (f"corner features {k}", partial(backend.corner_features, temperature=10.0), logits),
+        (
+            f"shade by harmonics {k}",
+            backend.sh_shade,
+            [*harmonics, transfer, transfer + 0.1, sky, reflectance, T[0], torch.tensor([0.0, 0, -3])],
+        ),
+        (f"bounce {k}", backend.bounce, [torch.rand(n, 3), transfer, sky, torch.rand(DIRECTIONS, 3)]),
+    ]
+
+
+def _light_cases(backend: Backend) -> list[Kernel]:
+    """Prefiltered light, and the shading of pixels by it."""
+    levels, h, p, size, n = 9, 16, 1024, 128, GAUSSIANS
+    rng = torch.Generator().manual_seed(0)
+    stack, sky = torch.rand(levels, h, 2 * h, 3, generator=rng), fibonacci(DIRECTIONS)
+    lobes = torch.rand(h + 1, (levels - 1) * h, h, generator=rng)
+    normal = normalize(torch.randn(size, size, 3, generator=rng) - torch.tensor([0, 0, 3.0]), dim=-1)
+    view = [torch.rand(size, size, 7, generator=rng), torch.ones(size, size), normal]
+    shown = [
+        torch.randint(0, n, (size, size), generator=rng).int(),
+        torch.randint(0, 256, (size, size, 3), generator=rng, dtype=torch.uint8),
+        torch.randperm(size * size, generator=rng)[:p],
+    ]
+    visibility = torch.randint(-(2**31), 2**31, (n, DIRECTIONS // 32), generator=rng).int()  # half of the sky
+    blocker = torch.randint(0, n, (n, DIRECTIONS), generator=rng).int()
+    lit = [stack, sky, visibility, blocker, torch.rand(n, 3), torch.rand(n, 9), torch.rand(32, 32)]
+    R, _, intrinsics = camera(size)
+
+    def shading(*x: Tensor) -> Tensor:
+        sampled, light = backends.SampledView(*x[:6]), backends.ShadingLight(*x[6:13])
+        return backend.shading_term(sampled, light, *x[13:])
+
+    rough = torch.rand(p, generator=rng)
+    return [
+        (f"prefilter {h} rows", backend.prefilter, [stack[0], lobes]),
+        (f"lookup, {p} directions", backend.lookup, [stack, torch.randn(p, 3, generator=rng), rough]),
+        (
+            f"shading term, {p} pixels, {DIRECTIONS} directions",
+            shading,
+            [*view, *shown, *lit, R, R, intrinsics, torch.full((3,), 0.04)],
+        ),
+    ]
 
 
 def row(what: str, name: str, threads: int, unit: str, value: float, backward: float | None = None) -> dict[str, Any]:
