@@ -118,7 +118,7 @@ def report(rows: list[Row]) -> str:
     sentences = "\n".join(f"- {row['name']}: {row['sentence']}" for row in rows)
     return (
         f"# Films of real objects\n\n`{COMMAND} [--scan NAME=GLB...]`. Rotation errors and distances are against scans "
-        "of the objects (see the docstring of the script). Times are on one thread of a 2-core x86_64 CPU that other "
+        "of the objects (see the docstring of the script). Times are on a 2-core x86_64 CPU that other "
         "work shared.\n\n" + "\n".join(lines) + f"\n\nWhat the program said:\n\n{sentences}\n\nInputs:\n\n{about}\n"
     )
 
