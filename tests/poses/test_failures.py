@@ -24,6 +24,7 @@ QUICK = stage.Config(
     window_scales=(3.0, 1.0, 0.5),
     global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
     relocalizations=0,
+    perturbations=0,
     max_corrections=0,
 )
 

@@ -1,6 +1,7 @@
 """Rounds of bundle adjustment, of windows of frames or of all, with frontier points found anew in every round."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -8,10 +9,11 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble.maths import SO3, angle_between, mean_rotation
+from tumble.maths import SO3, angle_between, fibonacci_sphere, mean_rotation
 from tumble.poses.sfm import bundle_adjustment, frontier_points
 from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
 from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres
+from tumble.poses.sfm.perturbation import mirrored
 from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.tracks import Tracks, concatenate
 
@@ -20,6 +22,13 @@ CONTRADICTION_COST = 3.0
 As a motion does not reverse its depth from one frame to the next, it is more than what wrong windows gain in loss."""
 SMALL_DEVIATION = math.radians(15)
 """Mean angle up to which rotations of neighbouring windows differ by their noise alone [radians]."""
+START_STEP = math.radians(8)
+"""Rotation per frame of the constant rotations from which windows start: the middle of 5 to 12 degrees, between which
+neighbouring frames are matched well and show enough parallax [radians]."""
+SCREENING_ROUNDS = 2
+"""Rounds after which only the starts with the smallest losses are continued."""
+KEPT_STARTS = 4
+"""Number of starts of a window that are continued."""
 
 
 @runtime_checkable
@@ -46,13 +55,13 @@ class Settings(Protocol):
 
 @dataclass(frozen=True)
 class Windows:
-    """Overlapping windows of consecutive frames, each adjusted from the current poses and from their mirror image."""
+    """Overlapping windows of consecutive frames, each adjusted from several starts."""
 
     frames: Int64[Tensor, "g f"]
-    R: Float[Tensor, "g 2 f 3 3"]
-    """`R_cam_obj`, in a frame of each window's own, from either start."""
-    loss: Float[Tensor, "g 2"]
-    """Loss per observation from either start [pixels^2]."""
+    R: Float[Tensor, "g s f 3 3"]
+    """`R_cam_obj`, in a frame of each window's own, from every start."""
+    loss: Float[Tensor, "g s"]
+    """Loss per observation from every start [pixels^2]."""
 
     @property
     def best(self) -> Float[Tensor, "g f 3 3"]:
@@ -78,14 +87,15 @@ class Windows:
             chosen.append(int(index[chosen[-1]]))
         return self.R[torch.arange(len(self.R)), torch.tensor(chosen[::-1])]
 
-    def _contradiction(self, a: int, b: int) -> Float[Tensor, "2 2"]:
+    def _contradiction(self, a: int, b: int) -> Float[Tensor, "s s"]:
         """How much every start of one window contradicts every start of a later one, 0 to 1."""
-        shift = int(self.frames[b, 0] - self.frames[a, 0])
+        shift, starts = int(self.frames[b, 0] - self.frames[a, 0]), self.R.shape[1]
         common = self.frames.shape[1] - shift
         if common < 2:
-            return torch.zeros(2, 2, dtype=self.R.dtype)
+            return torch.zeros(starts, starts, dtype=self.R.dtype)
         R_a, R_b = self.R[a, :, shift:].transpose(0, 1), self.R[b, :, :common].transpose(0, 1)
-        angle = deviation(R_a[:, :, None].expand(-1, -1, 2, -1, -1), R_b[:, None].expand(-1, 2, -1, -1, -1)).mean(0)
+        each = (-1, starts, starts, -1, -1)
+        angle = deviation(R_a[:, :, None].expand(each), R_b[:, None].expand(each)).mean(0)
         return angle / angle.max().clamp_min(SMALL_DEVIATION)
 
 
@@ -96,26 +106,59 @@ def deviation(R_a: Float[Tensor, "f *b 3 3"], R_b: Float[Tensor, "f *b 3 3"]) ->
 
 
 def adjust_windows(
-    cfg: Settings, inputs: Inputs, R: Float[Tensor, "t 3 3"], rng: torch.Generator, *, size: int, stride: int
+    cfg: Settings,
+    inputs: Inputs,
+    R: Float[Tensor, "t 3 3"],
+    rng: torch.Generator,
+    *,
+    size: int,
+    stride: int,
+    directions: int = 0,
 ) -> Windows:
-    """Adjust windows of `size` frames, one every `stride` frames, from rotations and from their mirror image."""
+    """Adjust windows of `size` frames, one every `stride` frames, from rotations and from their mirror image.
+
+    Args:
+        R: Rotations to start from, `R_cam_obj`.
+        directions: Number of axes, spread over the sphere, about which a constant rotation is one more start of every
+            window, for rotations that may be far off. The `KEPT_STARTS` most promising starts are continued.
+    """
     n, size = len(inputs.capture), min(size, len(inputs.capture))
     first = sorted({*range(0, n - size + 1, stride), n - size})
     frames = torch.tensor(first)[:, None] + torch.arange(size)
-    tracks, group = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
-    R = R[frames]
-    middle = R[:, size // 2, None]
-    # The mirror image (Necker reversal) reverses depth in the rotations relative to the middle frame.
-    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=R.dtype))
-    g = len(frames)
-    starts = torch.cat([R, flip @ R @ middle.mT @ flip @ middle])
-    both = concatenate(tracks, replace(tracks, frame=tracks.frame + frames.numel()))
-    group, frames = torch.cat([group, group + g]), frames.repeat(2, 1)
-    t = silhouette_centres(inputs.capture, inputs.silhouettes)[frames]
-    scene, loss = BundleState(starts, t, torch.zeros(0, 3, dtype=R.dtype)), torch.zeros(2 * g)
-    for scale in cfg.window_scales:
-        scene, loss = adjust_round(cfg, inputs, scene, both, group, frames, scale)
-    return Windows(frames[:g], torch.stack(scene.R.split(g), 1), torch.stack(loss.split(g), 1))
+    chosen = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
+    starts = [R[frames], mirrored(R[frames])]
+    if not directions:
+        return _adjust_starts(cfg, inputs, frames, *chosen, torch.stack(starts, 1), cfg.window_scales)
+    turns = START_STEP * (torch.arange(size, dtype=R.dtype) - size // 2)
+    axes = fibonacci_sphere(directions, dtype=R.dtype)
+    starts += SO3.exp(axes[:, None] * turns[:, None]).matrix()[:, None].expand(-1, len(frames), -1, -1, -1)
+    screening, rest = cfg.window_scales[:SCREENING_ROUNDS], cfg.window_scales[SCREENING_ROUNDS:]
+    screened = _adjust_starts(cfg, inputs, frames, *chosen, torch.stack(starts, 1), screening)
+    promising = screened.loss.topk(KEPT_STARTS, dim=1, largest=False).indices
+    kept = screened.R[torch.arange(len(frames))[:, None], promising]
+    return _adjust_starts(cfg, inputs, frames, *chosen, kept, rest)
+
+
+def _adjust_starts(
+    cfg: Settings,
+    inputs: Inputs,
+    frames: Int64[Tensor, "g f"],
+    tracks: Tracks,
+    group: Int64[Tensor, " n"],
+    starts: Float[Tensor, "g s f 3 3"],
+    scales: Sequence[float],
+) -> Windows:
+    """Adjust windows from several rotations each, in one round for every scale of the Cauchy loss [pixels]."""
+    g, s = starts.shape[:2]
+    shifted = [replace(tracks, frame=tracks.frame + k * frames.numel()) for k in range(s)]
+    group = torch.cat([group + k * g for k in range(s)])
+    repeated = frames.repeat(s, 1)
+    t = silhouette_centres(inputs.capture, inputs.silhouettes)[repeated]
+    scene = BundleState(starts.transpose(0, 1).flatten(0, 1), t, torch.zeros(0, 3, dtype=starts.dtype))
+    loss, every = torch.zeros(s * g), concatenate(*shifted)
+    for scale in scales:
+        scene, loss = adjust_round(cfg, inputs, scene, every, group, repeated, scale)
+    return Windows(frames, torch.stack(scene.R.split(g), 1), torch.stack(loss.split(g), 1))
 
 
 def averaged_windows(

@@ -11,8 +11,9 @@ What contours do not show is corrected by texture: the rotation of a body of rev
 part of the motion that leave the visual hull as it is (`symmetry`). These corrections are repeated until the poses
 settle.
 
-A capture that has not converged is attempted again with the settings in `Config.fallbacks`, and the best result is
-kept. A focal length that is only assumed is estimated as well whenever all frames are adjusted together.
+A capture that has not converged is attempted again with the settings in `Config.fallbacks`, until two attempts agree.
+Otherwise parts of the best one are changed at random, and what lowers the loss is kept (`perturbation`). A focal length
+that is only assumed is estimated as well whenever all frames are adjusted together.
 
 Unit of length until `finish`: the mean distance between camera and object.
 """
@@ -28,7 +29,7 @@ from tumble.engine import State
 from tumble.maths import SE3, SO3, angle_between, mean_rotation
 from tumble.poses.result import PoseResult
 from tumble.poses.sfm import relative_pose, segments, symmetry
-from tumble.poses.sfm.adjustment import adjust_round, adjust_windows, averaged_windows
+from tumble.poses.sfm.adjustment import adjust_round, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.finalize import Solution, pose_result
 from tumble.poses.sfm.loop_closure import loop_closures
@@ -36,6 +37,7 @@ from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centr
 from tumble.poses.sfm.observations import gather as gather
 from tumble.poses.sfm.observations import is_hidden as is_hidden
 from tumble.poses.sfm.observations import shown as shown
+from tumble.poses.sfm.perturbation import perturbed, stretched
 from tumble.poses.sfm.relocalization import (
     MIN_GAPS,
     POSE_JUMP,
@@ -49,7 +51,7 @@ from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
 from tumble.scene import Trajectory
 
-VERSION = 18
+VERSION = 19
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -75,6 +77,12 @@ RELOCALIZATION_SCALE = 0.7
 SETTLED_ANGLE = math.radians(1.0)
 """Largest change of a frame's rotation by a round of corrections below which no more rounds follow [radians]. A frame
 that is relocated or turned moves farther, one that is only adjusted less."""
+AGREEMENT = math.radians(3.0)
+"""Angle by which the rotations of two attempts that have found the same motion differ at most [radians]."""
+AGREEING_FRAMES = 0.9
+"""Fraction of the frames in which they have to agree."""
+PERTURBATIONS = 10
+"""Number of changes of the motion that are tried in one step."""
 NO_ROTATION_WEIGHT = 0.01
 """Weight of the prior that the object does not rotate between consecutive frames [weight of one inlier match]."""
 
@@ -85,8 +93,12 @@ class Fallback:
 
     window_sizes: tuple[int, ...]
     """Sizes of the windows, in ascending order [frames]."""
-    frontier_weight: float
-    """Weight of an observation of a frontier point, relative to an observation of a track."""
+    stretch: float
+    """Factor on the rotations between consecutive frames before all frames are adjusted.
+
+    Shading and highlights stay where they are while a surface turns below them, so that matches of an object with
+    little texture show too small a rotation: 0.7 of it where all is shading.
+    """
 
 
 @dataclass(frozen=True)
@@ -95,10 +107,23 @@ class Config:
 
     window_sizes: tuple[int, ...] = (6, 12)
     """Sizes of the windows, in ascending order [frames]."""
-    fallbacks: tuple[Fallback, ...] = (Fallback((8, 16), 12.0), Fallback((6, 12), 5.0))
+    fallbacks: tuple[Fallback, ...] = (
+        Fallback((12, 24), 1.0),
+        Fallback((6, 12), 1.2),
+        Fallback((6, 12, 24), 1.2),
+        Fallback((12, 24), 1.2),
+        Fallback((6, 12), 1.0),
+        Fallback((6, 12, 24), 1.0),
+        Fallback((12, 24), 1.4),
+    )
     """Settings of further attempts, for captures that have not converged."""
+    directions: int = 16
+    """Number of constant rotations from which windows of further attempts start as well."""
     converged_loss: float = 0.06
-    """Loss per observation below which a capture has converged [pixels^2]."""
+    """Loss per observation of the first attempt below which it has converged [pixels^2].
+
+    Only before relocalization, which fits contours, also with wrong rotations.
+    """
     max_window_tracks: int = 250
     """Maximum number of tracks per window."""
     window_scales: tuple[float, ...] = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5)
@@ -109,8 +134,12 @@ class Config:
     """Scale of the Cauchy loss in each round of adjusting the whole capture after a relocalization [pixels]."""
     disagreement_scales: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
     """Scale of the Cauchy loss in each round of the two fits that rely mainly on tracks or on contours [pixels]."""
-    relocalizations: int = 2
-    """Number of relocalizations of an attempt, each followed by rounds of adjustment."""
+    perturbations: int = 10
+    """Number of times that `PERTURBATIONS` random changes of the best attempt's poses are tried."""
+    perturbation_scales: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5)
+    """Scale of the Cauchy loss in each round of adjusting the whole capture after such a change [pixels]."""
+    relocalizations: int = 1
+    """Number of relocalizations of the first and of the best attempt, each followed by rounds of adjustment."""
     max_corrections: int = 4
     """Maximum number of rounds of corrections at the end (`CheckSettled`)."""
     frontier_weight: float = 12.0
@@ -153,6 +182,10 @@ class AdjustWindows:
 
     size: int
     """Number of frames per window."""
+    widely: bool = False
+    """Whether windows start from constant rotations as well (`Config.directions`)."""
+    stretch: float = 1.0
+    """Factor on the averaged rotations between consecutive frames (`Fallback.stretch`)."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +205,14 @@ class KeepBest:
 
 
 @dataclass(frozen=True)
+class Perturb:
+    """Change parts of the motion at random, and keep what is better (`perturbation`)."""
+
+    scale: float
+    """Scale of the Cauchy loss by which poses are compared [pixels]."""
+
+
+@dataclass(frozen=True)
 class AlignTexture:
     """Turn frames of a body of revolution about its axis where their texture contradicts the poses (`symmetry`)."""
 
@@ -180,8 +221,12 @@ class AlignTexture:
 class CheckSettled:
     """Start a round of corrections: by colours, loop closures and relocalization, then all frames are adjusted.
 
-    If no rotation has changed by `SETTLED_ANGLE` since the last check, this and all further rounds are skipped.
+    If the last round has raised the loss, it is undone. In that case, and if no rotation has changed by `SETTLED_ANGLE`
+    since the last check, this and all further rounds are skipped.
     """
+
+    scale: float
+    """Scale of the Cauchy loss by which poses are compared [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +257,7 @@ Phase = (
     | AdjustWindows
     | AdjustAll
     | KeepBest
+    | Perturb
     | AlignTexture
     | CheckSettled
     | AlignColours
@@ -229,7 +275,7 @@ class Step:
     attempt: int = 0
     """Attempt that the step belongs to: 0 is the first; the others are those of `Config.fallbacks`."""
     mends: bool = False
-    """Whether the step relocalizes frames of an attempt; it is skipped once the loss has converged."""
+    """Whether the step corrects poses that have not converged; it is skipped otherwise."""
 
 
 def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
@@ -243,15 +289,29 @@ def schedule(cfg: Config, *, hidden: bool = False) -> list[Step]:
     keep = KeepBest(cfg.global_scales[-1])
     relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
     steps: list[Step] = []
-    for attempt, sizes in enumerate((cfg.window_sizes, *(fallback.window_sizes for fallback in cfg.fallbacks))):
-        phases = [AverageRotations(), *map(AdjustWindows, sizes), *map(AdjustAll, cfg.global_scales)]
-        # Only what has not converged is mended, before attempts are compared: contours rescue some but not others.
-        # The loss of the first attempt decides whether any more steps follow.
-        steps += [Step(phase, attempt) for phase in (*phases, *([keep] if attempt == 0 else []))]
-        steps += [Step(phase, attempt, mends=True) for phase in (*relocalization * cfg.relocalizations, keep)]
+    first = [AverageRotations(), *map(AdjustWindows, cfg.window_sizes)]
+    others = [
+        [
+            AverageRotations(),
+            *(AdjustWindows(size, widely=True) for size in other.window_sizes[:-1]),
+            AdjustWindows(other.window_sizes[-1], widely=True, stretch=other.stretch),
+        ]
+        for other in cfg.fallbacks
+    ]
+    mending = [*relocalization * cfg.relocalizations, keep]
+    # The loss of the first attempt decides whether any more steps follow.
+    steps += map(Step, (*first, *map(AdjustAll, cfg.global_scales), keep))
+    steps += [Step(phase, mends=True) for phase in mending]
+    for attempt, phases in enumerate(others, 1):
+        steps += [Step(phase, attempt) for phase in (*phases, *map(AdjustAll, cfg.global_scales), keep)]
+    if others:
+        # Relocalization fits contours alone, so the best attempt is changed after it and compared by matches as well.
+        mending = [*mending, *[Perturb(keep.scale)] * cfg.perturbations, *mending]
+        steps += [Step(phase, len(others), mends=True) for phase in mending]
     steps.append(Step(AlignTexture()))
     for _ in range(cfg.max_corrections):
-        steps += map(Step, (CheckSettled(), AlignColours(), CloseLoops(), *relocalization))
+        steps += map(Step, (CheckSettled(keep.scale), AlignColours(), CloseLoops(), *relocalization))
+    steps.append(Step(CheckSettled(keep.scale)))
     return steps
 
 
@@ -264,10 +324,13 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     R = torch.eye(3, dtype=torch.float64).repeat(len(inputs.capture), 1, 1)
     t = silhouette_centres(inputs.capture, inputs.silhouettes)
     log_focal = torch.zeros((), dtype=torch.float64)
-    best = {"R": R, "t": t, "log_focal": log_focal, "loss": torch.full_like(log_focal, torch.inf)}
+    infinite = torch.full_like(log_focal, torch.inf)
+    best = {"R": R, "t": t, "log_focal": log_focal, "loss": infinite, "first_loss": infinite}
+    best["agreed"] = torch.tensor(False)
     best["posed"] = torch.ones(len(R), dtype=torch.bool)
     best["confirmed"] = torch.full((len(R),), -1)
-    best["checked"] = torch.full_like(R, torch.nan)  # rotations at the last check, before which there are none
+    # Poses at the last check, before which there are none.
+    best |= {"checked_R": torch.full_like(R, torch.nan), "checked_t": t, "checked_log_focal": log_focal}
     best["settled"] = torch.tensor(False)
     best["steady"] = torch.ones(len(inputs.tracks), dtype=torch.bool)
     return State(
@@ -277,16 +340,19 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 @torch.no_grad()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
-    """Carry out the next step of the schedule, unless the loss has converged or the poses have settled before it."""
+    """Carry out the next step of the schedule.
+
+    Nothing is done where no more attempts are needed, because the first has converged or two agree, and no more
+    corrections, because the poses have settled.
+    """
     now = schedule(cfg, hidden=inputs.hidden)[state.step]
     cfg = _weighted(cfg, inputs)
-    if (now.attempt > 0 or now.mends) and float(state.memory["loss"]) < cfg.converged_loss:
+    converged = float(state.memory["first_loss"]) < cfg.converged_loss or bool(state.memory["agreed"])
+    if converged and (now.attempt > 0 or now.mends):
         return {}
     if bool(state.memory["settled"]):
         return {}
-    if now.attempt > 0 and not isinstance(now.phase, KeepBest):
-        cfg = replace(cfg, frontier_weight=cfg.fallbacks[now.attempt - 1].frontier_weight)
-    state.params, scalars = _run_phase(now.phase, cfg, with_focal_length(inputs, state.params.log_focal), state)
+    state.params, scalars = _run_phase(now, cfg, with_focal_length(inputs, state.params.log_focal), state)
     return scalars
 
 
@@ -295,20 +361,22 @@ def _weighted(cfg: Config, inputs: Inputs) -> Config:
     return replace(cfg, frontier_weight=segments.FRONTIER_WEIGHT) if inputs.hidden else cfg
 
 
-def _run_phase(phase: Phase, cfg: Config, inputs: Inputs, state: State) -> "PhaseResult":
-    match phase:
+def _run_phase(now: Step, cfg: Config, inputs: Inputs, state: State) -> "PhaseResult":
+    match now.phase:
         case AverageRotations():
             return _average_rotations(cfg, inputs, state)
-        case AdjustWindows(size):
-            return _adjust_windows(cfg, inputs, state, size)
+        case AdjustWindows():
+            return _adjust_windows(cfg, inputs, state, now.phase)
         case AdjustAll(scale):
             return adjust_all(cfg, inputs, state, scale)
         case KeepBest(scale):
-            return _keep_best(cfg, inputs, state, scale)
+            return _keep_best(cfg, inputs, state, scale, is_other=now.attempt > 0 and not now.mends)
+        case Perturb(scale):
+            return _perturb(cfg, inputs, state, scale)
         case AlignTexture():
             return _align_texture(inputs, state)
-        case CheckSettled():
-            return _check_settled(state)
+        case CheckSettled(scale):
+            return _check_settled(cfg, inputs, state, scale)
         case AlignColours():
             return _align_colours(inputs, state)
         case CloseLoops():
@@ -345,10 +413,14 @@ def _average_rotations(cfg: Config, inputs: Inputs, state: State) -> PhaseResult
     return poses, {"pairs": float(len(fits))}
 
 
-def _adjust_windows(cfg: Config, inputs: Inputs, state: State, size: int) -> PhaseResult:
-    """Adjust overlapping windows, each also from its mirror image, and average the consistent rotations within them."""
-    windows = adjust_windows(cfg, inputs, state.params.R, state.rng, size=size, stride=max(1, size // 4))
+def _adjust_windows(cfg: Config, inputs: Inputs, state: State, phase: AdjustWindows) -> PhaseResult:
+    """Adjust overlapping windows from several starts, and average the consistent rotations within them."""
+    size, directions = phase.size, cfg.directions if phase.widely else 0
+    R, stride = state.params.R, max(1, size // 4)
+    windows = adjust_windows(cfg, inputs, R, state.rng, size=size, stride=stride, directions=directions)
     R = averaged_windows(windows.frames, windows.consistent, n_frames=len(inputs.capture))
+    if phase.stretch != 1:
+        R = stretched(R, phase.stretch)
     return replace(state.params, R=R), {"loss": windows.loss.amin(1).mean()}
 
 
@@ -431,12 +503,18 @@ def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
     return _from_unit_sphere(inputs, state.params, trajectory), {"turned": found.angle.abs().median()}
 
 
-def _check_settled(state: State) -> PhaseResult:
-    """Compare the rotations with those of the last check."""
-    R = state.params.R
-    change = angle_between(SO3.from_matrix(R), SO3.from_matrix(state.memory["checked"])).max()
-    state.memory |= {"checked": R, "settled": change < SETTLED_ANGLE}
-    return state.params, {"changed": change} if bool(change.isfinite()) else {}
+def _check_settled(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
+    """Compare the poses with those of the last check."""
+    now, memory = state.params, state.memory
+    before = Poses(*(memory[f"checked_{name}"] for name in vars(now)))
+    memory |= {f"checked_{name}": x for name, x in vars(now).items()}
+    change = angle_between(SO3.from_matrix(now.R), SO3.from_matrix(before.R)).max()
+    if not bool(change.isfinite()):  # the first check
+        return now, {}
+    losses = [_comparable_loss(cfg, inputs, state, poses, scale) for poses in (before, now)]
+    is_worse = bool(losses[1] > losses[0])
+    memory["settled"] = torch.tensor(is_worse or bool(change < SETTLED_ANGLE))
+    return before if is_worse else now, {"changed": change, "undone": float(is_worse)}
 
 
 def _align_colours(inputs: Inputs, state: State) -> PhaseResult:
@@ -466,13 +544,46 @@ def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
     return symmetry.estimate_spin(inputs.capture, _in_unit_sphere(inputs, poses))
 
 
-def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
-    """Keep the poses with the lowest loss: the current ones or those of an earlier attempt."""
-    trial = State(0, state.params, None, torch.Generator().manual_seed(0))
-    loss, memory = torch.as_tensor(adjust_all(cfg, inputs, trial, scale)[1]["loss"]), state.memory
-    if float(loss) < float(memory["loss"]):
-        memory |= {**vars(state.params), "loss": loss}
+def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_other: bool) -> PhaseResult:
+    """Keep the poses with the lowest loss, the current ones or those of an earlier attempt; see whether both agree."""
+    memory, found = state.memory, _comparable_loss(cfg, inputs, state, state.params, scale)
+    if bool(memory["first_loss"].isinf()):
+        trial = State(0, state.params, None, torch.Generator().manual_seed(0))
+        memory["first_loss"] = torch.as_tensor(adjust_all(cfg, inputs, trial, scale)[1]["loss"])
+    if is_other:
+        memory["agreed"] = deviation(state.params.R, memory["R"]).quantile(AGREEING_FRAMES) < AGREEMENT
+    if found < memory["loss"]:
+        memory |= {**vars(state.params), "loss": found}
     return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
+
+
+def _perturb(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
+    """Try random changes of the poses, and keep those after which the adjusted poses have a lower loss."""
+    best, loss, accepted = state.params, _comparable_loss(cfg, inputs, state, state.params, scale), 0
+    for _ in range(PERTURBATIONS):
+        trial = replace(state, params=replace(best, R=perturbed(best.R, state.rng)))
+        for each in cfg.perturbation_scales:
+            current = with_focal_length(inputs, trial.params.log_focal - state.params.log_focal)
+            trial.params, _ = adjust_all(cfg, current, trial, each)
+        found = _comparable_loss(cfg, inputs, state, trial.params, scale)
+        if found < loss:
+            best, loss, accepted = trial.params, found, accepted + 1
+    return best, {"loss": loss, "accepted": float(accepted)}
+
+
+def _comparable_loss(cfg: Config, inputs: Inputs, state: State, poses: Poses, scale: float) -> Tensor:
+    """Loss per observation by which poses are compared [pixels^2].
+
+    Every observation counts once. In adjustment frontier points have a larger weight, because matches have a bias, but
+    wrong rotations often fit the contours as well as the true ones do, and then not the matches.
+
+    Args:
+        inputs: Observations with the focal length of `state.params`.
+    """
+    cfg = replace(cfg, frontier_weight=1.0, iterations=1)
+    inputs = with_focal_length(inputs, poses.log_focal - state.params.log_focal)
+    trial = State(0, poses, None, torch.Generator().manual_seed(0), state.memory)
+    return torch.as_tensor(adjust_all(cfg, inputs, trial, scale)[1]["loss"])
 
 
 def _close_loops(inputs: Inputs, state: State) -> PhaseResult:
