@@ -3,7 +3,7 @@
 Pairs farther apart than `OFFSETS` are not needed: frontier points constrain all pairs of frames
 (`poses/sfm/frontier_points`), and tracks connect distant frames. Bodies of revolution are the exception: their
 silhouettes do not determine the rotation about the axis, so that errors add up until the texture comes into view again;
-these need loop closure (`poses/sfm/loop_closure`).
+these need loop closure (`poses/sfm/symmetry/loop_closure`).
 """
 
 from collections.abc import Sequence

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.loop_closure import loop_closures
+from tumble.poses.sfm.symmetry.loop_closure import loop_closures
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.trajectory import Trajectory

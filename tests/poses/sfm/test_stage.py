@@ -14,7 +14,7 @@ from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
 from tumble.maths import SO3
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import stage
+from tumble.poses.sfm import schedule, stage
 from tumble.poses.sfm.adjustment import deviation
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
@@ -100,7 +100,7 @@ def test_a_frame_without_the_object_is_lost_and_the_others_are_not_affected(scen
 def test_a_capture_that_has_not_converged_is_attempted_again_and_the_best_result_is_kept(scene: Tumble) -> None:
     """The second attempt has smaller windows, and starts from more rotations."""
     inputs = stage.gather(scene.capture, matches(scene), "mixed")
-    fallbacks = (stage.Fallback((4,), 1.0),)
+    fallbacks = (schedule.Fallback((4,), 1.0),)
     state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))
     cfg = replace(QUICK, fallbacks=fallbacks, converged_loss=0.0)
     kept = []
@@ -179,7 +179,7 @@ def test_corrections_that_raise_the_loss_are_undone(scene: Tumble) -> None:
 
 def test_two_attempts_that_agree_are_enough(scene: Tumble) -> None:
     """A third attempt is skipped after two that found the same, and is not after two that differ by ten degrees."""
-    cfg = replace(QUICK, converged_loss=0.0, fallbacks=(stage.Fallback((6,), 1.0),) * 2)
+    cfg = replace(QUICK, converged_loss=0.0, fallbacks=(schedule.Fallback((6,), 1.0),) * 2)
     steps = stage.schedule(cfg)
     keep = [k for k, step in enumerate(steps) if isinstance(step.phase, stage.KeepBest)]
     inputs = stage.gather(scene.capture, matches(scene), "mixed")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from tests.lopsided import tumbling
-from tumble.poses.sfm import texture_information
+from tumble.poses.sfm.symmetry import texture_information
 from tumble.poses.sfm.tracks import Tracks
 from tumble.scene.capture import OBJECT
 

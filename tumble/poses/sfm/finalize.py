@@ -15,10 +15,10 @@ from torch import Tensor
 
 from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
 from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult
-from tumble.poses.sfm import bundle_adjustment, relocalization, texture_information
+from tumble.poses.sfm import bundle_adjustment, relocalization
 from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
 from tumble.poses.sfm.relocalization import ContourConstraints
-from tumble.poses.sfm.symmetry import MirrorSymmetry
+from tumble.poses.sfm.symmetry import MirrorSymmetry, texture_information
 from tumble.poses.sfm.tracks import Tracks
 from tumble.scene import BACKGROUND, UNKNOWN, Camera, Capture, Trajectory, visual_hull
 

@@ -1,0 +1,222 @@
+"""The steps of stage 1 in order, and its settings; `stage` carries them out."""
+
+from dataclasses import dataclass
+
+RELOCALIZATION_SCALE = 0.7
+"""Scale of the Cauchy loss in relocalization [pixels]."""
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """Settings of another attempt at a capture that has not converged."""
+
+    window_sizes: tuple[int, ...]
+    """Sizes of the windows, in ascending order [frames]."""
+    stretch: float
+    """Factor on the rotations between consecutive frames before all frames are adjusted.
+
+    Shading and highlights stay where they are while a surface turns below them, so that matches of an object with
+    little texture show too small a rotation: 0.7 of it where all is shading.
+    """
+
+
+@dataclass(frozen=True)
+class BaseConfig:
+    """Settings of stage 1 by structure from motion, found by experiment; the paper's method is `progressive`."""
+
+    window_sizes: tuple[int, ...] = (6, 12)
+    """Sizes of the windows, in ascending order [frames]."""
+    fallbacks: tuple[Fallback, ...] = (
+        Fallback((12, 24), 1.0),
+        Fallback((6, 12), 1.2),
+        Fallback((6, 12, 24), 1.2),
+        Fallback((12, 24), 1.2),
+        Fallback((6, 12), 1.0),
+        Fallback((6, 12, 24), 1.0),
+        Fallback((12, 24), 1.4),
+    )
+    """Settings of further attempts, for captures that have not converged."""
+    directions: int = 16
+    """Number of constant rotations from which windows of further attempts start as well."""
+    converged_loss: float = 0.06
+    """Loss per observation of the first attempt below which it has converged [pixels^2].
+
+    Only before relocalization, which fits contours, also with wrong rotations.
+    """
+    max_window_tracks: int = 250
+    """Maximum number of tracks per window."""
+    window_scales: tuple[float, ...] = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5)
+    """Scale of the Cauchy loss in each round of adjusting windows [pixels]."""
+    global_scales: tuple[float, ...] = (5.0, 4.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5)
+    """Scale of the Cauchy loss in each round of adjusting the whole capture [pixels]."""
+    relocalized_scales: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
+    """Scale of the Cauchy loss in each round of adjusting the whole capture after a relocalization [pixels]."""
+    disagreement_scales: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
+    """Scale of the Cauchy loss in each round of the two fits that rely mainly on tracks or on contours [pixels]."""
+    perturbations: int = 10
+    """Number of times that `PERTURBATIONS` random changes of the best attempt's poses are tried."""
+    perturbation_scales: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5)
+    """Scale of the Cauchy loss in each round of adjusting the whole capture after such a change [pixels]."""
+    relocalizations: int = 1
+    """Number of relocalizations of the first and of the best attempt, each followed by rounds of adjustment."""
+    max_corrections: int = 4
+    """Maximum number of rounds of corrections at the end (`CheckSettled`)."""
+    frontier_weight: float = 12.0
+    """Weight of an observation of a frontier point, relative to an observation of a track.
+
+    It is large, because shading biases all matches in the same way, but not contours.
+    """
+    iterations: int = 4
+    """Levenberg-Marquardt iterations per round, after which the frontier points are found anew."""
+    max_pair_distance: int = 2
+    """Maximum distance in time of frames whose relative rotation is fitted [frames]."""
+    centre_sigma: float = 0.25
+    """Standard deviation of the projected origin about the silhouette's centre [projected radius of the object]."""
+    depth_sigma: float = 0.1
+    """Standard deviation of the logarithm of the object's distance."""
+    max_frontier_pairs: int = 3000
+    """Maximum number of frame pairs whose frontier points are used in a round; chosen at random if there are more."""
+
+
+@dataclass(frozen=True)
+class AverageRotations:
+    """Fit the relative rotations of nearby frames and average them."""
+
+
+@dataclass(frozen=True)
+class AdjustWindows:
+    """Adjust overlapping windows of frames, and average the rotations within them."""
+
+    size: int
+    """Number of frames per window."""
+    widely: bool = False
+    """Whether windows start from constant rotations as well (`BaseConfig.directions`)."""
+    stretch: float = 1.0
+    """Factor on the averaged rotations between consecutive frames (`Fallback.stretch`)."""
+
+
+@dataclass(frozen=True)
+class AdjustAll:
+    """One round of bundle adjustment of the whole capture."""
+
+    scale: float
+    """Scale of the Cauchy loss [pixels]."""
+
+
+@dataclass(frozen=True)
+class KeepBest:
+    """Keep the poses with the lowest loss: the current ones or those of an earlier attempt."""
+
+    scale: float
+    """Scale of the Cauchy loss [pixels]."""
+
+
+@dataclass(frozen=True)
+class Perturb:
+    """Change parts of the motion at random, and keep what is better (`perturbation`)."""
+
+    scale: float
+    """Scale of the Cauchy loss by which poses are compared [pixels]."""
+
+
+@dataclass(frozen=True)
+class AlignTexture:
+    """Turn frames of a body of revolution about its axis where their texture contradicts the poses (`symmetry`)."""
+
+
+@dataclass(frozen=True)
+class CheckSettled:
+    """Start a round of corrections: by colours, loop closures and relocalization, then all frames are adjusted.
+
+    If the last round has raised the loss, it is undone. In that case, and if no rotation has changed by `SETTLED_ANGLE`
+    since the last check, this and all further rounds are skipped.
+    """
+
+    scale: float
+    """Scale of the Cauchy loss by which poses are compared [pixels]."""
+
+
+@dataclass(frozen=True)
+class AlignColours:
+    """Turn a part of the motion by a rotation that silhouettes do not show, where colours say so (`symmetry.turns`)."""
+
+
+@dataclass(frozen=True)
+class CloseLoops:
+    """Match frames that are far apart in time and see the same side, if the object is a body of revolution."""
+
+
+@dataclass(frozen=True)
+class Relocalize:
+    """Relocalize frames whose contour contradicts those of the others."""
+
+    scale: float
+    """Scale of the Cauchy loss [pixels]."""
+
+
+@dataclass(frozen=True)
+class JoinSegments:
+    """Pose the frames of an object that is hidden in part (`segments`); the other frames are lost."""
+
+
+Phase = (
+    AverageRotations
+    | AdjustWindows
+    | AdjustAll
+    | KeepBest
+    | Perturb
+    | AlignTexture
+    | CheckSettled
+    | AlignColours
+    | CloseLoops
+    | Relocalize
+    | JoinSegments
+)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the schedule."""
+
+    phase: Phase
+    attempt: int = 0
+    """Attempt that the step belongs to: 0 is the first; the others are those of `BaseConfig.fallbacks`."""
+    mends: bool = False
+    """Whether the step corrects poses that have not converged; it is skipped otherwise."""
+
+
+def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
+    """All steps, in order.
+
+    Args:
+        hidden: Whether something hides a part of the object, which contours alone then do not relocalize.
+    """
+    if hidden:
+        return [*map(Step, (AverageRotations(), JoinSegments(), *map(AdjustAll, cfg.relocalized_scales)))]
+    keep = KeepBest(cfg.global_scales[-1])
+    relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
+    steps: list[Step] = []
+    first = [AverageRotations(), *map(AdjustWindows, cfg.window_sizes)]
+    others = [
+        [
+            AverageRotations(),
+            *(AdjustWindows(size, widely=True) for size in other.window_sizes[:-1]),
+            AdjustWindows(other.window_sizes[-1], widely=True, stretch=other.stretch),
+        ]
+        for other in cfg.fallbacks
+    ]
+    mending = [*relocalization * cfg.relocalizations, keep]
+    # The loss of the first attempt decides whether any more steps follow.
+    steps += map(Step, (*first, *map(AdjustAll, cfg.global_scales), keep))
+    steps += [Step(phase, mends=True) for phase in mending]
+    for attempt, phases in enumerate(others, 1):
+        steps += [Step(phase, attempt) for phase in (*phases, *map(AdjustAll, cfg.global_scales), keep)]
+    if others:
+        # Relocalization fits contours alone, so the best attempt is changed after it and compared by matches as well.
+        mending = [*mending, *[Perturb(keep.scale)] * cfg.perturbations, *mending]
+        steps += [Step(phase, len(others), mends=True) for phase in mending]
+    steps.append(Step(AlignTexture()))
+    for _ in range(cfg.max_corrections):
+        steps += map(Step, (CheckSettled(keep.scale), AlignColours(), CloseLoops(), *relocalization))
+    steps.append(Step(CheckSettled(keep.scale)))
+    return steps
