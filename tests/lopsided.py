@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tumble.maths.se3 import SE3
+from tumble.maths.se3 import SE3, SO3
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.match import Match
@@ -70,6 +70,15 @@ def _hits(origin: Tensor, direction: Tensor, radius: float) -> Tensor:
     """Whether rays meet a ball about 0, by the discriminant."""
     a, b = (direction * direction).sum(-1), (direction * origin).sum(-1)
     return b * b > a * ((origin * origin).sum() - radius**2)
+
+
+def tumbling_rotations(n: int) -> Tensor:
+    """Ten degrees per frame about an axis that turns within the image plane, (n, 3, 3)."""
+    rotations = [torch.eye(3, dtype=torch.float64)]
+    for k in range(n - 1):
+        axis = torch.tensor([math.cos(0.2 * k), math.sin(0.2 * k), 0.3], dtype=torch.float64)
+        rotations.append(SO3.exp(math.radians(10) * axis).matrix() @ rotations[-1])
+    return torch.stack(rotations)
 
 
 def truth(scene: Tumble) -> Trajectory:

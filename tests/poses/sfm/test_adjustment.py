@@ -6,20 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths import SO3
+from tests.lopsided import tumbling_rotations
 from tumble.poses.sfm.adjustment import Windows, averaged_windows, deviation
 
 N, SIZE = 24, 6
 FLIP = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
-
-
-def tumbling_rotations() -> Float[Tensor, "t 3 3"]:
-    """Ten degrees per frame about an axis that turns within the image plane."""
-    rotations = [torch.eye(3, dtype=torch.float64)]
-    for k in range(N - 1):
-        axis = torch.tensor([math.cos(0.2 * k), math.sin(0.2 * k), 0.3], dtype=torch.float64)
-        rotations.append(SO3.exp(math.radians(10) * axis).matrix() @ rotations[-1])
-    return torch.stack(rotations)
 
 
 def windows(R: Float[Tensor, "t 3 3"], mirrored_loss: Float[Tensor, " g"]) -> Windows:
@@ -32,7 +23,7 @@ def windows(R: Float[Tensor, "t 3 3"], mirrored_loss: Float[Tensor, " g"]) -> Wi
 
 
 def test_windows_whose_mirror_images_have_smaller_losses_are_outvoted_by_their_neighbours() -> None:
-    R = tumbling_rotations()
+    R = tumbling_rotations(N)
     mirrored_loss = torch.full((N - SIZE + 1,), 0.13, dtype=torch.float64)
     mirrored_loss[7:11] = torch.tensor([0.095, 0.08, 0.05, 0.09])
     found = windows(R, mirrored_loss)
@@ -43,13 +34,13 @@ def test_windows_whose_mirror_images_have_smaller_losses_are_outvoted_by_their_n
 
 
 def test_the_losses_of_all_windows_decide_between_a_motion_and_its_mirror_image() -> None:
-    R = tumbling_rotations()
+    R = tumbling_rotations(N)
     found = windows(R, torch.full((N - SIZE + 1,), 0.09, dtype=torch.float64))
     assert torch.equal(found.consistent, found.R[:, 1])
 
 
 def test_windows_without_common_frames_are_chosen_by_their_losses() -> None:
-    R = tumbling_rotations()
+    R = tumbling_rotations(N)
     found = windows(R, torch.tensor([0.2, 0.05] * 9 + [0.2], dtype=torch.float64))
     apart = Windows(found.frames[::SIZE], found.R[::SIZE], found.loss[[0, 1, 2, 3]])
     assert torch.equal(apart.consistent, apart.best)

@@ -1,25 +1,14 @@
 """Random changes of a part of the motion."""
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tests.lopsided import tumbling_rotations
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm.perturbation import LARGEST_TURN, LONGEST_PART, mirrored, perturbed, stretched
 
 N = 50
-
-
-def motion() -> Float[Tensor, "t 3 3"]:
-    """Ten degrees per frame about an axis that turns within the image plane."""
-    k = 0.2 * torch.arange(N, dtype=torch.float64)
-    axes = torch.stack([k.cos(), k.sin(), torch.full_like(k, 0.3)], 1)
-    rotations = [torch.eye(3, dtype=torch.float64)]
-    for step in SO3.exp(math.radians(10) * axes[1:]).matrix():
-        rotations.append(step @ rotations[-1])
-    return torch.stack(rotations)
 
 
 def steps(R: Float[Tensor, "t 3 3"]) -> SO3:
@@ -27,14 +16,14 @@ def steps(R: Float[Tensor, "t 3 3"]) -> SO3:
 
 
 def test_a_stretched_motion_rotates_by_more_about_the_same_axes() -> None:
-    R = motion()
+    R = tumbling_rotations(N)
     assert torch.allclose(steps(stretched(R, 1.2)).log(), 1.2 * steps(R).log(), atol=1e-9)
     assert torch.equal(stretched(R, 1.2)[0], R[0])
 
 
 def test_the_mirror_image_reverses_depth_about_the_middle_frame() -> None:
     """Rotations about x and y change their sign, that about the optical axis does not; its own image is the motion."""
-    R = motion()[:9]
+    R = tumbling_rotations(N)[:9]
     flip = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
     assert torch.allclose(mirrored(R)[4], R[4])
     # Relative to the middle frame, in camera coordinates.
@@ -44,7 +33,7 @@ def test_the_mirror_image_reverses_depth_about_the_middle_frame() -> None:
 
 
 def test_only_one_part_of_the_motion_is_changed_and_the_frames_behind_it_follow() -> None:
-    R, rng = motion(), torch.Generator().manual_seed(0)
+    R, rng = tumbling_rotations(N), torch.Generator().manual_seed(0)
     kinds = set()
     for _ in range(200):
         changed = perturbed(R, rng)

@@ -23,8 +23,8 @@ As a motion does not reverse its depth from one frame to the next, it is more th
 SMALL_DEVIATION = math.radians(15)
 """Mean angle up to which rotations of neighbouring windows differ by their noise alone [radians]."""
 START_STEP = math.radians(8)
-"""Rotation per frame of the constant rotations from which windows start: the middle of 5 to 12 degrees, between which
-neighbouring frames are matched well and show enough parallax [radians]."""
+"""Rotation per frame of the constant rotations from which windows start: the middle of the 5 to 12
+degrees of hand-held captures [radians]."""
 SCREENING_ROUNDS = 2
 """Rounds after which only the starts with the smallest losses are continued."""
 KEPT_STARTS = 4
