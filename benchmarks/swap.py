@@ -92,7 +92,7 @@ def decompose_given(capture: Capture, truth: Any, refined: refine.Refined, given
                 albedo = state.params.material.albedo * environment.integral() / light.integral()
                 albedo_logits.copy_(TEMPERATURE * torch.logit(albedo.clamp(*decompose.ALBEDO_RANGE)))
                 environment.log_radiance.copy_(light.log_radiance)
-            decompose.choose_start(cfg, inputs, state)
+            state = decompose.choose_start(cfg, inputs, state)
         return state
 
     stage: Any = SimpleNamespace(**vars(decompose) | {"init": init})

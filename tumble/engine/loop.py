@@ -98,7 +98,8 @@ class Stage(Protocol):
         ...
 
     def init(self, cfg: Any, inputs: Any, rng: torch.Generator) -> State:
-        """The state at step 0. Also called before a checkpoint is restored, to provide its structure."""
+        """The first state, which may have made some steps. Also called before a checkpoint is restored, to provide its
+        structure."""
         ...
 
     def step(self, cfg: Any, inputs: Any, state: State) -> Mapping[str, Tensor | float]:

@@ -57,7 +57,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 19
+VERSION = 20
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -71,7 +71,7 @@ FIT_PIXELS = 2
 NO_LOBE = -200.0
 """Logarithmic specular scale of an object without a specular lobe: its exponential is 0, as are all gradients."""
 TRIAL_STEPS = 200
-"""Maximum number of steps after which an object with and one without a specular lobe are compared."""
+"""Number of first steps that are made with and without a specular lobe; at most a third of the run."""
 MIN_EXPLAINED = 0.07
 """Smallest part of the photometric error without a specular lobe that a lobe must explain, or the object has none."""
 BLOCKERS = f"{CACHE}blocker"
@@ -149,7 +149,8 @@ class Config:
     roughness: float = 0.5
     """Initial roughness: that of the lobe in stage 2 (`sh_lighting.GLOSSY_FALLOFF`), for which its light is made."""
     try_matte: bool = False
-    """Whether a trial before the first step decides if the object has a specular lobe (`choose_start`)."""
+    """Whether the first steps are made with and without a specular lobe, of which the better ones count
+    (`choose_start`)."""
     initial_albedo: float = 0.8
     """95 % quantile of the initial albedo. The factor goes into the light, since stage 2 determines only the product of
     albedo and light."""
@@ -214,7 +215,7 @@ def length(cfg: Config, inputs: Inputs) -> int:
 
 @threads_for_kernels()
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
-    """The initial state: material and light of stage 2, with traced visibility."""
+    """The first state: material and light of stage 2, with traced visibility, and what `choose_start` makes of it."""
     refined = inputs.refined
     # One factor for all channels, since a channel of a saturated object is rightly dark.
     factor = cfg.initial_albedo / refined.albedo.amax(-1).quantile(0.95)
@@ -236,13 +237,11 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
     state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, {"directions": torch.stack(sets)})
     _trace_visibility(cfg, inputs, state)
-    if cfg.try_matte:
-        choose_start(cfg, inputs, state)
-    return state
+    return choose_start(cfg, inputs, state) if cfg.try_matte else state
 
 
-def choose_start(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Start with or without a specular lobe, whichever explains the frames better after some steps of both.
+def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
+    """The state after the first steps with or without a specular lobe, whichever explains the frames better by then.
 
     Albedos make up for a change of the lobe, so that neither is ahead, and both take the same steps with their own
     light. A lobe that explains less than `MIN_EXPLAINED` of the error compensates for errors of light and shape. One
@@ -254,11 +253,8 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> None:
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
     glossy = _start(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
     matte = _start(params, before * fitted.albedo_per_scale, NO_LOBE)
-    has_lobe = _trial_error(cfg, inputs, state, glossy) < (1 - MIN_EXPLAINED) * _trial_error(cfg, inputs, state, matte)
-    chosen = glossy if has_lobe else matte
-    with torch.no_grad():
-        params.material.albedo_logits.copy_(chosen.material.albedo_logits)
-        params.log_specular_scale.copy_(chosen.log_specular_scale)
+    (with_lobe, error), (without, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
+    return with_lobe if error < (1 - MIN_EXPLAINED) * error_without else without
 
 
 @torch.no_grad()
@@ -269,17 +265,21 @@ def _start(params: Params, brighter: Float[Tensor, "n 3"], log_scale: float) -> 
     return replace(params, material=material, log_specular_scale=torch.full_like(params.log_specular_scale, log_scale))
 
 
-def _trial_error(cfg: Config, inputs: Inputs, state: State, start: Params) -> float:
-    """Mean photometric term in the second half of a trial, which leaves the state as it is."""
-    steps = min(cfg.steps, TRIAL_STEPS)
+def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[State, float]:
+    """The state after the first steps from other parameters, and the mean photometric term in their second half.
+
+    Geometry and the resolution of the light stay as they are, so that visibility does, too.
+    """
+    steps = min(cfg.steps // 3, TRIAL_STEPS)
     cfg = replace(cfg, warmup=steps, doublings=0)
     params, rng = optim.leaves(start), torch.Generator()
-    rng.set_state(state.rng.get_state())
-    trial = State(0, params, optim.adam(params, learning_rates(cfg)), rng, dict(state.memory))
+    rng.set_state(before.rng.get_state())
+    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, dict(before.memory))
     errors = []
-    for trial.step in range(steps):
-        errors.append(step(cfg, inputs, trial)["render"])
-    return float(torch.stack(errors[steps // 2 :]).mean())
+    for state.step in range(steps):
+        errors.append(step(cfg, inputs, state)["render"])
+    state.step = steps
+    return state, float(torch.stack(errors[steps // 2 :]).mean())
 
 
 @torch.no_grad()
