@@ -427,7 +427,7 @@ def test_visibility_is_traced_again_only_when_geometry_has_moved(
     taken = folder.load(capture)
     refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
     inputs = decompose.Inputs(taken, refined)
-    cfg = dataclasses.replace(RECIPE.decompose, warmup=0)
+    cfg = dataclasses.replace(RECIPE.decompose, warmup=0, try_matte=False)
     state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
     looks: list[int] = []
     monkeypatch.setattr(decompose, "_trace_visibility", lambda cfg, inputs, state: looks.append(state.step))

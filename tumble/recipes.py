@@ -44,6 +44,9 @@ PROJ = 0.1
 MASK = 3.0
 """Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
+DIAMETER = 107.0
+"""Diameter of an object that fills an image of 128 x 128 pixels, for which DRAFT's numbers of Gaussians were chosen."""
+
 OURS = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
 """What our recipes share: the default configuration of every stage, and realigned poses."""
 
@@ -144,6 +147,7 @@ DRAFT = replace(
         points=9_000,
         densification=densify.Config(refine_every=300, max_gaussians=16_000),
         hull=96,
+        diameter=DIAMETER,
         weights=replace(OURS.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
         crease=CREASE,
         rates=replace(OURS.refine.rates, specular_scale=0.02),
@@ -441,7 +445,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
         *(f"refine.rates.{name}" for name in ("means", "quats", "log_scales", "albedo", "light", "sh", "sh_rest")),
         *("refine.rates.decay", "refine.rates.others_decay"),
     ),
-    "densification": ("refine.densification",),
+    "densification": ("refine.densification", "refine.diameter"),
     "squared-mask": ("refine.mask_loss", "refine.weights.mask"),
     "normals": ("refine.weights.normal", "refine.crease", "refine.ramp"),
     "projection": ("refine.weights.proj",),

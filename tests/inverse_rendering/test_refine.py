@@ -58,6 +58,18 @@ def test_alignment_corrects_wrong_poses_and_keeps_correct_ones() -> None:
     assert degrees.max() < 0.25, degrees
 
 
+@pytest.mark.parametrize(("distance", "factor"), [(2.0, 2.0), (4.0, 1.0), (8.0, 1.0)])
+def test_an_object_that_more_pixels_show_has_more_gaussians(distance: float, factor: float) -> None:
+    _, true, capture = textured_sphere()
+    focal = float(capture.camera.fx_fy_cx_cy[0])
+    poses = SE3.from_rotation(true.rotation, torch.tensor([0.0, 0.0, distance]).expand(4, 3))
+    # At a distance of 4 radii the object has the diameter for which the numbers are meant.
+    cfg = replace(SMOKE.refine, points=100, hull=20, diameter=2 * focal / 4)
+    grown = refine.for_resolution(cfg, refine.Inputs(capture, Trajectory(poses, "camera")))
+    assert grown.densification.max_gaussians == factor * cfg.densification.max_gaussians
+    assert (grown.points, grown.hull) == (100 * factor, round(20 * math.sqrt(factor)))
+
+
 def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_pruned() -> None:
     _, true, capture = textured_sphere()
     growth = densify.Config(max_gaussians=600, grow_score=math.inf, refine_every=1000)

@@ -270,7 +270,7 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
 
     Geometry and the resolution of the light stay as they are, so that visibility does, too.
     """
-    steps = min(cfg.steps // 3, TRIAL_STEPS)
+    steps = max(1, min(cfg.steps // 3, TRIAL_STEPS))
     cfg = replace(cfg, warmup=steps, doublings=0)
     params, rng = optim.leaves(start), torch.Generator()
     rng.set_state(before.rng.get_state())

@@ -36,7 +36,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 13
+VERSION = 14
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3
@@ -111,6 +111,9 @@ class Config:
     """Initial number of Gaussians; not stated in the paper."""
     hull: int = 128
     """Cells per side of the visual hull's grid."""
+    diameter: float = 0.0
+    """Diameter of the object in the images up to which the numbers of Gaussians hold [pixels]. Where it is larger, both
+    numbers grow in proportion to it, and `hull` to its square root (`for_resolution`). 0: they never grow."""
     opacity: float = 0.9
     """Initial opacity."""
     gamma: float = 30.0
@@ -225,8 +228,22 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     return State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
 
 
+def for_resolution(cfg: Config, inputs: Inputs) -> Config:
+    """The settings with as many Gaussians as the images resolve, by the diameter of the object's sphere in them."""
+    focal, distances = inputs.capture.camera.fx_fy_cx_cy[0], inputs.trajectory.T_cam_obj.xyz.norm(dim=-1)
+    factor = max(1.0, float(2 * focal / distances.median()) / cfg.diameter) if cfg.diameter else 1.0
+    most = round(cfg.densification.max_gaussians * factor)
+    return replace(
+        cfg,
+        points=round(cfg.points * factor),
+        hull=round(cfg.hull * math.sqrt(factor)),
+        densification=replace(cfg.densification, max_gaussians=most),
+    )
+
+
 def _start(cfg: Config, inputs: Inputs, rng: torch.Generator) -> visual_hull.OrientedPoints:
     """Points on the initial surface."""
+    cfg = for_resolution(cfg, inputs)
     if cfg.start == "sphere":
         x_obj = fibonacci_sphere(cfg.points).to(inputs.trajectory.T_cam_obj.xyz)
         spacing = math.sqrt(4 * math.pi / cfg.points)
@@ -389,7 +406,7 @@ def _terms(
 @torch.no_grad()
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     """Score the Gaussians over random frames, then split and prune."""
-    params, camera, growth = state.params, inputs.capture.camera, cfg.densification
+    params, camera, growth = state.params, inputs.capture.camera, for_resolution(cfg, inputs).densification
     assert state.optimizer is not None, "init makes one"
     score = params.gamma.new_zeros(len(params.points.albedo_logits))
     frames = torch.randperm(len(inputs.capture), generator=state.rng)[: growth.score_views].tolist()
