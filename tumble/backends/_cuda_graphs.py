@@ -2,9 +2,9 @@
 
 torch captures everything that is launched on its current stream, in memory of its own (a private pool). Warp's kernels
 go to the same stream. Warp is told about the capture: it then keeps the modules of its kernels loaded for as long as
-the graph exists, and its sort takes its temporary memory from the graph. Captures are impossible on the default stream,
-and an operation of the backward pass waits for the stream of its parameter's first use; therefore all steps run on one
-stream of their own, not only the captured ones.
+the graph exists, and frees nothing meanwhile. Captures are impossible on the default stream, and an operation of the
+backward pass waits for the stream of its parameter's first use; therefore all steps run on one stream of their own, not
+only the captured ones.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -27,6 +27,7 @@ from tumble.backends._cuda_terms import (
     material_terms,
     sh_shade,
 )
+from tumble.backends._graphs import recording
 from tumble.backends._pairs import PairLimit
 
 __all__ = [
@@ -220,7 +221,11 @@ def _bin(
     tiles, listed = _int32(depth, 2 * room).fill_(n_all), _int32(depth, 2 * room)
     pairs = tiles[:room], listed[:room]
     runtime.launch(projection.list_tiles, len(order), order, ends, record, n_tiles, height, width, *pairs, longest)
-    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), room, end_bit=n_all.bit_length())
+    if recording():  # Warp's sort, which looks at fewer bits, would allocate memory of its own
+        in_order, of_sorted = pairs[0].sort(stable=True)
+        pairs = in_order, pairs[1][of_sorted]
+    else:
+        warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), room, end_bit=n_all.bit_length())
     starts = torch.searchsorted(pairs[0], _all_tiles(n_all, depth.device), out_int32=True)
     return starts, pairs[1]
 

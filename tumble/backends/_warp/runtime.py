@@ -57,7 +57,7 @@ def _stream_of(stream: torch.cuda.Stream) -> Any:
 def told_of_capture(device: torch.device) -> Iterator[list[Any]]:
     """Context in which Warp knows that torch captures its current stream; afterwards the list holds Warp's graph.
 
-    Warp frees temporary memory of its sort, and unloads kernels that nobody else needs, when that graph is deleted.
+    Kernels stay loaded as long as that exists.
     """
     graph: list[Any] = []
     with stream(device):
