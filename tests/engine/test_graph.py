@@ -218,6 +218,12 @@ def test_a_cuda_graph_is_captured_on_the_stream_of_the_session_and_known_to_warp
     expected = ["wait", "stream", "capture", "warp True", "work True", "end of warp", "end of capture", "replay"]
     assert calls == [*expected, "end of stream", "wait"]
 
+    def refused() -> None:
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    with pytest.raises(RuntimeError, match=r"cannot be captured as a CUDA graph \(operation not .* leave --graph out"):
+        recorder.record(refused)
+
 
 @pytest.mark.parametrize("numbers", [Numbers(3, 0.25, True), Numbers(-1, 1e30, False)])
 def test_numbers_and_rates_arrive_as_they_were_sent(numbers: Numbers) -> None:

@@ -50,8 +50,11 @@ class CudaRecorder:
         graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self.device)
         # Only this thread must do nothing that a capture forbids, not those that torch or the user runs beside it.
         capture = torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local")
-        with as_recording(), capture, runtime.told_of_capture(self.device) as of_warp:
-            result = work()
+        try:
+            with as_recording(), capture, runtime.told_of_capture(self.device) as of_warp:
+                result = work()
+        except RuntimeError as error:
+            raise RuntimeError(f"a step cannot be captured as a CUDA graph ({error}); leave --graph out") from error
 
         def replay() -> None:
             assert of_warp, "the capture has ended"  # Warp's part of the graph lives as long as this function
