@@ -25,6 +25,7 @@ from tumble.export import asset as export
 from tumble.export.asset import Preset
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files, tree, video
+from tumble.maths import SO3
 from tumble.report import page
 from tumble.scene.asset import Asset
 from tumble.scene.trajectory import Trajectory
@@ -235,6 +236,35 @@ def test_replayed_steps_are_those_that_nobody_recorded(
     assert recorder.sent == 40
     # A recording after three usual steps; a fourth one is the first of all, and the first that moves the Gaussians.
     assert (len(recorder.tapes), recorder.replays) == ((4, 40 - 4 * 3 - 1), (4, 40 - 4 * 3 - 2))[number]
+
+
+OTHERS: list[tuple[int, dict[str, Any]]] = [
+    (0, {"rates": {"poses": 1e-3}}),
+    (0, {"rates": {"poses": 1e-3}, "pose_model": "network", "mask_loss": "entropy"}),
+    (0, {"colour": "sh", "crease": 1.0}),
+    (1, {"rates": {"poses": 1e-3}, "pose_model": "network", "corners": False}),
+    (1, {"lobes": "sum", "bounce": "average"}),
+    (1, {"visibility": False, "smooth_light": "radiance", "rows": 64}),
+]
+"""Settings of other parts of the steps, by stage."""
+
+
+@pytest.mark.parametrize(("number", "settings"), OTHERS)
+def test_replayed_steps_of_other_settings_are_those_that_nobody_recorded(
+    number: int, settings: dict[str, Any], stages: list[Any]
+) -> None:
+    """Bit for bit, also under a light that turns."""
+    stage, cfg, inputs, _ = stages[number]
+    rates = dataclasses.replace(cfg.rates, **settings.get("rates", {}))
+    cfg = dataclasses.replace(cfg, **settings | {"steps": 8, "rates": rates})
+    cfg = dataclasses.replace(cfg, **({"ramp": 0.0} if stage is refine else {"warmup": 0, "doublings": 0}))
+    if stage is refine:
+        turns = SO3.exp(0.1 * torch.arange(12.0).view(4, 3)).matrix()
+        inputs = dataclasses.replace(inputs, trajectory=dataclasses.replace(inputs.trajectory, light_turns=turns))
+    with simulated_graphs() as recorder:
+        usual = loop.drive(stage, cfg, inputs, seed=1)
+        test_pipeline.assert_same(usual, loop.drive(stage, cfg, inputs, seed=1, graph=True))
+    assert recorder.replays >= 3
 
 
 def test_replayed_steps_with_rising_weights_are_usual_ones_with_their_numbers_on_the_device(

@@ -31,7 +31,7 @@ class Config:
     grow: int = 1000
     """Steps between two changes of the shape."""
     broken: str = ""
-    """What `advance` does that it must not do."""
+    """What `advance` does that it must not do; with "always" the stage says so."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def prepare(cfg: Config, inputs: Any, state: State) -> Numbers:
 def advance(cfg: Config, inputs: Any, state: State, numbers: Numbers) -> dict[str, Tensor | float]:
     assert state.optimizer is not None
     away = state.params["x"] - entry(torch.arange(12.0).view(4, 3), numbers.target)
-    if cfg.broken == "asks":
+    if cfg.broken in ("asks", "always"):
         float(away.detach().sum())
     if cfg.broken == "copies":
         away = away + torch.tensor([1.0, 2.0, 3.0])
@@ -75,6 +75,10 @@ def advance(cfg: Config, inputs: Any, state: State, numbers: Numbers) -> dict[st
     state.memory["sum"] += loss.detach()
     optim.descend(loss, state.optimizer, step=state.step)
     return {"loss": loss.detach()}
+
+
+def can_be_recorded(cfg: Config) -> bool:
+    return cfg.broken != "always"
 
 
 def step(cfg: Config, inputs: Any, state: State) -> dict[str, Tensor | float]:
@@ -90,8 +94,8 @@ THIS: Any = sys.modules[__name__]
 
 def stage_with(**parts: Any) -> Any:
     """This stage with other parts of its step, or none."""
-    same = {name: getattr(THIS, name) for name in ("VERSION", "Config", "length", "init", "step", "finish")}
-    return SimpleNamespace(**same, **parts)
+    names = ["VERSION", "Config", "length", "init", "step", "finish"] + ["can_be_recorded", "advance"] * bool(parts)
+    return SimpleNamespace(**{name: getattr(THIS, name) for name in names}, **parts)
 
 
 @pytest.fixture
@@ -146,7 +150,7 @@ def test_a_recording_whose_memory_became_too_small_is_made_again(
         longest.fill_(3 if state.step > 8 else 2)
         return replace(prepare(cfg, inputs, state), late=False)
 
-    drive(stage_with(prepare=fuller, advance=advance), Config(steps=24), None, seed=3, graph=True)
+    drive(stage_with(prepare=fuller), Config(steps=24), None, seed=3, graph=True)
     assert len(recorder.tapes) == 2
     assert (limit.capacity, recorder.replays) == (8, 20)
 
@@ -169,7 +173,12 @@ def test_a_gradient_that_is_not_finite_in_replayed_steps_stops_them(recorder: Si
         return replace(numbers, weight=float("nan") if state.step == 30 else 1.0, late=False)
 
     with pytest.raises(optim.NotFinite, match="in one of the last 50 steps is not finite at step 49"):
-        drive(stage_with(prepare=poisoned, advance=advance), Config(steps=60), None, seed=3, graph=True)
+        drive(stage_with(prepare=poisoned), Config(steps=60), None, seed=3, graph=True)
+
+
+def test_a_stage_that_cannot_be_recorded_ignores_the_option(recorder: SimulatedRecorder) -> None:
+    assert is_same(Config(broken="always"))
+    assert recorder.sent == 0
 
 
 def test_a_stage_in_one_part_ignores_the_option_and_the_cpu_refuses_it() -> None:

@@ -34,6 +34,10 @@ Step = Callable[[Any, Any, Any], Mapping[str, Tensor | float]]
 class SplitStage(Protocol):
     """A stage (`loop.Stage`) whose step is `prepare` and then `advance`."""
 
+    def can_be_recorded(self, cfg: Any) -> bool:
+        """Whether `advance` can be recorded with these settings; if not, all steps are usual ones."""
+        ...
+
     def prepare(self, cfg: Any, inputs: Any, state: Any) -> Any:
         """What must precede the step, and its numbers.
 
@@ -50,13 +54,14 @@ class SplitStage(Protocol):
 
 @contextmanager
 def steps(stage: Any, cfg: Any, inputs: Any, state: Any) -> Iterator[Step]:
-    """The step of a stage, which is recorded and replayed if the stage is a `SplitStage`.
+    """The step of a stage, which is recorded and replayed if the stage is a `SplitStage` that allows it.
 
     Raises:
         ValueError: The state's device cannot record steps.
     """
-    if not isinstance(stage, SplitStage):
-        yield stage.step
+    usual: Step = stage.step
+    if not (isinstance(stage, SplitStage) and stage.can_be_recorded(cfg)):
+        yield usual
         return
     device = next(iter(tree.named_tensors(state.params).values())).device
     recorder = backends.recorder(device)

@@ -415,6 +415,11 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     return advance(cfg, inputs, state, prepare(cfg, inputs, state))
 
 
+def can_be_recorded(cfg: Config) -> bool:
+    """Whether `advance` never waits for the device: a hierarchy to trace shadows in is built with its values."""
+    return cfg.shadows == "cached" or not cfg.visibility
+
+
 def prepare(cfg: Config, inputs: Inputs, state: State) -> PixelNumbers:
     """A finer light, visibility and learning rates where they are due, and the numbers of the next step."""
     assert state.optimizer is not None, "init makes one"
@@ -440,14 +445,9 @@ def advance(cfg: Config, inputs: Inputs, state: State, numbers: PixelNumbers) ->
     corners, mean_albedo = corner_features(shifted_material(params if cfg.corners else without_corners(params)))
     view = rasterize_material(params, corners, T_cam_obj, capture.camera)
     photo, mask = (entry(x, frame).to(view.alpha.device) for x in (capture.images, capture.masks))
-    shown = _Shown(
-        view,
-        pixels_at(numbers.place, cfg.pixels, view.alpha, mask == OBJECT),
-        photo,
-        T_cam_obj,
-        inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj),
-        numbers.current,
-    )
+    pixels = pixels_at(numbers.place, cfg.pixels, view.alpha, mask == OBJECT)
+    R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
+    shown = _Shown(view, pixels, photo, T_cam_obj, R_env_obj, numbers.current)
     of_view = losses.material_terms(view, photo, mask)
     terms = {
         "render": _render_term(cfg, state, params, shown, capture.camera, mean_albedo),
