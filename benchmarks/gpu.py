@@ -10,6 +10,7 @@ order:
     draft     DRAFT on the bundled clip with its true poses, on the GPU and on the CPU: seconds, scores, difference
     profile   kernel launches, synchronisations and copies in one step of stages 2 and 3
     standard  STANDARD on `--capture`, or on the bundled clip with 200 frames of 512 x 512: seconds, memory, scores
+    graphs    milliseconds of a step of stages 2 and 3 with and without a CUDA graph (`tumble run --graph`)
 
 Each part is a process of its own with a limit of time. A part that fails, or is stopped at its limit, is marked in
 `gpu.json` beside what it measured until then, and the next part runs. `--dry` runs everything on the CPU with tiny
@@ -34,6 +35,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -42,7 +44,7 @@ import torch
 from benchmarks import kernels
 from tumble import backends, demo
 from tumble.datasets import folder, save_capture
-from tumble.engine import loop, run
+from tumble.engine import graph, loop, run
 from tumble.evaluation import align_views, predict_views, read_with_truth, score
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files, tree
@@ -52,7 +54,7 @@ from tumble.scene import Asset, Capture, Truth
 
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (100_000, 256), (100_000, 512), (100_000, 1024)]
 """Rasterization cases on a GPU: number of Gaussians, and image width [pixels]."""
-LIMITS = {"tests": 130.0, "kernels": 50.0, "draft": 120.0, "profile": 30.0, "standard": 190.0}
+LIMITS = {"tests": 120.0, "kernels": 50.0, "draft": 120.0, "profile": 30.0, "standard": 180.0, "graphs": 20.0}
 """Time of each part, without what earlier parts leave of theirs [s]."""
 GRACE = 20.0
 """Time in which a stopped part writes its results before it is killed [s]."""
@@ -64,6 +66,8 @@ WARMUP_STEPS = 20
 """Steps before the profile."""
 PROFILED_STEPS = 10
 """Steps of the profile."""
+TIMED_STEPS = 50
+"""Steps that are timed with and without a CUDA graph."""
 
 Row = dict[str, Any]
 """Results of a part, which the part fills in as it goes on."""
@@ -314,6 +318,41 @@ def profile(plan: Plan, row: Row) -> None:
         row[name] = profile_stages(path, known_poses(recipe), plan.device)
 
 
+def graphs(plan: Plan, row: Row) -> None:
+    """Milliseconds of a step of DRAFT on the bundled clip, by stage; `replayed` is that with a CUDA graph."""
+    recipe = known_poses(draft_recipe(plan))
+    capture = tree.to(folder.load(posed_clip(plan.out / "clip")), plan.device)
+    assert capture.trajectory is not None
+    inputs = refine.Inputs(capture, capture.trajectory)
+    state = time_steps(plan, row, refine, recipe.refine, inputs)
+    third = decompose.Inputs(capture, refine.finish(recipe.refine, inputs, state))
+    time_steps(plan, row, decompose, recipe.decompose, third)
+
+
+def time_steps(plan: Plan, row: Row, stage: Any, cfg: Any, inputs: Any) -> loop.State:
+    """Fill in the times of a stage's steps; returns its state after those that were launched one by one."""
+    wait = (lambda: None) if plan.dry else torch.cuda.synchronize
+    times = row[stage.__name__.rpartition(".")[2]] = {}
+
+    def timed(step: Callable[[], None], n: int) -> float:
+        wait()
+        started = time.perf_counter()
+        for _ in range(n):
+            step()
+        wait()
+        return round((time.perf_counter() - started) / n * 1e3, 3)
+
+    state = state_after(stage, cfg, inputs, WARMUP_STEPS)
+    times["usual"] = timed(lambda: run_step(stage, cfg, inputs, state), TIMED_STEPS)
+    if not plan.dry:
+        other = state_after(stage, cfg, inputs, WARMUP_STEPS)
+        with graph.steps(stage, cfg, inputs, other) as step:
+            replayed = SimpleNamespace(step=step)
+            times["until_replayed"] = timed(lambda: run_step(replayed, cfg, inputs, other), graph.WARMUP + 1)
+            times["replayed"] = timed(lambda: run_step(replayed, cfg, inputs, other), TIMED_STEPS)
+    return state
+
+
 def profile_stages(path: Path, recipe: Recipe, device: torch.device) -> Row:
     """Profile of a step of each stage."""
     capture = tree.to(folder.load(path), device)
@@ -394,6 +433,7 @@ PARTS: dict[str, Callable[[Plan, Row], None]] = {
     "draft": draft,
     "profile": profile,
     "standard": standard,
+    "graphs": graphs,
 }
 """The parts, by name and in their order."""
 

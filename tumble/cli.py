@@ -179,6 +179,7 @@ def run(
     size: Size = None,
     pick: bool = False,
     device: Device = "cpu",
+    graph: bool = False,
     seed: int = 0,
 ) -> None:
     """Reconstruct an object from a video: its motion, geometry, albedo and roughness, and the light of the room.
@@ -200,6 +201,8 @@ def run(
         adjustment: Orientation and colour of the results.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`; then, if you
             like, look at the masks and correct them by clicks on any frame.
+        graph: Record a step of the optimisation on the GPU and replay it as a whole, as a CUDA graph. Needs
+            `--device cuda`. No GPU has run it yet.
         seed: Seed of all random numbers.
     """
     from dataclasses import replace
@@ -212,9 +215,8 @@ def run(
     if tracking.route:
         recipe = progressive_poses(recipe) if tracking.route == "progressive" else replace(recipe, track=DRAFT.track)
     options = at_quality(options, quality, frames=frames, size=size)
-    print(
-        run_capture(capture, out, recipe, options, poses=tracking.poses, pick=pick, device=device, **vars(adjustment))
-    )
+    place = {"device": device, "graph": graph}
+    print(run_capture(capture, out, recipe, options, poses=tracking.poses, pick=pick, **place, **vars(adjustment)))
 
 
 def batch(

@@ -57,6 +57,7 @@ from tumble.backends._geometry.contract import (
     FuseKernel,
     ReducedBundle,
 )
+from tumble.backends._graphs import Recorder, Recording, as_recording, recording
 
 __all__ = [
     "ALPHA_MAX",
@@ -85,6 +86,8 @@ __all__ = [
     "OBJECT",
     "RATIO_MAX",
     "ROUGHNESS_MIN",
+    "Recorder",
+    "Recording",
     "ReducedBundle",
     "RelightKernel",
     "Rendering",
@@ -100,6 +103,7 @@ __all__ = [
     "T_MIN",
     "UNKNOWN",
     "VISIBLE",
+    "as_recording",
     "blend_kernel",
     "bundle_kernel",
     "choose",
@@ -107,6 +111,8 @@ __all__ = [
     "load",
     "names",
     "origin_of_kernels",
+    "recorder",
+    "recording",
     "relight_kernel",
     "threads",
     "threads_for_kernels",
@@ -265,6 +271,21 @@ def bundle_kernel() -> BundleKernel | None:
     """The kernel of bundle adjustment, which runs on the CPU; None if it is not ready."""
     backend = load("cpu")
     return None if backend.ready(torch.device("cpu"), torch.float32) else cast(BundleKernel, backend)
+
+
+def recorder(device: torch.device) -> Recorder:
+    """What records steps on a device, to replay them as a whole. No GPU has run it yet.
+
+    Raises:
+        ValueError: The device has none, as the CPU, or its kernels are not ready.
+    """
+    make = getattr(load(device.type), "recorder", None) if device.type in names() else None
+    if make is None:
+        fix = "add --device cuda, or leave --graph out"
+        raise ValueError(f"--graph: only an NVIDIA GPU can record steps, not the device {device.type}; {fix}")
+    if reason := load(device.type).ready(device, torch.float32):
+        raise ValueError(f"--graph: {reason}")
+    return make(device)
 
 
 @cache

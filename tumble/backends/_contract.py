@@ -99,8 +99,8 @@ class Leaf(NamedTuple):
     """Running mean of the gradient's square."""
     count: Float[Tensor, ""]
     """Number of steps so far, in float32; advanced in place."""
-    rate: float
-    """Learning rate."""
+    rate: float | Float[Tensor, ""]
+    """Learning rate: a number, or a float32 on the device, which a recording of the step reads."""
 
 
 @runtime_checkable

@@ -532,7 +532,7 @@ def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, be
     rows = []
     for leaf in leaves:
         count = int(leaf.count) + 1
-        corrections = leaf.rate / (1 - beta_1**count), math.sqrt(1 - beta_2**count)
+        corrections = float(leaf.rate) / (1 - beta_1**count), math.sqrt(1 - beta_2**count)
         rows.append((*(x.data_ptr() for x in leaf[:4]), leaf.value.numel(), *corrections))
     rates = {"beta_2": beta_2, "rest_1": 1 - beta_1, "rest_2": 1 - beta_2, "eps": eps}
     struct = AdamStep(n_leaves=len(rows), threads=threads(), **rates)

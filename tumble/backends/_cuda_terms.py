@@ -5,6 +5,7 @@ A kernel that adds to a result needs whole warps of threads and a result of zero
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from itertools import accumulate
 from typing import Any
 
@@ -384,11 +385,19 @@ def adam(leaves: Sequence[Leaf], loss: Tensor, failed: Tensor, beta_1: float, be
         for group in _groups(leaves):
             corrections = loss.new_empty(len(group), 2)
             values, gradients, firsts, seconds, counts, rates = zip(*group, strict=True)
-            ends = _ends(values)
-            runtime.launch(parameters.count_step, len(group), counts, rates, beta_1, beta_2, failed, corrections)
+            ends, one = _ends(values), _one(loss.device)
+            factors = [x if isinstance(x, Tensor) else one for x in rates]
+            numbers = [1.0 if isinstance(x, Tensor) else x for x in rates]
+            counted = counts, numbers, factors, beta_1, beta_2, failed, corrections
+            runtime.launch(parameters.count_step, len(group), *counted)
             moved = values, gradients, firsts, seconds, ends, corrections
-            factors = beta_2, 1 - beta_1, 1 - beta_2, eps
-            runtime.launch(parameters.adam_step, ends[-1], *moved, *factors, failed)
+            runtime.launch(parameters.adam_step, ends[-1], *moved, beta_2, 1 - beta_1, 1 - beta_2, eps, failed)
+
+
+@cache
+def _one(device: torch.device) -> Float[Tensor, ""]:
+    """The number 1 on a device."""
+    return torch.ones((), device=device)
 
 
 def _groups(items: Sequence[Any]) -> Iterator[Sequence[Any]]:

@@ -6,17 +6,16 @@ GPU differ by rounding errors. The kernels run on the device of the tensors; on 
 """
 
 import importlib.util
-import warnings
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.nn.functional import pad
 
 from tumble.backends import Hits, Rendering
+from tumble.backends._cuda_graphs import CudaRecorder
 from tumble.backends._cuda_shading import lookup, prefilter, shade, shading_term
 from tumble.backends._cuda_terms import (
     activate,
@@ -28,6 +27,8 @@ from tumble.backends._cuda_terms import (
     material_terms,
     sh_shade,
 )
+from tumble.backends._graphs import recording
+from tumble.backends._pairs import PairLimit
 
 __all__ = [
     "activate",
@@ -40,9 +41,11 @@ __all__ = [
     "image_terms",
     "lookup",
     "material_terms",
+    "pair_limits",
     "prefilter",
     "rasterize",
     "ready",
+    "recorder",
     "sh_shade",
     "shade",
     "shading_term",
@@ -60,6 +63,11 @@ def ready(device: torch.device, dtype: torch.dtype) -> str:
     if importlib.util.find_spec("warp") is None:
         return "the kernels need NVIDIA Warp; install it: pip install 'tumble[cuda]'"
     return ""
+
+
+def recorder(device: torch.device) -> CudaRecorder:
+    """See `backends.recorder`."""
+    return CudaRecorder(device, pair_limits)
 
 
 def rasterize(
@@ -165,59 +173,18 @@ def _threads(starts: Int32[Tensor, " tiles_1"]) -> int:
     return (len(starts) - 1) * TILE * TILE
 
 
-LOOK_EVERY = 64
-"""Views after which the host asks a GPU for the number of pairs again."""
+_limits: dict[tuple[torch.device, int, int], PairLimit] = {}
+"""Limits of training views by device and size."""
 
 
-@dataclass
-class PairLimit:
-    """Length of the lists of tiles for views of one size in training, so that the host need not wait for the true one.
-
-    Lists are at least twice as long as those of the first view of as many Gaussians. The device keeps the length of the
-    longest since; the host looks at it after 1, 2, 4, 8, ... views, at least every `LOOK_EVERY`, and before each view
-    without gradients, whose lists have the true length. Lists that were more than half full become longer. Had a view
-    more pairs than its lists could hold, those of the Gaussians farthest from the camera were left out of it; then a
-    warning says so.
-    """
-
-    capacity: int = 0
-    """Pairs of a tile and a Gaussian that the lists hold."""
-    n: int = -1
-    """Number of Gaussians for which this was found."""
-    views: int = 0
-    """Views of as many Gaussians so far."""
-    longest: Int32[Tensor, "1"] | None = None
-    """Number of pairs of the view with most of them, on the device."""
-
-    def room(self, ends: Int64[Tensor, " n"]) -> tuple[int, Int32[Tensor, "1"]]:
-        """Capacity for a view whose i-th Gaussian by depth has its pairs before `ends[i]`, and `longest`."""
-        if len(ends) != self.n or self.longest is None:
-            self.look()
-            self.n, self.views, self.longest = len(ends), 0, _int32(ends, 1).zero_()
-            self.capacity = _power_of_two(2 * int(ends[-1]))
-        elif self.views & (self.views - 1) == 0 or self.views % LOOK_EVERY == 0:
-            self.look()
-        self.views += 1
-        return self.capacity, self.longest
-
-    def look(self) -> None:
-        """Wait for the number of pairs of the view with most of them, and make lists longer if need be."""
-        found = int(self.longest) if self.longest is not None else 0
-        if found > self.capacity:
-            lost = f"{found - self.capacity} of {found} pairs of a tile and a Gaussian"
-            warnings.warn(f"a training view left out {lost}, far from the camera", RuntimeWarning, stacklevel=2)
-        self.capacity = max(self.capacity, _power_of_two(2 * found))
-
-
-@cache
 def _limit(device: torch.device, height: int, width: int) -> PairLimit:
     """The limit for views of a size."""
-    return PairLimit()
+    return _limits.setdefault((device, height, width), PairLimit())
 
 
-def _power_of_two(n: int) -> int:
-    """The smallest power of two that is at least n."""
-    return 1 << max(0, n - 1).bit_length()
+def pair_limits(device: torch.device) -> list[PairLimit]:
+    """The limits for views of all sizes so far, in the order of their first view."""
+    return [limit for (place, *_), limit in _limits.items() if place.type == device.type]
 
 
 def _bin(
@@ -254,7 +221,11 @@ def _bin(
     tiles, listed = _int32(depth, 2 * room).fill_(n_all), _int32(depth, 2 * room)
     pairs = tiles[:room], listed[:room]
     runtime.launch(projection.list_tiles, len(order), order, ends, record, n_tiles, height, width, *pairs, longest)
-    warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), room, end_bit=n_all.bit_length())
+    if recording():  # Warp's sort, which looks at fewer bits, would allocate memory of its own
+        in_order, of_sorted = pairs[0].sort(stable=True)
+        pairs = in_order, pairs[1][of_sorted]
+    else:
+        warp.utils.radix_sort_pairs(warp.from_torch(tiles), warp.from_torch(listed), room, end_bit=n_all.bit_length())
     starts = torch.searchsorted(pairs[0], _all_tiles(n_all, depth.device), out_int32=True)
     return starts, pairs[1]
 

@@ -26,6 +26,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from tumble import __version__
+from tumble.engine import graph as graphs
 from tumble.engine import optim
 from tumble.engine.optim import NotFinite
 from tumble.io import BadFile, files, progress, read_tensors, tree, write_tensors
@@ -81,7 +82,11 @@ class Progress:
 
 @runtime_checkable
 class Stage(Protocol):
-    """Interface of a stage module, which may also define `preview(cfg, inputs, state)`, an image `u8[h w 3]`."""
+    """Interface of a stage module.
+
+    It may also define `preview(cfg, inputs, state)`, an image `u8[h w 3]`, and the two parts of its step
+    (`graph.SplitStage`).
+    """
 
     @property
     def VERSION(self) -> int:
@@ -122,6 +127,7 @@ def drive(
     report: Callable[[Progress], None] | None = None,
     name: str = "",
     key: str = "",
+    graph: bool = False,
 ) -> Any:
     """Train a stage from its start or its checkpoint to the end, and return its output.
 
@@ -138,8 +144,11 @@ def drive(
         report: Called after the first and the last step, and between them at most every `REPORT_SECONDS`.
         name: Name of the stage for messages.
         key: Hash of the inputs. A checkpoint with another key, version, configuration or seed is ignored.
+        graph: Whether the steps of a stage that offers it are recorded on the GPU and replayed as a whole (`graph`);
+            other stages ignore it. No GPU has run it yet.
 
     Raises:
+        ValueError: There is no GPU that can record the stage's steps.
         NotFinite: A tensor became NaN or infinite; the last valid checkpoint is kept.
         BadFile: The checkpoint does not match the stage.
         OSError: The checkpoint cannot be written; the previous one is kept.
@@ -159,9 +168,10 @@ def drive(
                 _write_preview(stage, cfg, inputs, state, checkpoint.with_name(PREVIEW))
 
         show = _step_reports(name, total, state.step, started - seconds, update, report)
-        with _interrupts() as interrupted:
+        steps = graphs.steps(stage, cfg, inputs, state) if graph else contextlib.nullcontext(stage.step)
+        with _interrupts() as interrupted, steps as step:
             while state.step < total:
-                scalars = _step(stage, cfg, inputs, state, checkpoint)
+                scalars = _step(step, cfg, inputs, state, checkpoint)
                 state.step += 1
                 show(state.step, scalars)
                 if state.step % every == 0 or state.step == total or interrupted():
@@ -197,9 +207,11 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _step(stage: Stage, cfg: Any, inputs: Any, state: State, checkpoint: Path | None) -> Mapping[str, Tensor | float]:
+def _step(
+    step: graphs.Step, cfg: Any, inputs: Any, state: State, checkpoint: Path | None
+) -> Mapping[str, Tensor | float]:
     try:
-        return stage.step(cfg, inputs, state)
+        return step(cfg, inputs, state)
     except NotFinite as error:
         raise _with_checkpoint(error, checkpoint) from error
 

@@ -54,6 +54,9 @@ class Adam:
     """Constant against division by zero."""
     state: dict[Tensor, dict[str, Tensor]] = field(default_factory=dict)
     """Moments and number of steps (`step`) of each leaf that has had a gradient."""
+    rates: list[Tensor] | None = None
+    """Learning rates on the device, one per group, in place of those of the groups: a recording of a step reads them
+    (`engine.graph`). The host then looks at no step; None for all other steps."""
     failed: Tensor | None = None
     """1 since the first loss or gradient that was not finite, from which on no leaf moves; else 0."""
 
@@ -70,13 +73,14 @@ class Adam:
         """Move every leaf that has a gradient, unless `failed` is or becomes 1; the host waits for no device."""
         if self.failed is None:
             self.failed = torch.zeros((), dtype=torch.float32, device=loss.device)
+        rates = self.rates or [group["lr"] for group in self.param_groups]
         moved = []
-        for group, x in zip(self.param_groups, gradients, strict=True):
+        for group, x, rate in zip(self.param_groups, gradients, rates, strict=True):
             if x is not None:
                 leaf = group["params"][0]
                 state = self.state_of(leaf)
                 first, second = (state[key] for key in MOMENTS)
-                moved.append(backends.Leaf(leaf, x, first, second, state["step"], group["lr"]))
+                moved.append(backends.Leaf(leaf, x, first, second, state["step"], rate))
         backends.choose(loss.device, loss.dtype).adam(moved, loss, self.failed, *self.betas, self.eps)
 
 
@@ -138,7 +142,8 @@ def anneal(optimizer: Adam, factor: dict[str, float] | float) -> None:
 def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     """One optimizer step on `loss`; leaves that the loss does not depend on keep their values and moments.
 
-    On a GPU the host looks only in every `CHECK_EVERY`th step whether all is finite.
+    On a GPU the host looks only in every `CHECK_EVERY`th step whether all is finite, and never if the optimizer's rates
+    lie on the device; then `check_steps` tells.
 
     Raises:
         NotFinite: The loss or a gradient holds NaN or infinity; no leaf was changed since.
@@ -147,6 +152,8 @@ def descend(loss: Float[Tensor, ""], optimizer: Adam, *, step: int) -> None:
     found = torch.autograd.grad(loss, leaves, allow_unused=True)
     gradients = [None if x is None else x.contiguous() for x in found]
     optimizer.step(gradients, loss.detach())
+    if optimizer.rates is not None:
+        return
     free = loss.device.type == "cpu"
     if (free or (step + 1) % CHECK_EVERY == 0) and optimizer.failed is not None and bool(optimizer.failed):
         if free:

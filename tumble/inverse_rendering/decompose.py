@@ -11,15 +11,16 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from tumble.engine import CACHE, State, optim
 from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
+from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_at, sample_pixels
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
-from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb, random_rotation
+from tumble.maths import SE3, Index, entry, fibonacci_sphere, linear_from_srgb, random_rotation
 from tumble.rendering import (
     AveragedBounce,
     Bounce,
@@ -292,7 +293,7 @@ def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
         view = render_gbuffer(params, T_cam_obj, capture.camera)
         truth = target_view(capture, frame, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
-        pixels = _sample_pixels(FIT_PIXELS * cfg.pixels, view.alpha, inner > 0.5, state.rng)
+        pixels = sample_pixels(FIT_PIXELS * cfg.pixels, view.alpha, inner > 0.5, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels[pixels >= 0])
         R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
         gaussian, rough = _dominant_gaussian(view, points), torch.full_like(points.normals[:, :1], cfg.roughness)
@@ -314,7 +315,7 @@ def _first_network(cfg: Config, refined: Refined, rng: torch.Generator) -> dict[
     return refined.pose_network or pose_network.initial(len(refined.trajectory), refined.albedo, rng)
 
 
-def _correction(params: Params, inputs: Inputs, frame: int | slice) -> SE3:
+def _correction(params: Params, inputs: Inputs, frame: Index | slice) -> SE3:
     """Correction of the poses of stage 2. A network also predicts those of stage 2, which are taken out."""
     now, before = params.pose_network, inputs.refined.pose_network
     correction = pose_network.correction(params.poses, now, frame)
@@ -383,9 +384,9 @@ def _retrace_if_moved(cfg: Config, inputs: Inputs, state: State) -> None:
         _trace_visibility(cfg, inputs, state)
 
 
-def pose(params: Params, inputs: Inputs, frame: int) -> SE3:
+def pose(params: Params, inputs: Inputs, frame: Index) -> SE3:
     """`T_cam_obj` of one frame."""
-    base = inputs.refined.trajectory.T_cam_obj[frame]
+    base = inputs.refined.trajectory.T_cam_obj.at(frame)
     if not params.poses.requires_grad and not params.pose_network:
         return base
     return _correction(params, inputs, frame) @ base
@@ -411,26 +412,42 @@ def shifted_material(params: Params) -> Material:
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """One optimisation step on random pixels of a random frame; the weighted loss terms."""
+    return advance(cfg, inputs, state, prepare(cfg, inputs, state))
+
+
+def can_be_recorded(cfg: Config) -> bool:
+    """Whether `advance` never waits for the device: a hierarchy to trace shadows in is built with its values."""
+    return cfg.shadows == "cached" or not cfg.visibility
+
+
+def prepare(cfg: Config, inputs: Inputs, state: State) -> PixelNumbers:
+    """A finer light, visibility and learning rates where they are due, and the numbers of the next step."""
     assert state.optimizer is not None, "init makes one"
     _upsample_light(cfg, state)
     _retrace_if_moved(cfg, inputs, state)
-    params, capture = state.params, inputs.capture
-    if state.step < cfg.warmup:
-        # Geometry and poses are fixed; this saves half of the rasterizer's backward pass.
+    decayed = cfg.rates.decay ** (state.step / cfg.steps)
+    later = decayed * (state.step >= cfg.warmup)
+    optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})
+    frame = int(torch.randint(len(inputs.capture), (1,), generator=state.rng))
+    place = float(torch.rand((), generator=state.rng))
+    return PixelNumbers(frame, place, state.step % cfg.sets, state.step < cfg.warmup)
+
+
+def advance(cfg: Config, inputs: Inputs, state: State, numbers: PixelNumbers) -> dict[str, Tensor | float]:
+    """One optimisation step on some pixels of one frame; replaces no tensor of the state."""
+    assert state.optimizer is not None, "init makes one"
+    params, capture, frame = state.params, inputs.capture, numbers.frame
+    if numbers.is_fixed:
+        # This saves half of the rasterizer's backward pass.
         fixed = {"gaussians": tree.detach(params.gaussians), "poses": params.poses.detach()}
         params = replace(params, **fixed, pose_network={})
-    frame = int(torch.randint(len(capture), (1,), generator=state.rng))
     T_cam_obj = pose(params, inputs, frame)
     corners, mean_albedo = corner_features(shifted_material(params if cfg.corners else without_corners(params)))
     view = rasterize_material(params, corners, T_cam_obj, capture.camera)
-    photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
-    shown = _Shown(
-        view,
-        _sample_pixels(cfg.pixels, view.alpha, mask == OBJECT, state.rng),
-        photo,
-        T_cam_obj,
-        inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj),
-    )
+    photo, mask = (entry(x, frame).to(view.alpha.device) for x in (capture.images, capture.masks))
+    pixels = pixels_at(numbers.place, cfg.pixels, view.alpha, mask == OBJECT)
+    R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
+    shown = _Shown(view, pixels, photo, T_cam_obj, R_env_obj, numbers.current)
     of_view = losses.material_terms(view, photo, mask)
     terms = {
         "render": _render_term(cfg, state, params, shown, capture.camera, mean_albedo),
@@ -439,9 +456,6 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         "material": cfg.weights.material * of_view["material"],
         "specular": cfg.weights.specular * (1 - (-params.log_specular_scale.exp().mean() / PENALTY_SCALE).exp()),
     }
-    decayed = cfg.rates.decay ** (state.step / cfg.steps)
-    later = decayed * (state.step >= cfg.warmup)
-    optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()}
 
@@ -449,21 +463,6 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 def _light_smoothness(cfg: Config, light: Environment) -> Float[Tensor, ""]:
     """The smoothness term of the environment map before its weight."""
     return losses.light_smoothness(light.log_radiance if cfg.smooth_light == "log radiance" else light.radiance)
-
-
-def _sample_pixels(
-    n: int, alpha: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"], rng: torch.Generator
-) -> Int64[Tensor, "{n}"]:
-    """`n` pixels that certainly show the object, counted row by row; -1 if there are no such pixels.
-
-    Systematic sampling: every n-th part of the list of these pixels gives one, all at the same place of their part. The
-    host asks the device for nothing.
-    """
-    count = ((alpha > 0.5) & mask).flatten().cumsum(0, dtype=torch.int32)
-    place = torch.arange(n, device=alpha.device) + float(torch.rand((), generator=rng))
-    total = count[-1]
-    rank = torch.minimum((place * (total / n)).int(), total - 1)
-    return torch.where(total > 0, torch.searchsorted(count, rank + 1), -1)
 
 
 @dataclass(frozen=True)
@@ -478,6 +477,8 @@ class _Shown:
     """Input image, sRGB."""
     T_cam_obj: SE3
     R_env_obj: Float[Tensor, "3 3"]
+    current: Index
+    """Set of directions."""
 
 
 def _render_term(
@@ -492,13 +493,13 @@ def _render_term(
     light = prefilter(params.environment) if cfg.lobes == "split" else None
     cached = cfg.visibility and cfg.shadows == "cached"
     if cached and light is not None and not light.is_finer and not isinstance(bounce, AveragedBounce):
-        shading = shading_light(light, _cached_visibility(cfg, state), bounce)
+        shading = shading_light(light, _cached_visibility(cfg, state, shown.current), bounce)
         pose = (shown.T_cam_obj, shown.R_env_obj)
         return losses.shading_term(shown.view, shown.pixels, shown.photo, camera, *pose, shading, f0)
     view, pixels = with_offset(shown.view), shown.pixels.clamp_min(0)
     points = surface(view, shown.T_cam_obj, camera, pixels=pixels)
     albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
-    visible = _pixel_visibility(cfg, state, params, points, _dominant_gaussian(view, points))
+    visible = _pixel_visibility(cfg, state, params, points, _dominant_gaussian(view, points), shown.current)
     material, lit = (points, albedo, rough), (shown.R_env_obj, visible)
     if light is None:
         shaded = shade(*material, params.environment, *lit, f0=f0, bounce=bounce)
@@ -523,26 +524,29 @@ def _bounce(cfg: Config, state: State, params: Params, albedo: Float[Tensor, "n 
     return Bounce(albedo, state.memory["transfer"])
 
 
-def _pixel_visibility(cfg: Config, state: State, params: Params, points: Surface, index: Tensor) -> Visibility:
-    """Visibility of pixels for this step's set of directions: of their points, or of the Gaussians `index`."""
-    directions = state.memory["directions"][state.step % cfg.sets]
+def _pixel_visibility(
+    cfg: Config, state: State, params: Params, points: Surface, index: Tensor, current: Index = 0
+) -> Visibility:
+    """Visibility of pixels for one set of directions: of their points, or of the Gaussians `index`."""
+    directions = entry(state.memory["directions"], current)
     if not cfg.visibility:
         return unoccluded(directions, len(index))
     if cfg.shadows == "traced":
         tracer = build_tracer(params.gaussians, params.gamma)
         at = (points.points.detach(), points.normals.detach(), directions)
         return visibility(tracer, *at, blockers=cfg.bounce != "none")
-    return _cached_visibility(cfg, state).gather(index)
+    return _cached_visibility(cfg, state, current).gather(index)
 
 
-def _cached_visibility(cfg: Config, state: State) -> Visibility:
-    """Visibility of all Gaussians for this step's set of directions, as it was last traced."""
-    memory, current = state.memory, state.step % cfg.sets
+def _cached_visibility(cfg: Config, state: State, current: Index = 0) -> Visibility:
+    """Visibility of all Gaussians for one set of directions, as it was last traced."""
+    memory = state.memory
+    directions, bits = (entry(memory[name], current) for name in ("directions", "bits"))
     if cfg.bounce == "none":
-        return Visibility(memory["directions"][current], memory["bits"][current], None)
+        return Visibility(directions, bits, None)
     if BLOCKERS not in memory:  # after a checkpoint was read
         memory[BLOCKERS] = torch.stack([v.blocker for v in _visibility_of_traced(cfg, state) if v.blocker is not None])
-    return Visibility(memory["directions"][current], memory["bits"][current], memory[BLOCKERS][current])
+    return Visibility(directions, bits, entry(memory[BLOCKERS], current))
 
 
 def _upsample_light(cfg: Config, state: State) -> None:

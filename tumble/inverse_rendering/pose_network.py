@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import gelu, linear
 
-from tumble.maths import SE3
+from tumble.maths import SE3, Index, entry
 
 EMBEDDING = 32
 """Numbers in the embedding of a frame."""
@@ -30,15 +30,15 @@ def initial(n_frames: int, like: Tensor, rng: torch.Generator) -> dict[str, Tens
     return {name: x.to(like) for name, x in network.items()}
 
 
-def tangents(network: dict[str, Tensor], frame: int | slice) -> Float[Tensor, "*f 6"]:
+def tangents(network: dict[str, Tensor], frame: Index | slice) -> Float[Tensor, "*f 6"]:
     """Tangent of the correction of one frame, or of several."""
-    hidden = network["embeddings"][frame]
+    hidden = _selected(network["embeddings"], frame)
     for layer in range(2):
         hidden = gelu(linear(hidden, network[f"weight{layer}"], network[f"bias{layer}"]))
     return linear(hidden, network["weight2"], network["bias2"])
 
 
-def correction(poses: Float[Tensor, "t 6"], network: dict[str, Tensor], frame: int | slice) -> SE3:
+def correction(poses: Float[Tensor, "t 6"], network: dict[str, Tensor], frame: Index | slice) -> SE3:
     """Motion in the camera frame that corrects the initial pose of one frame, or of several.
 
     Args:
@@ -46,4 +46,8 @@ def correction(poses: Float[Tensor, "t 6"], network: dict[str, Tensor], frame: i
         network: A network, or an empty dict.
         frame: Index of the frame, or slice of the frames.
     """
-    return SE3.exp(tangents(network, frame) if network else poses[frame])
+    return SE3.exp(tangents(network, frame) if network else _selected(poses, frame))
+
+
+def _selected(of_frames: Tensor, frame: Index | slice) -> Tensor:
+    return of_frames[frame] if isinstance(frame, slice) else entry(of_frames, frame)

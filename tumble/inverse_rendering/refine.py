@@ -20,7 +20,7 @@ from tumble.inverse_rendering.photometric_alignment import align_pose
 from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.io import tree
-from tumble.maths import SE3, fibonacci_sphere, spherical_harmonics
+from tumble.maths import SE3, Index, entry, fibonacci_sphere, spherical_harmonics
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
     Camera,
@@ -271,14 +271,14 @@ def _rates(cfg: Config) -> dict[str, float]:
     } | ({"pose_network": rates.poses} if learned else {})
 
 
-def pose(params: Params, inputs: Inputs, frame: int, *, corrected: bool = True) -> SE3:
+def pose(params: Params, inputs: Inputs, frame: Index, *, corrected: bool = True) -> SE3:
     """`T_cam_obj` of one frame.
 
     Args:
         corrected: Whether its tangent may differ from zero. If not, the exponential map, some hundred small operations,
             is skipped; the result is the same.
     """
-    base = inputs.trajectory.T_cam_obj[frame]
+    base = inputs.trajectory.T_cam_obj.at(frame)
     return pose_network.correction(params.poses, params.pose_network, frame) @ base if corrected else base
 
 
@@ -324,9 +324,31 @@ def _with_radiance(points: Points) -> Gaussians:
     return replace(gaussians, sh=torch.cat([gaussians.sh, points.sh_rest], 1)) if points.sh_rest.shape[1] else gaussians
 
 
+@dataclass(frozen=True)
+class FrameNumbers:
+    """What a step of stage 2 draws, and what changes from step to step; numbers may be tensors (`engine.graph`)."""
+
+    frame: Index
+    """Frame whose view is compared."""
+    ramp: float | Float[Tensor, ""]
+    """Fraction of the weights of the normal and variance terms (`Config.ramp`)."""
+    corrected: bool
+    """Whether poses may differ from the initial ones."""
+
+
 @threads_for_kernels()
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """One optimisation step on one frame, preceded by densification, visibility and alignment where they are due."""
+    return advance(cfg, inputs, state, prepare(cfg, inputs, state))
+
+
+def can_be_recorded(cfg: Config) -> bool:
+    """Whether `advance` never waits for the device."""
+    return True
+
+
+def prepare(cfg: Config, inputs: Inputs, state: State) -> FrameNumbers:
+    """Densification, visibility, alignment and learning rates where they are due, and the numbers of the next step."""
     assert state.optimizer is not None, "init makes one"
     progress, every = state.step / cfg.steps, cfg.densification.refine_every
     if state.step and state.step % every == 0 and progress < cfg.densification.refine_stop:
@@ -335,15 +357,22 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         _trace_visibility(inputs, state)
     if state.step in _alignment_steps(cfg):
         _align_poses(inputs, state)
-    params, camera = state.params, inputs.capture.camera
-    frame = _next_frame(state, len(inputs.capture))
-    T_cam_obj = pose(params, inputs, frame, corrected=_corrects_poses(cfg, state.step))
+    optim.anneal(state.optimizer, _rate_factors(cfg, progress))
+    ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
+    return FrameNumbers(_next_frame(state, len(inputs.capture)), ramp, _corrects_poses(cfg, state.step))
+
+
+def advance(cfg: Config, inputs: Inputs, state: State, numbers: FrameNumbers) -> dict[str, Tensor | float]:
+    """One optimisation step on one frame; replaces no tensor of the state."""
+    assert state.optimizer is not None, "init makes one"
+    params, camera, frame = state.params, inputs.capture.camera, numbers.frame
+    T_cam_obj = pose(params, inputs, frame, corrected=numbers.corrected)
     R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
     arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, camera)
     view = render(*arguments, visibility=cached_visibility(state))
-    state.memory["max_weight"] = torch.maximum(state.memory["max_weight"], view.weight.detach())
-    terms = _terms(cfg, params, view, inputs.capture, frame, T_cam_obj, progress)
-    optim.anneal(state.optimizer, _rate_factors(cfg, progress))
+    largest = state.memory["max_weight"]
+    torch.maximum(largest, view.weight.detach(), out=largest)
+    terms = _terms(cfg, params, view, inputs.capture, frame, T_cam_obj, numbers.ramp)
     optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
     return {name: value.detach() for name, value in terms.items()} | {
         "gaussians": float(len(params.points.albedo_logits))
@@ -369,8 +398,10 @@ def cached_visibility(state: State) -> VisibilityTransfer | None:
 
 def _next_frame(state: State, n: int) -> int:
     """Index of the next frame: every epoch visits all frames once, in random order."""
-    if state.step % n == 0 or not len(state.memory["order"]):
+    if not len(state.memory["order"]):
         state.memory["order"] = torch.randperm(n, generator=state.rng)
+    elif state.step % n == 0:
+        state.memory["order"].copy_(torch.randperm(n, generator=state.rng))
     return int(state.memory["order"][state.step % n])
 
 
@@ -380,22 +411,30 @@ def _rate_factors(cfg: Config, progress: float) -> dict[str, float]:
 
 
 def _terms(
-    cfg: Config, params: Params, view: Buffers, capture: Capture, frame: int, T_cam_obj: SE3, progress: float
+    cfg: Config,
+    params: Params,
+    view: Buffers,
+    capture: Capture,
+    frame: Index,
+    T_cam_obj: SE3,
+    ramp: float | Float[Tensor, ""],
 ) -> dict[str, Tensor]:
-    """Weighted loss terms (eq. 11) of the view of a frame, at a progress of 0 to 1."""
+    """Weighted loss terms (eq. 11) of the view of a frame; `ramp` is a fraction of the two weights that rise."""
     weights, camera = cfg.weights, capture.camera
-    ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
-    photo, mask = (x[frame].to(view.alpha.device) for x in (capture.images, capture.masks))
+    photo, mask = (entry(x, frame).to(view.alpha.device) for x in (capture.images, capture.masks))
+    fraction = 1.0 if isinstance(ramp, Tensor) else ramp
     factors = {
         "mask": weights.mask,
-        "normal": ramp * weights.normal,
-        "variance": ramp * weights.variance,
+        "normal": fraction * weights.normal,
+        "variance": fraction * weights.variance,
         "rank": weights.rank,
         "gamma": weights.gamma,
         "proj": weights.proj,
     }
     image = {"ssim_weight": cfg.ssim, "crease": cfg.crease, "weights": factors}
     terms = losses.image_terms(view, photo, mask, camera, T_cam_obj, **image)
+    if isinstance(ramp, Tensor):  # weights of kernels are numbers
+        terms |= {name: ramp * terms[name] for name in ("normal", "variance")}
     if cfg.mask_loss == "entropy":
         terms |= {"mask": weights.mask * losses.mask_entropy(view.alpha, mask)}
     own = (params.points.gaussians, params.gamma, view, camera, T_cam_obj)

@@ -15,6 +15,7 @@ from tumble.maths.directions import (
     texel_directions,
     texel_solid_angles,
 )
+from tumble.maths.entries import Index, entry
 from tumble.maths.images import (
     Box,
     crop,
@@ -34,6 +35,7 @@ __all__ = [
     "Box",
     "Damping",
     "GOLDEN_ANGLE",
+    "Index",
     "Linearised",
     "SE3",
     "SO3",
@@ -41,6 +43,7 @@ __all__ = [
     "crop",
     "crop_box",
     "direction_from_equirect",
+    "entry",
     "equirect_from_direction",
     "fibonacci_sphere",
     "interpolate",

@@ -19,6 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tumble.maths.entries import Index, entry
+
 SMALL = 1e-2
 """Squared angle below which series replace the closed forms, which divide 0 by 0 at zero."""
 COSINE_SERIES = tuple((-1) ** k / 4**k / math.factorial(2 * k) for k in range(6))
@@ -229,6 +231,10 @@ class SE3:
         index = _batch_index(index)
         return SE3(self.wxyz[index], self.xyz[index])
 
+    def at(self, index: Index) -> "SE3":
+        """One of a batch with one axis, also by an index that only the device knows."""
+        return SE3(entry(self.wxyz, index), entry(self.xyz, index))
+
 
 def slerp(a: SO3, b: SO3, t: float | Float[Tensor, "*t"]) -> SO3:
     """Spherical interpolation from `a` at t = 0 to `b` at t = 1 along the shortest path; `t` has the batch axes."""
@@ -287,9 +293,9 @@ def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> tuple[Float
         [(x, z, 2), (w, y, -2)], [(y, z, 2), (w, x, 2)], [(x, x, -2), (y, y, -2)],
     ]  # fmt: skip
     table = torch.zeros(4, 4, 9, dtype=dtype, device=device)
-    for entry, sums in enumerate(terms):
+    for number, sums in enumerate(terms):
         for i, j, factor in sums:
-            table[i, j, entry] = factor
+            table[i, j, number] = factor
     return table.flatten(0, 1), torch.eye(3, dtype=dtype, device=device).flatten()
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble.maths import SE3, SO3
+from tumble.maths import SE3, SO3, Index, entry
 
 Light = Literal["camera", "object"]
 """Frame in which the light is static."""
@@ -69,10 +69,10 @@ class Trajectory:
         R_env_obj = env_from_obj(self.T_cam_obj, self.light)
         return R_env_obj if self.light_turns is None else self.light_turns @ R_env_obj
 
-    def R_env_obj_at(self, frame: int, T_cam_obj: SE3) -> Float[Tensor, "3 3"]:
+    def R_env_obj_at(self, frame: Index, T_cam_obj: SE3) -> Float[Tensor, "3 3"]:
         """`R_env_obj` of a frame at another pose, such as a corrected one."""
         R_env_obj = env_from_obj(T_cam_obj, self.light)
-        return R_env_obj if self.light_turns is None else self.light_turns[frame] @ R_env_obj
+        return R_env_obj if self.light_turns is None else entry(self.light_turns, frame) @ R_env_obj
 
     @property
     def camera_positions(self) -> Float[Tensor, "t 3"]:

@@ -142,18 +142,20 @@ def find_not_finite(gradients: Addresses, ends: Ends, failed: wp.array[float]):
 def count_step(
     counts: Addresses,
     rates: Rates,
+    factors: Addresses,
     beta_1: wp.float64,
     beta_2: wp.float64,
     failed: wp.array[float],
     corrections: wp.array2d[float],
 ):
-    """Count a step of each leaf, and write its rate and root of the second moment with their corrections."""
+    """Count a step of each leaf, and write its rate (times its factor) and root of the second moment, corrected."""
     k = wp.tid()
     count = numbers(counts[k])
     n = count[0] + 1.0 - failed[0]
     count[0] = n
     one = wp.float64(1.0)
-    corrections[k, 0] = rates[k] / float(one - wp.pow(beta_1, wp.float64(n)))
+    factor = numbers(factors[k])
+    corrections[k, 0] = rates[k] * factor[0] / float(one - wp.pow(beta_1, wp.float64(n)))
     corrections[k, 1] = float(wp.sqrt(one - wp.pow(beta_2, wp.float64(n))))
 
 

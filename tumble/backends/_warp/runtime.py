@@ -9,8 +9,9 @@ Compiled kernels are cached in the folder of the CPU kernels unless $WARP_CACHE_
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
@@ -43,7 +44,28 @@ def stream(device: torch.device) -> AbstractContextManager[Any]:
     """Context in which Warp uses torch's current stream on a device."""
     if device.type != "cuda":
         return wp.ScopedDevice(str(device))
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(_stream_of(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+@cache
+def _stream_of(stream: torch.cuda.Stream) -> Any:
+    """A stream of torch as one of Warp; kept, since Warp forgets what it holds for a stream when the object ends."""
+    return wp.stream_from_torch(stream)
+
+
+@contextmanager
+def told_of_capture(device: torch.device) -> Iterator[list[Any]]:
+    """Context in which Warp knows that torch captures its current stream; afterwards the list holds Warp's graph.
+
+    Kernels stay loaded as long as that exists.
+    """
+    graph: list[Any] = []
+    with stream(device):
+        wp.capture_begin(force_module_load=False, external=True)
+        try:
+            yield graph
+        finally:
+            graph.append(wp.capture_end())
 
 
 Argument = Tensor | float | wp.uint64 | Sequence[Any] | Mapping[str, Any]
