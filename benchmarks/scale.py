@@ -114,7 +114,7 @@ def measure(pixels: int, gaussians: int, frames: int, directions: int) -> Row:
     capture, trajectory = scene(math.isqrt(pixels), frames)
     recipe, row = known_poses(DRAFT), {}
     growth = replace(recipe.refine.densification, max_gaussians=2 * gaussians)
-    second = replace(recipe.refine, points=gaussians, densification=growth)
+    second = replace(recipe.refine, points=gaussians, diameter=0.0, densification=growth)
     third = replace(recipe.decompose, directions=directions, sets=SETS, try_matte=False)
 
     def hull() -> None:
