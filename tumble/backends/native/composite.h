@@ -142,7 +142,7 @@ enum { GROUP = 8 };
 
 // Responses of a group at the pixels of a tile.
 struct Responses {
-    vf K[GROUP], l[GROUP], r[GROUP], zeta_1[GROUP];   // zeta_1: zeta - 1
+    vf K[GROUP], l[GROUP], r[GROUP], zeta_1[GROUP];   // r: 1 / q; zeta_1: zeta - 1
     vf raw[GROUP];                                    // alpha before it is limited, 0 where it is too small
     vf u[GROUP], v[GROUP];                            // corner coordinates before they are clamped
 };
@@ -152,14 +152,17 @@ INLINE void respond(const Raster& r, const Tile& t, const int* list, int n, Resp
     for (int i = 0; i < n; i++) {
         const float* f = r.record + (i64)list[i] * r.record_size;
         prefetch(r, list + i, r.record, RECORD + 4 * C);
-        vf dx = t.x - f[CX], dy = t.y - f[CY], beta = f[BX] * dx + f[BY] * dy, l = beta + 1.0f;
-        vf K = dx * (f[KA] * dx + f[KB] * dy) + f[KC] * dy * dy, bend = f[KAPPA] * K, q = l * l + bend, inv_q = inverse(q);
-        vf raw = f[OPACITY] * vexp2(-0.721347520f * K * inv_q), zeta_1 = -(l * beta + bend) * inv_q;
-        s.K[i] = K, s.l[i] = l, s.r[i] = inv_q, s.zeta_1[i] = zeta_1;
-        s.raw[i] = keep((K <= f[CUT] * q) & (raw >= r.alpha_min), raw);
-        if (!C) continue;
-        vf u = f[UX] * dx + f[UY] * dy, v = f[VX] * dx + f[VY] * dy;
-        s.u[i] = u + 0.5f + zeta_1 * (u + f[EU]), s.v[i] = v + 0.5f + zeta_1 * (v + f[EV]);
+        vf dx = t.x - f[CX], dy = t.y - f[CY], l = f[BX] * dx + f[BY] * dy + 1.0f;
+        vf K = dx * (f[KA] * dx + f[KB] * dy) + f[KC] * dy * dy;
+        s.K[i] = K, s.l[i] = l, s.r[i] = l * l + f[KAPPA] * K;
+        if (C) s.u[i] = f[UX] * dx + f[UY] * dy, s.v[i] = f[VX] * dx + f[VY] * dy;
+    }
+    for (int i = 0; i < n; i++) {
+        const float* f = r.record + (i64)list[i] * r.record_size;
+        vf K = s.K[i], l = s.l[i], q = s.r[i], inv_q = inverse(q), raw = f[OPACITY] * vexp2(-0.721347520f * K * inv_q);
+        vf zeta_1 = -(l * (l - 1.0f) + f[KAPPA] * K) * inv_q;
+        s.raw[i] = keep((K <= f[CUT] * q) & (raw >= r.alpha_min), raw), s.r[i] = inv_q, s.zeta_1[i] = zeta_1;
+        if (C) s.u[i] += 0.5f + zeta_1 * (s.u[i] + f[EU]), s.v[i] += 0.5f + zeta_1 * (s.v[i] + f[EV]);
     }
 }
 
@@ -282,13 +285,14 @@ INLINE void prefetch_seed(const Raster& r, const Tile& t, int row) {
 
 // The Gaussians of a group in the adjoint, between two parts of the computation.
 struct Visits : Responses {
-    vf T[GROUP], w[GROUP], v_u[GROUP], v_v[GROUP], value[GROUP];
+    vf T[GROUP], w[GROUP], v_u[GROUP], v_v[GROUP], v_zeta[GROUP], value[GROUP];
+    vf rho[GROUP], v_l[GROUP], v_K[GROUP], kappa[GROUP];
     float corner[GROUP][4][LANES];   // weights of the corners
 };
 
 // Computes responses and weights, and moves the transmittance behind the group.
 template <int C>
-INLINE void visit(const Raster& r, const Tile& t, const int* list, int n, vf& before, Visits& s) {
+APART void visit(const Raster& r, const Tile& t, const int* list, int n, vf& before, Visits& s) {
     respond<C>(r, t, list, n, s);
     vf T = before;
     for (int i = 0; i < n; i++) {
@@ -307,7 +311,7 @@ INLINE void visit(const Raster& r, const Tile& t, const int* list, int n, vf& be
 
 // Derivatives by the corner coordinates and the sum of the features' seeds times features.
 template <int C>
-INLINE void visit_features(const Raster& r, const int* list, int n, const Seeds<C>& seeds, Visits& s) {
+APART void visit_features(const Raster& r, const int* list, int n, const Seeds<C>& seeds, Visits& s) {
     for (int i = 0; i < n; i++) {
         const float* f = r.record + (i64)list[i] * r.record_size + RECORD;
         // Two chains of sums each, because the latency of one chain would stall the processor.
@@ -327,7 +331,7 @@ INLINE void visit_features(const Raster& r, const int* list, int n, const Seeds<
 
 // Adds the gradients of the features at the corners.
 template <int C>
-INLINE void visit_corners(const Raster& r, const int* list, int n, const Seeds<C>& seeds, const Visits& s, float* parts) {
+APART void visit_corners(const Raster& r, const int* list, int n, const Seeds<C>& seeds, const Visits& s, float* parts) {
     enum { WIDTH = PADDED<C + !C> };
     for (int j = 0; j < WIDTH; j += LANES) {
         vf rows[LANES];
@@ -346,6 +350,23 @@ INLINE void visit_corners(const Raster& r, const int* list, int n, const Seeds<C
     }
 }
 
+// Derivatives by w and zeta.
+template <int C>
+APART void visit_values(const Raster& r, const Tile& t, const int* list, int n, const Seeds<C>& seeds, Visits& s) {
+    for (int i = 0; i < n; i++) {
+        const float* f = r.record + (i64)list[i] * r.record_size;
+        vf depth = f[DZ] + f[PZ] * s.zeta_1[i], bent = depth * seeds.zz, slope = seeds.z + bent;
+        vf value = seeds.alpha + depth * slope, v_zeta = f[PZ] * (s.w[i] * (slope + bent));
+        for (int j = 0; j < 6; j++) value += seeds.fixed[j] * f[j < 3 ? RED + j : NX + j - 3];
+        if (C) {
+            vf dx = t.x - f[CX], dy = t.y - f[CY];
+            value += s.value[i];
+            v_zeta += s.v_u[i] * (f[UX] * dx + f[UY] * dy + f[EU]) + s.v_v[i] * (f[VX] * dx + f[VY] * dy + f[EV]);
+        }
+        s.value[i] = value, s.v_zeta[i] = v_zeta;
+    }
+}
+
 template <int C>
 static void adjoint_tile(const Raster& r, const Tile& t, const Tile& next, const int* list, int count, float* parts) {
     enum { N = C ? SUMS : S_U };
@@ -360,28 +381,30 @@ static void adjoint_tile(const Raster& r, const Tile& t, const Tile& next, const
             __builtin_prefetch(parts + (i64)list[i] * r.gradient_size);
         visit<C>(r, t, list, n, T, s);
         if (C) visit_features<C>(r, list, n, seeds, s);
+        visit_values<C>(r, t, list, n, seeds, s);
+        for (int i = 0; i < n; i++) {
+            const float* f = r.record + (i64)list[i] * r.record_size;
+            vf raw = s.raw[i], K = s.K[i], l = s.l[i], R = s.r[i], value = s.value[i], v_zeta = s.v_zeta[i];
+            rem -= s.w[i] * value;
+            vf v_alpha = s.T[i] * value - rem * inverse(1.0f - vmin(raw, splat(r.alpha_max)));
+            vf rho = keep(raw <= r.alpha_max, v_alpha * (-0.5f * raw));
+            vf v_r = rho * K + v_zeta * l, v_q = v_r * (R * R);   // -v_q
+            s.v_l[i] = v_zeta * R - 2.0f * l * v_q;
+            s.v_K[i] = rho * R - f[KAPPA] * v_q;
+            s.rho[i] = rho, s.kappa[i] = v_q * K;
+        }
         for (int i = 0; i < n; i++) {
             const float* f = r.record + (i64)list[i] * r.record_size;
             float* out = parts + (i64)list[i] * r.gradient_size;
-            vf dx = t.x - f[CX], dy = t.y - f[CY], w = s.w[i], raw = s.raw[i], K = s.K[i], l = s.l[i], R = s.r[i], zeta_1 = s.zeta_1[i];
-            vf depth = f[DZ] + f[PZ] * zeta_1, bent = depth * seeds.zz, slope = seeds.z + bent;
-            vf value = seeds.alpha + depth * slope, v_zeta = f[PZ] * (w * (slope + bent)), x[PADDED<N>] = {};
-            for (int j = 0; j < 6; j++) value += seeds.fixed[j] * f[j < 3 ? RED + j : NX + j - 3];
+            vf dx = t.x - f[CX], dy = t.y - f[CY], w = s.w[i];
+            vf x[PADDED<N>] = {};
             if (C) {
-                value += s.value[i];
-                vf v_u = s.v_u[i], v_v = s.v_v[i];
-                v_zeta += v_u * (f[UX] * dx + f[UY] * dy + f[EU]) + v_v * (f[VX] * dx + f[VY] * dy + f[EV]);
-                x[S_EU] = v_u * zeta_1, x[S_EV] = v_v * zeta_1;
-                x[S_U] = v_u + x[S_EU], x[S_V] = v_v + x[S_EV];
+                x[S_EU] = s.v_u[i] * s.zeta_1[i], x[S_EV] = s.v_v[i] * s.zeta_1[i];
+                x[S_U] = s.v_u[i] + x[S_EU], x[S_V] = s.v_v[i] + x[S_EV];
                 x[S_UX] = x[S_U] * dx, x[S_UY] = x[S_U] * dy, x[S_VX] = x[S_V] * dx, x[S_VY] = x[S_V] * dy;
             }
-            rem -= w * value;
-            vf v_alpha = s.T[i] * value - rem * inverse(1.0f - vmin(raw, splat(r.alpha_max)));
-            x[S_RHO] = keep(raw <= r.alpha_max, v_alpha * (-0.5f * raw));
-            vf v_r = x[S_RHO] * K + v_zeta * l, v_q = v_r * (R * R);   // -v_q
-            x[S_L] = v_zeta * R - 2.0f * l * v_q;
-            vf v_K = x[S_RHO] * R - f[KAPPA] * v_q;
-            x[S_KX] = v_K * dx, x[S_KY] = v_K * dy, x[S_KAPPA] = v_q * K;
+            x[S_RHO] = s.rho[i], x[S_L] = s.v_l[i], x[S_KAPPA] = s.kappa[i];
+            x[S_KX] = s.v_K[i] * dx, x[S_KY] = s.v_K[i] * dy;
             x[S_A] = x[S_KX] * dx, x[S_B] = x[S_KX] * dy, x[S_C] = x[S_KY] * dy;
             x[S_BX] = x[S_L] * dx, x[S_BY] = x[S_L] * dy;
             for (int j = 0; j < 6; j++) x[S_RGB + j] = w * seeds.fixed[j];

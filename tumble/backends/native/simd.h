@@ -21,6 +21,8 @@ typedef unsigned int u32;
 typedef long long i64;
 
 #define INLINE static inline __attribute__((always_inline))
+// Loops that keep many vectors in registers are functions of their own: merged into one, GCC moves some to memory.
+#define APART static __attribute__((noinline))
 #define METHOD inline __attribute__((always_inline))
 
 #if defined(__clang__)
