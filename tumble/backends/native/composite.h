@@ -73,22 +73,13 @@ INLINE void write_three(const Raster& r, float* image, const Tile& t, const vf* 
 template <int N>
 constexpr int PADDED = (N + LANES - 1) / LANES * LANES;
 
-// The r.c features per pixel, padded with zeros to C; all are 0 if the image is null.
+// The r.c features per pixel, one pixel after the other; what is read beyond the last one is undefined.
 template <int C>
-INLINE void read_features(const Raster& r, const float* image, const Tile& t, vf* features) {
-    float x[LANES * C + LANES];
-    for (int ch = 0; ch < C; ch++) features[ch] = vf{};
-    if (!image) return;
+INLINE void read_features(const Raster& r, const float* image, const Tile& t, float* to) {
     if (r.c == C)
-        read_pixels(r, image, t, C, x);   // a constant makes it faster
+        read_pixels(r, image, t, C, to);   // a constant makes it faster
     else
-        read_pixels(r, image, t, r.c, x);
-    for (int first = 0; first < C; first += LANES) {
-        vf group[LANES];
-        for (int l = 0; l < LANES; l++) group[l] = load(x + l * r.c + first);
-        transpose(group);
-        for (int i = 0; i < imin2(C - first, LANES); i++) features[first + i] = first + i < r.c ? group[i] : vf{};
-    }
+        read_pixels(r, image, t, r.c, to);
 }
 template <int C>
 INLINE void write_features(const Raster& r, const Tile& t, const vf* features) {
@@ -245,9 +236,29 @@ struct Seeds {
     float rows[LANES][PADDED<C + !C>];   // the same with one row per pixel
 };
 
+// Seeds of the features, both with a vector per feature and with a row per pixel, and what they contribute to that of alpha.
+template <int C>
+INLINE void seed_features(const Raster& r, const Tile& t, vf inv, Seeds<C>& s) {
+    float v[LANES * C + LANES], x[LANES * C + LANES], scale[LANES];
+    read_features<C>(r, r.v_features, t, v), read_features<C>(r, r.features, t, x), store(scale, inv);
+    vf products[LANES] = {};
+    for (int first = 0; first < C; first += LANES) {
+        vf group[LANES];
+        vi exists = lane_index() < r.c - first;
+        for (int l = 0; l < LANES; l++) {
+            group[l] = keep(exists, load(v + l * r.c + first) * scale[l]);
+            products[l] += keep(exists, group[l] * load(x + l * r.c + first));
+            store(s.rows[l] + first, group[l]);
+        }
+        transpose(group);
+        for (int i = 0; i < imin2(C - first, LANES); i++) s.features[first + i] = group[i];
+    }
+    s.alpha -= sums_of(products);
+}
+
 template <int C>
 INLINE void seed(const Raster& r, const Tile& t, Seeds<C>& s) {
-    vf alpha = read_one(r, r.alpha, t), x[C + 3], v[C + 3];
+    vf alpha = read_one(r, r.alpha, t), x[3], v[3];
     vi covered = t.inside & (alpha > 0.0f);
     vf inv = keep(covered, 1.0f / alpha);
     read_three(r, r.rgb, t, x), read_three(r, r.v_rgb, t, s.fixed);
@@ -255,18 +266,13 @@ INLINE void seed(const Raster& r, const Tile& t, Seeds<C>& s) {
     for (int i = 0; i < 3; i++) s.rem += s.fixed[i] * x[i];
     read_three(r, r.normal, t, x), read_three(r, r.v_normal, t, v);
     for (int i = 0; i < 3; i++) s.fixed[3 + i] = v[i] * inv, s.alpha -= s.fixed[3 + i] * x[i];
-    if (C) read_features<C + !C>(r, r.features, t, x), read_features<C + !C>(r, r.v_features, t, v);
-    for (int ch = 0; ch < C; ch++) s.features[ch] = v[ch] * inv, s.alpha -= s.features[ch] * x[ch];
     vf mean = read_one(r, r.depth, t) - r.t[2], v_var = read_one(r, r.v_depth_var, t);
     s.zz = v_var * inv;
     s.z = (read_one(r, r.v_depth, t) - 2.0f * mean * v_var) * inv;
     s.alpha -= s.z * mean + s.zz * (read_one(r, r.depth_var, t) + mean * mean);
-    for (int first = 0; first < C; first += LANES) {
-        vf group[LANES];
-        for (int i = 0; i < LANES; i++) group[i] = first + i < C ? s.features[first + i] : vf{};
-        transpose(group);
-        for (int l = 0; l < LANES; l++) store(s.rows[l] + first, group[l]);
-    }
+    if (C && r.v_features) return seed_features(r, t, inv, s);
+    for (int ch = 0; ch < C; ch++) s.features[ch] = vf{};
+    clear(s.rows, sizeof s.rows);
 }
 
 // Prefetches what `seed` reads in a row of a tile, without what the previous tile read. (GCC would drop the call if this
