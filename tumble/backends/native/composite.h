@@ -129,13 +129,13 @@ INLINE void prefetch(const Raster& r, const int* place, const float* array, int 
 
 // Gaussians of a tile are processed in groups, one part of the computation after the other for the whole group: the processor
 // overlaps what depends on no other Gaussian, and sums and seeds of features stay in registers.
-enum { GROUP = 8 };
+enum { GROUP = 12 };
 
 // Responses of a group at the pixels of a tile.
 struct Responses {
-    vf K[GROUP], l[GROUP], r[GROUP], zeta_1[GROUP];   // r: 1 / q; zeta_1: zeta - 1
-    vf raw[GROUP];                                    // alpha before it is limited, 0 where it is too small
-    vf u[GROUP], v[GROUP];                            // corner coordinates before they are clamped
+    vf K[GROUP], beta[GROUP], r[GROUP], zeta_1[GROUP];   // beta: l - 1; r: 1 / q; zeta_1: zeta - 1
+    vf raw[GROUP];                                       // alpha before it is limited, 0 where it is too small
+    vf u[GROUP], v[GROUP];                               // corner coordinates before they are clamped
 };
 
 template <int C>
@@ -143,15 +143,15 @@ INLINE void respond(const Raster& r, const Tile& t, const int* list, int n, Resp
     for (int i = 0; i < n; i++) {
         const float* f = r.record + (i64)list[i] * r.record_size;
         prefetch(r, list + i, r.record, RECORD + 4 * C);
-        vf dx = t.x - f[CX], dy = t.y - f[CY], l = f[BX] * dx + f[BY] * dy + 1.0f;
+        vf dx = t.x - f[CX], dy = t.y - f[CY], beta = f[BX] * dx + f[BY] * dy, l = beta + 1.0f;
         vf K = dx * (f[KA] * dx + f[KB] * dy) + f[KC] * dy * dy;
-        s.K[i] = K, s.l[i] = l, s.r[i] = l * l + f[KAPPA] * K;
+        s.K[i] = K, s.beta[i] = beta, s.r[i] = l * l + f[KAPPA] * K;
         if (C) s.u[i] = f[UX] * dx + f[UY] * dy, s.v[i] = f[VX] * dx + f[VY] * dy;
     }
     for (int i = 0; i < n; i++) {
         const float* f = r.record + (i64)list[i] * r.record_size;
-        vf K = s.K[i], l = s.l[i], q = s.r[i], inv_q = inverse(q), raw = f[OPACITY] * vexp2(-0.721347520f * K * inv_q);
-        vf zeta_1 = -(l * (l - 1.0f) + f[KAPPA] * K) * inv_q;
+        vf K = s.K[i], beta = s.beta[i], q = s.r[i], inv_q = inverse(q), raw = f[OPACITY] * vexp2(-0.721347520f * K * inv_q);
+        vf zeta_1 = -((beta + 1.0f) * beta + f[KAPPA] * K) * inv_q;
         s.raw[i] = keep((K <= f[CUT] * q) & (raw >= r.alpha_min), raw), s.r[i] = inv_q, s.zeta_1[i] = zeta_1;
         if (C) s.u[i] += 0.5f + zeta_1 * (s.u[i] + f[EU]), s.v[i] += 0.5f + zeta_1 * (s.v[i] + f[EV]);
     }
@@ -390,7 +390,7 @@ static void adjoint_tile(const Raster& r, const Tile& t, const Tile& next, const
         visit_values<C>(r, t, list, n, seeds, s);
         for (int i = 0; i < n; i++) {
             const float* f = r.record + (i64)list[i] * r.record_size;
-            vf raw = s.raw[i], K = s.K[i], l = s.l[i], R = s.r[i], value = s.value[i], v_zeta = s.v_zeta[i];
+            vf raw = s.raw[i], K = s.K[i], l = s.beta[i] + 1.0f, R = s.r[i], value = s.value[i], v_zeta = s.v_zeta[i];
             rem -= s.w[i] * value;
             vf v_alpha = s.T[i] * value - rem * inverse(1.0f - vmin(raw, splat(r.alpha_max)));
             vf rho = keep(raw <= r.alpha_max, v_alpha * (-0.5f * raw));
