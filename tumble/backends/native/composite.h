@@ -133,9 +133,9 @@ enum { GROUP = 12 };
 
 // Responses of a group at the pixels of a tile.
 struct Responses {
-    vf K[GROUP], beta[GROUP], r[GROUP], zeta_1[GROUP];   // beta: l - 1; r: 1 / q; zeta_1: zeta - 1
-    vf raw[GROUP];                                       // alpha before it is limited, 0 where it is too small
-    vf u[GROUP], v[GROUP];                               // corner coordinates before they are clamped
+    vf K[GROUP], l[GROUP], r[GROUP], zeta_1[GROUP];   // r: 1 / q; zeta_1: zeta - 1
+    vf raw[GROUP];                                    // alpha before it is limited, 0 where it is too small
+    vf u[GROUP], v[GROUP];                            // corner coordinates before they are clamped
 };
 
 template <int C>
@@ -144,16 +144,13 @@ INLINE void respond(const Raster& r, const Tile& t, const int* list, int n, Resp
         const float* f = r.record + (i64)list[i] * r.record_size;
         prefetch(r, list + i, r.record, RECORD + 4 * C);
         vf dx = t.x - f[CX], dy = t.y - f[CY], beta = f[BX] * dx + f[BY] * dy, l = beta + 1.0f;
-        vf K = dx * (f[KA] * dx + f[KB] * dy) + f[KC] * dy * dy;
-        s.K[i] = K, s.beta[i] = beta, s.r[i] = l * l + f[KAPPA] * K;
-        if (C) s.u[i] = f[UX] * dx + f[UY] * dy, s.v[i] = f[VX] * dx + f[VY] * dy;
-    }
-    for (int i = 0; i < n; i++) {
-        const float* f = r.record + (i64)list[i] * r.record_size;
-        vf K = s.K[i], beta = s.beta[i], q = s.r[i], inv_q = inverse(q), raw = f[OPACITY] * vexp2(-0.721347520f * K * inv_q);
-        vf zeta_1 = -((beta + 1.0f) * beta + f[KAPPA] * K) * inv_q;
-        s.raw[i] = keep((K <= f[CUT] * q) & (raw >= r.alpha_min), raw), s.r[i] = inv_q, s.zeta_1[i] = zeta_1;
-        if (C) s.u[i] += 0.5f + zeta_1 * (s.u[i] + f[EU]), s.v[i] += 0.5f + zeta_1 * (s.v[i] + f[EV]);
+        vf K = dx * (f[KA] * dx + f[KB] * dy) + f[KC] * dy * dy, bend = f[KAPPA] * K, q = l * l + bend, inv_q = inverse(q);
+        vf raw = f[OPACITY] * vexp2(-0.721347520f * K * inv_q), zeta_1 = -(l * beta + bend) * inv_q;
+        s.K[i] = K, s.l[i] = l, s.r[i] = inv_q, s.zeta_1[i] = zeta_1;
+        s.raw[i] = keep((K <= f[CUT] * q) & (raw >= r.alpha_min), raw);
+        if (!C) continue;
+        vf u = f[UX] * dx + f[UY] * dy, v = f[VX] * dx + f[VY] * dy;
+        s.u[i] = u + 0.5f + zeta_1 * (u + f[EU]), s.v[i] = v + 0.5f + zeta_1 * (v + f[EV]);
     }
 }
 
@@ -275,8 +272,8 @@ INLINE void seed(const Raster& r, const Tile& t, Seeds<C>& s) {
     clear(s.rows, sizeof s.rows);
 }
 
-// Prefetches what `seed` reads in a row of a tile, without what the previous tile read. (GCC would drop the call if this
-// were not inlined: it thinks that the function has no effect.)
+// Prefetches what `seed` reads in a row of a tile beyond the previous tile's: a large view is not in the cache. (If this were
+// not inlined, GCC would drop the call, because it thinks that it has no effect.)
 INLINE void prefetch_seed(const Raster& r, const Tile& t, int row) {
     if (row >= t.rows) return;
     const struct {
@@ -292,7 +289,7 @@ INLINE void prefetch_seed(const Raster& r, const Tile& t, int row) {
 // The Gaussians of a group in the adjoint, between two parts of the computation.
 struct Visits : Responses {
     vf T[GROUP], w[GROUP], v_u[GROUP], v_v[GROUP], v_zeta[GROUP], value[GROUP];
-    vf rho[GROUP], v_l[GROUP], v_K[GROUP], kappa[GROUP];
+    vf v_rho[GROUP], v_l[GROUP], v_K[GROUP], v_kappa[GROUP];   // v_kappa: -v_q K
     float corner[GROUP][4][LANES];   // weights of the corners
 };
 
@@ -373,9 +370,46 @@ APART void visit_values(const Raster& r, const Tile& t, const int* list, int n, 
     }
 }
 
+// Derivatives by l, K, kappa and rho; subtracts the group's shares from what the Gaussians behind it contribute.
+APART void visit_responses(const Raster& r, const int* list, int n, vf& rem, Visits& s) {
+    vf behind = rem;
+    for (int i = 0; i < n; i++) {
+        const float* f = r.record + (i64)list[i] * r.record_size;
+        vf raw = s.raw[i], K = s.K[i], l = s.l[i], inv_q = s.r[i], value = s.value[i], v_zeta = s.v_zeta[i];
+        behind -= s.w[i] * value;
+        vf v_alpha = s.T[i] * value - behind * inverse(1.0f - vmin(raw, splat(r.alpha_max)));
+        vf v_rho = keep(raw <= r.alpha_max, v_alpha * (-0.5f * raw));
+        vf v_r = v_rho * K + v_zeta * l, v_q = v_r * (inv_q * inv_q);   // -v_q
+        s.v_rho[i] = v_rho, s.v_l[i] = v_zeta * inv_q - 2.0f * l * v_q;
+        s.v_K[i] = v_rho * inv_q - f[KAPPA] * v_q, s.v_kappa[i] = v_q * K;
+    }
+    rem = behind;
+}
+
+// Adds the sums over the pixels.
+template <int C>
+APART void visit_sums(const Raster& r, const Tile& t, const int* list, int n, const Seeds<C>& seeds, const Visits& s, float* parts) {
+    enum { N = C ? SUMS : S_U };
+    for (int i = 0; i < n; i++) {
+        const float* f = r.record + (i64)list[i] * r.record_size;
+        float* out = parts + (i64)list[i] * r.gradient_size;
+        vf dx = t.x - f[CX], dy = t.y - f[CY], x[PADDED<N>] = {};
+        x[S_RHO] = s.v_rho[i], x[S_L] = s.v_l[i], x[S_KAPPA] = s.v_kappa[i];
+        x[S_KX] = s.v_K[i] * dx, x[S_KY] = s.v_K[i] * dy;
+        x[S_A] = x[S_KX] * dx, x[S_B] = x[S_KX] * dy, x[S_C] = x[S_KY] * dy;
+        x[S_BX] = x[S_L] * dx, x[S_BY] = x[S_L] * dy;
+        for (int j = 0; j < 6; j++) x[S_RGB + j] = s.w[i] * seeds.fixed[j];
+        if (C) {
+            x[S_EU] = s.v_u[i] * s.zeta_1[i], x[S_EV] = s.v_v[i] * s.zeta_1[i];
+            x[S_U] = s.v_u[i] + x[S_EU], x[S_V] = s.v_v[i] + x[S_EV];
+            x[S_UX] = x[S_U] * dx, x[S_UY] = x[S_U] * dy, x[S_VX] = x[S_V] * dx, x[S_VY] = x[S_V] * dy;
+        }
+        for (int j = 0; j < N; j += LANES) store(out + j, load(out + j) + sums_of(x + j));
+    }
+}
+
 template <int C>
 static void adjoint_tile(const Raster& r, const Tile& t, const Tile& next, const int* list, int count, float* parts) {
-    enum { N = C ? SUMS : S_U };
     Seeds<C> seeds;
     seed<C>(r, t, seeds);
     vf T = keep(t.inside, splat(1.0f)), rem = seeds.rem;
@@ -383,39 +417,12 @@ static void adjoint_tile(const Raster& r, const Tile& t, const Tile& next, const
     for (int first = 0; first < count; first += GROUP, list += GROUP) {
         int n = imin2(GROUP, count - first);
         prefetch_seed(r, next, first / GROUP);
-        for (int i = 0; i < n; i++)
-            __builtin_prefetch(parts + (i64)list[i] * r.gradient_size);
+        for (int i = 0; i < n; i++) __builtin_prefetch(parts + (i64)list[i] * r.gradient_size);
         visit<C>(r, t, list, n, T, s);
         if (C) visit_features<C>(r, list, n, seeds, s);
         visit_values<C>(r, t, list, n, seeds, s);
-        for (int i = 0; i < n; i++) {
-            const float* f = r.record + (i64)list[i] * r.record_size;
-            vf raw = s.raw[i], K = s.K[i], l = s.beta[i] + 1.0f, R = s.r[i], value = s.value[i], v_zeta = s.v_zeta[i];
-            rem -= s.w[i] * value;
-            vf v_alpha = s.T[i] * value - rem * inverse(1.0f - vmin(raw, splat(r.alpha_max)));
-            vf rho = keep(raw <= r.alpha_max, v_alpha * (-0.5f * raw));
-            vf v_r = rho * K + v_zeta * l, v_q = v_r * (R * R);   // -v_q
-            s.v_l[i] = v_zeta * R - 2.0f * l * v_q;
-            s.v_K[i] = rho * R - f[KAPPA] * v_q;
-            s.rho[i] = rho, s.kappa[i] = v_q * K;
-        }
-        for (int i = 0; i < n; i++) {
-            const float* f = r.record + (i64)list[i] * r.record_size;
-            float* out = parts + (i64)list[i] * r.gradient_size;
-            vf dx = t.x - f[CX], dy = t.y - f[CY], w = s.w[i];
-            vf x[PADDED<N>] = {};
-            if (C) {
-                x[S_EU] = s.v_u[i] * s.zeta_1[i], x[S_EV] = s.v_v[i] * s.zeta_1[i];
-                x[S_U] = s.v_u[i] + x[S_EU], x[S_V] = s.v_v[i] + x[S_EV];
-                x[S_UX] = x[S_U] * dx, x[S_UY] = x[S_U] * dy, x[S_VX] = x[S_V] * dx, x[S_VY] = x[S_V] * dy;
-            }
-            x[S_RHO] = s.rho[i], x[S_L] = s.v_l[i], x[S_KAPPA] = s.kappa[i];
-            x[S_KX] = s.v_K[i] * dx, x[S_KY] = s.v_K[i] * dy;
-            x[S_A] = x[S_KX] * dx, x[S_B] = x[S_KX] * dy, x[S_C] = x[S_KY] * dy;
-            x[S_BX] = x[S_L] * dx, x[S_BY] = x[S_L] * dy;
-            for (int j = 0; j < 6; j++) x[S_RGB + j] = w * seeds.fixed[j];
-            for (int j = 0; j < N; j += LANES) store(out + j, load(out + j) + sums_of(x + j));
-        }
+        visit_responses(r, list, n, rem, s);
+        visit_sums<C>(r, t, list, n, seeds, s, parts);
         if (C) visit_corners<C>(r, list, n, seeds, s, parts);
     }
 }
