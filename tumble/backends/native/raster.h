@@ -27,7 +27,7 @@ enum {
 enum { COLUMN, COLUMN_END, ROW, ROW_END, MID_X, MID_Y, HALF_Y, SLOPE, REST, EXTREME, INV_Y2 };
 
 // Sums over pixels, from which the gradients of a Gaussian follow, with v_x the gradient of x in
-// `adjoint_tile`: of v_K dx^2, v_K dx dy, v_K dy^2, v_K dx, v_K dy, v_l, v_l dx, v_l dy, -v_q K, v_rho; of the fixed
+// `visit_responses`: of v_K dx^2, v_K dx dy, v_K dy^2, v_K dx, v_K dy, v_l, v_l dx, v_l dy, -v_q K, v_rho; of the fixed
 // channels; and, with features, of zeta v_u and its products with dx and dy, of (zeta - 1) v_u, and the same for v. The
 // gradients of the features at each of the four corners follow, padded to whole vectors.
 enum {

@@ -67,8 +67,8 @@ INLINE void lobe_at(const Shade& s, const Point& p, Lobe& o) {
     // tumble.rendering.brdf.fresnel and its derivative in m.
     o.F = (1 + 24 * m * mm * (0.9878f + m * (-3.8886f + m * (9.1922f + m * (-9.6217f + m * 4.3303f)))));
     o.slope_F = 24 * mm * (2.9634f + m * (-15.5544f + m * (45.961f + m * (-57.7302f + m * 30.3121f))));
-    vf x = o.HH / o.t_num;
-    o.rest = keep(o.exists, (p.aa * 0.0795774715f / p.g_v) * x * x / o.g_w);
+    vf x = o.HH * inverse(o.t_num);
+    o.rest = keep(o.exists, (p.aa * 0.0795774715f / p.g_v) * x * x * inverse(o.g_w));
     o.f = o.F * o.rest;
 }
 
@@ -135,16 +135,16 @@ struct PointSums {
 };
 
 INLINE void lobe_adjoint(const Shade& s, const Point& p, const Lobe& b, vf v_f, vf v_n_w, PointSums& sum) {
-    vf over_f = v_f * b.f, v_num = -2.0f * over_f / b.t_num;   // d/d(t |H|^2)
+    vf over_f = v_f * b.f, v_num = -2.0f * over_f * inverse(b.t_num);   // d/d(t |H|^2)
     sum.g_v += over_f;
-    vf v_g_w = -over_f / b.g_w, facing = vmax(b.n_w, vf{});
-    sum.aa += v_g_w * (1.0f - facing * facing) / (4.0f * b.root_w);
-    v_n_w += v_g_w * (0.5f + 0.5f * (1 - p.aa) * facing / b.root_w);
+    vf v_g_w = -over_f * inverse(b.g_w), facing = vmax(b.n_w, vf{}), inv_root = inverse(b.root_w);
+    sum.aa += v_g_w * (1.0f - facing * facing) * (0.25f * inv_root);
+    v_n_w += v_g_w * (0.5f + 0.5f * (1 - p.aa) * facing * inv_root);
     sum.a += over_f * (2.0f / p.a) + v_num * (2.0f * p.a) * b.n_H * b.n_H;
     vf v_n_H = v_num * (2.0f * p.aa) * b.n_H;
     v_n_w += v_n_H, sum.n_v += v_n_H;
     // f ~ |H|^4 F(|H|); d(v.h)/d|H|^2 = 1 / (8 v.h), and |H|^2 = 2 + 2 v.w.
-    vf v_F = v_f * b.rest, v_HH = 2.0f * over_f / b.HH - v_F * b.slope_F / (8.0f * b.vh);
+    vf v_F = v_f * b.rest, v_HH = 2.0f * over_f * inverse(b.HH) - v_F * b.slope_F * (0.125f * inverse(b.vh));
     vf v_vw = keep(b.exists, 2.0f * v_HH), H[3], c[3];
     for (int i = 0; i < 3; i++) H[i] = b.w[i] + p.v[i], c[i] = 2.0f * v_num * b.C[i];
     // C = n x H.

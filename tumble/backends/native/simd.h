@@ -21,6 +21,8 @@ typedef unsigned int u32;
 typedef long long i64;
 
 #define INLINE static inline __attribute__((always_inline))
+// Loops that keep many vectors in registers are functions of their own: merged into one, GCC moves some to memory.
+#define APART static __attribute__((noinline))
 #define METHOD inline __attribute__((always_inline))
 
 #if defined(__clang__)
@@ -35,8 +37,20 @@ INLINE vf load(const float* p) { return *(const vf_loose*)p; }
 INLINE void store(float* p, vf x) { *(vf_loose*)p = x; }
 INLINE vf pick(vi m, vf a, vf b) { return m ? a : b; }
 INLINE vf keep(vi m, vf a) { return m ? a : vf{}; }
+// a > b ? a : b and a < b ? a : b, for which GCC needs to be told that there is one instruction.
+#if defined(__clang__) || !defined(__SSE__)
 INLINE vf vmax(vf a, vf b) { return a > b ? a : b; }
 INLINE vf vmin(vf a, vf b) { return a < b ? a : b; }
+#elif LANES == 16
+INLINE vf vmax(vf a, vf b) { return __builtin_ia32_maxps512_mask(a, b, a, -1, 4); }
+INLINE vf vmin(vf a, vf b) { return __builtin_ia32_minps512_mask(a, b, a, -1, 4); }
+#elif LANES == 8
+INLINE vf vmax(vf a, vf b) { return __builtin_ia32_maxps256(a, b); }
+INLINE vf vmin(vf a, vf b) { return __builtin_ia32_minps256(a, b); }
+#else
+INLINE vf vmax(vf a, vf b) { return __builtin_ia32_maxps(a, b); }
+INLINE vf vmin(vf a, vf b) { return __builtin_ia32_minps(a, b); }
+#endif
 INLINE float fmax2(float a, float b) { return a > b ? a : b; }
 INLINE float fmin2(float a, float b) { return a < b ? a : b; }
 INLINE int imax2(int a, int b) { return a > b ? a : b; }
