@@ -14,6 +14,7 @@ from tests.preprocess.test_held_object import landmarks
 from tumble import cli
 from tumble.io import files
 from tumble.preprocess import check as checking
+from tumble.preprocess import survey
 from tumble.preprocess.check import Finding, check_footage, passes
 from tumble.preprocess.colour_model import hand_coloured_fraction
 from tumble.preprocess.options import FootageOptions
@@ -124,6 +125,20 @@ def test_a_mask_with_a_hand_is_named(surveyed: Survey) -> None:
     worst = checking._worst(with_masks(surveyed, labels, fraction))
     assert re.findall(r"frame (\d+): \d+ % of the mask has the hand's colours", worst.state) == ["10"]
     assert hand_coloured_fraction(surveyed.images, inside, [[] for _ in hands], surveyed.background).max() == 0
+
+
+@pytest.mark.parametrize(("part", "counts"), [(0.2, False), (0.3, True)])
+def test_a_print_that_passes_for_a_hand_in_some_frames_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: float, counts: bool
+) -> None:
+    path = written(scene().pictures, tmp_path / "x.mp4")
+    without = survey_footage(path, OPTIONS)
+    n = len(without.images)
+    hands = [[landmarks(i)] if i < part * n else [] for i in range(n)]
+    monkeypatch.setattr(survey, "track_hands", lambda images: hands)
+    found = survey_footage(path, OPTIONS)
+    assert any(found.hands) == counts
+    assert np.array_equal(found.masks.labels, without.masks.labels) != counts
 
 
 def test_limits_may_rise_or_fall() -> None:

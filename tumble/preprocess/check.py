@@ -51,8 +51,6 @@ RAY_DISTANCE = (0.4, 0.8)
 VIEW_ANGLE = (math.radians(90), math.radians(30))
 """Limits of the largest angle between two views of the object [radians]."""
 
-MIN_HAND_FRAMES = 0.5
-"""Fraction of frames with a detected hand below which none is mentioned: prints and handles pass for hands at times."""
 MAX_HAND_COLOURED = 0.08
 """Fraction of a mask with the colours of a hand above which a part of a hand is probably taken for the object."""
 AREA_NEIGHBOURS = 3
@@ -105,7 +103,7 @@ def check_footage(
     video_to_capture.write_preview(survey, out / video_to_capture.PREVIEW, kept)
     findings = [_video(survey), _inputs(survey), _camera(survey), _masks(survey), _worst(survey), _border(survey)]
     with_hand = float(np.mean([bool(hands) for hands in survey.hands]))
-    findings += [_hand(with_hand)] if with_hand > MIN_HAND_FRAMES else []
+    findings += [_hand(with_hand)] if with_hand else []
     if not kept:
         return [*findings, Finding("frames", "stop", "no usable frame", "draw a box with --pick, or give --masks")]
     return [*findings, _size(survey), *_rotation(survey, kept), _sharpness(survey, kept, options), *_light(survey)]

@@ -45,6 +45,10 @@ MIN_CONFIDENCE = 0.6
 MIN_GAIN_CHANGE = 0.01
 """Gains closer to 1 than this are not compensated: one code value."""
 
+MIN_HAND_FRAMES = 0.25
+"""Fraction of frames with a detected hand below which no hand counts: in films of hands it is 0.76 or more
+(benchmarks/hands.md), while prints pass for a hand in up to 0.07 of the frames."""
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -185,7 +189,7 @@ def _segment(
 ) -> tuple[np.ndarray, np.ndarray, Background, Seed, Masks, list[list[Hand]]]:
     """Images without gain drift, their gains, the background, the seed, the masks and the hands."""
     images = _compensated(scan.images, estimate_gains(scan.images))
-    hands = track_hands(images) if options.segmenter == "grabcut" else [[] for _ in images]
+    hands = _hands(images) if options.segmenter == "grabcut" else [[] for _ in images]
     background = estimate_background(images)
     background = estimate_background(images, _hand_or_skin(images, hands, background))
     seed = _seed(path, scan, images, background, options)
@@ -204,6 +208,12 @@ def _segment(
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks, hands)
     return images, gains, background, seed, masks, hands
+
+
+def _hands(images: UInt8[np.ndarray, "t h w 3"]) -> list[list[Hand]]:
+    """The hands of every frame; none in a film in which few frames show one, since a print passed for it there."""
+    found = track_hands(images)
+    return found if np.mean([bool(hands) for hands in found]) >= MIN_HAND_FRAMES else [[] for _ in images]
 
 
 def _hand_or_skin(images: np.ndarray, hands: Sequence[Sequence[Hand]], background: Background) -> np.ndarray:
