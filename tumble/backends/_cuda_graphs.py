@@ -53,6 +53,8 @@ class CudaRecorder:
         try:
             with as_recording(), capture, runtime.told_of_capture(self.device) as of_warp:
                 result = work()
+        except torch.OutOfMemoryError:
+            raise
         except RuntimeError as error:
             raise RuntimeError(f"a step cannot be captured as a CUDA graph ({error}); leave --graph out") from error
 

@@ -49,7 +49,7 @@ class State:
     """
 
     step: int
-    """Number of steps made; only `drive` increments it."""
+    """Number of steps made; only `drive` increments it, and `init` if it makes some."""
     params: Any
     """A tree of leaf tensors. Shapes may change during training, names may not."""
     optimizer: optim.Adam | None
@@ -141,7 +141,8 @@ def drive(
         seed: Seed of `State.rng`.
         checkpoint: File to resume from and to save to, in whose folder a preview is also written; None saves nothing.
         every: Number of steps between two checkpoints; one is also saved after the last step, before `finish`.
-        report: Called after the first and the last step, and between them at most every `REPORT_SECONDS`.
+        report: Called after the first step of this process and the last one, and between them at most every
+            `REPORT_SECONDS`.
         name: Name of the stage for messages.
         key: Hash of the inputs. A checkpoint with another key, version, configuration or seed is ignored.
         graph: Whether the steps of a stage that offers it are recorded on the GPU and replayed as a whole (`graph`);
@@ -170,6 +171,8 @@ def drive(
         show = _step_reports(name, total, state.step, started - seconds, update, report)
         steps = graphs.steps(stage, cfg, inputs, state) if graph else contextlib.nullcontext(stage.step)
         with _interrupts() as interrupted, steps as step:
+            if state.step >= total:
+                _check(state, checkpoint)
             while state.step < total:
                 scalars = _step(step, cfg, inputs, state, checkpoint)
                 state.step += 1
