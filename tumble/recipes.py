@@ -45,7 +45,8 @@ MASK = 3.0
 """Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
 DIAMETER = 107.0
-"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians were chosen."""
+"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians were chosen
+[pixels]."""
 
 OURS = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
 """What our recipes share: the default configuration of every stage, and realigned poses."""

@@ -112,8 +112,9 @@ class Config:
     hull: int = 128
     """Cells per side of the visual hull's grid."""
     diameter: float = 0.0
-    """Diameter of the object's sphere in the images up to which the numbers of Gaussians hold [pixels]. Where it is larger, both
-    numbers grow in proportion to it, and `hull` to its square root (`for_resolution`). 0: they never grow."""
+    """Diameter of the object's sphere in the images up to which the numbers of Gaussians hold [pixels]. Where it is
+    larger, both numbers grow in proportion to it, and `hull` to its square root (`for_resolution`). 0: they never
+    grow."""
     opacity: float = 0.9
     """Initial opacity."""
     gamma: float = 30.0
