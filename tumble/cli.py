@@ -191,8 +191,8 @@ def run(
         options: How a video or images are converted to a capture. Ignored if the input is a capture.
         out: Run directory. Repeating the command resumes an interrupted run.
         quality: How much is computed, and from how many frames of which size if the input is footage.
-            draft: 3,000 and 1,000 steps. 23 to 39 seconds on two CPU cores for 64 frames of 128 x 128 pixels with
-            known poses, where it reaches 23 to 35 dB of albedo. All measured runs are of this quality.
+            draft: 3,000 and 1,000 steps. 23 seconds on two CPU cores for 64 frames of 128 x 128 pixels with known
+            poses, where it reaches 23 to 35 dB of albedo. All measured runs are of this quality.
             standard: 20,000 and 10,000 steps, for a GPU. No measured run yet.
             full: 150,000 steps each, for a GPU. Never run.
             paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
