@@ -87,8 +87,8 @@ class Tracking:
     paper."""
     matcher: str = "mixed"
     """Finds corresponding pixels in two frames.
-    mixed: SIFT keypoints and dense optical flow; sift, dis: either alone.
-    xfeat, aliked, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install."""
+    mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations.
+    xfeat, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install."""
 
 
 Jobs = Annotated[int, arg(metavar="N", help="Number at the same time on this machine. 0: one for every two cores.")]

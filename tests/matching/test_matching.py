@@ -339,8 +339,8 @@ def test_keypoints_have_sub_pixel_positions() -> None:
     assert len(_aliked.keypoints(score, usable, max_count=9, min_score=0.05)) == len(at) - 1
 
 
-def glue_weights(channels: int = 16, layers: int = 2) -> dict[str, torch.Tensor]:
-    """Random weights with the names and shapes of LightGlue."""
+def glue_weights(channels: int = 16, layers: int = 2, outputs: tuple[int, ...] = (1,)) -> dict[str, torch.Tensor]:
+    """Random weights with the names and shapes of LightGlue, with outputs of some layers."""
     rng = torch.Generator().manual_seed(1)
     c, p = channels, {}
 
@@ -359,6 +359,7 @@ def glue_weights(channels: int = 16, layers: int = 2) -> dict[str, torch.Tensor]
             linear(f"{t}.{block}.ffn.0", 2 * c, 2 * c)
             p[f"{t}.{block}.ffn.1.weight"], p[f"{t}.{block}.ffn.1.bias"] = torch.ones(2 * c), torch.zeros(2 * c)
             linear(f"{t}.{block}.ffn.3", c, 2 * c)
+    for k in outputs:
         linear(f"log_assignment.{k}.matchability", 1, c)
         linear(f"log_assignment.{k}.final_proj", c, c)
     return p
@@ -377,6 +378,18 @@ def test_lightglue_is_independent_of_order_and_origin() -> None:
     torch.testing.assert_close(_lightglue.assignment(at_j, at_i, d_j, d_i, p), probability.T, atol=1e-6, rtol=1e-4)
     torch.testing.assert_close(_lightglue.assignment(at_i + 0.7, at_j, d_i, d_j, p), probability, atol=1e-6, rtol=1e-3)
     assert not torch.allclose(_lightglue.assignment(at_i * 2, at_j, d_i, d_j, p), probability, atol=1e-6)
+
+
+def test_lightglue_gives_up_pairs_that_an_earlier_output_calls_hopeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random features match about nowhere: the pair is given up. Without that limit the last output decides alone."""
+    rng = torch.Generator().manual_seed(4)
+    at, d = torch.rand(2, 9, 2, generator=rng), torch.randn(2, 9, 8, generator=rng)
+    both, last = glue_weights(outputs=(1, 0)), glue_weights(outputs=(1,))
+    expected = _lightglue.assignment(*at, *d, last)
+    assert float(expected.max()) > 0
+    assert float(_lightglue.assignment(*at, *d, both).max()) == 0
+    monkeypatch.setattr(_lightglue, "MIN_EXPECTED", 0.0)
+    assert torch.equal(_lightglue.assignment(*at, *d, both), expected)
 
 
 def test_xfeat_uses_the_published_names_and_shapes_of_weights() -> None:

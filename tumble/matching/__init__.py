@@ -21,7 +21,7 @@ from tumble.io import BadFile, in_threads, load_plugin, progress, read_tensors, 
 from tumble.matching import _window
 from tumble.scene import Capture, Match, View
 
-__all__ = ["Matcher", "match_pairs", "settings", "views_of"]
+__all__ = ["Matcher", "joined", "match_pairs", "settings", "views_of"]
 
 Matcher = Callable[[View, View], Match]
 """Function that matches two views."""
@@ -30,6 +30,12 @@ Matcher = Callable[[View, View], Match]
 def views_of(capture: Capture) -> list[View]:
     """All frames of a capture, as inputs of matchers."""
     return [View(i, image, mask) for i, (image, mask) in enumerate(zip(capture.images, capture.masks, strict=True))]
+
+
+def joined(matches: Sequence[Match]) -> Match:
+    """The correspondences of several matches of the same two frames."""
+    uv_i, uv_j, confidence = (torch.cat([getattr(m, name) for m in matches]) for name in ("uv_i", "uv_j", "confidence"))
+    return Match(matches[0].i, matches[0].j, uv_i, uv_j, confidence)
 
 
 def match_pairs(

@@ -1,6 +1,7 @@
 """LightGlue (Lindenberger et al. 2023): matching of keypoints, as a function of the published weights.
 
-Implemented from the paper. All layers are run; early exit and pruning are omitted, as there are few keypoints.
+Implemented from the paper. Instead of its early exit and pruning, pairs that show no common surface are given up after
+four of nine layers.
 """
 
 import torch
@@ -11,8 +12,11 @@ from torch.nn import functional
 HEADS = 4
 """Number of attention heads."""
 
+MIN_EXPECTED = 4.0
+"""Sum of the best probabilities of all keypoints after an earlier layer below which a pair is given up."""
+
 Parameters = dict[str, Tensor]
-"""Published weights by name."""
+"""Published weights by name, with outputs (`log_assignment`) of the last layer and of any earlier ones."""
 
 
 def assignment(
@@ -22,7 +26,7 @@ def assignment(
     descriptors_j: Float[Tensor, "m c"],
     p: Parameters,
 ) -> Float[Tensor, "n m"]:
-    """Probability that two keypoints show the same point, for every pair (section 3.1 of the paper).
+    """Probability that two keypoints show the same point, for every pair (section 3.1 of the paper); 0 if given up.
 
     Args:
         at_i: Positions of the keypoints of frame i, in [-1, 1] along its longer side.
@@ -33,15 +37,25 @@ def assignment(
     """
     x_i, x_j = (_linear(d, p, "input_proj") for d in (descriptors_i, descriptors_j))
     rotary_i, rotary_j = (_rotary(at, p) for at in (at_i, at_j))
-    last = -1
-    while f"transformers.{last + 1}.self_attn.Wqkv.weight" in p:
-        last += 1
+    layer = 0
+    while True:
         x_i, x_j = (
-            _self_attention(x, rotary, p, f"transformers.{last}.self_attn")
+            _self_attention(x, rotary, p, f"transformers.{layer}.self_attn")
             for x, rotary in ((x_i, rotary_i), (x_j, rotary_j))
         )
-        x_i, x_j = _cross_attention(x_i, x_j, p, f"transformers.{last}.cross_attn")
-    name = f"log_assignment.{last}"
+        x_i, x_j = _cross_attention(x_i, x_j, p, f"transformers.{layer}.cross_attn")
+        is_last = f"transformers.{layer + 1}.self_attn.Wqkv.weight" not in p
+        if is_last or f"log_assignment.{layer}.final_proj.weight" in p:
+            probability = _probability(x_i, x_j, p, f"log_assignment.{layer}")
+            if is_last:
+                return probability
+            if float(probability.amax(1).sum()) < MIN_EXPECTED:
+                return torch.zeros_like(probability)
+        layer += 1
+
+
+def _probability(x_i: Float[Tensor, "n c"], x_j: Float[Tensor, "m c"], p: Parameters, name: str) -> Tensor:
+    """Probabilities of all pairs from the features after a layer."""
     y_i, y_j = (_linear(x, p, f"{name}.final_proj") for x in (x_i, x_j))
     similarity = y_i @ y_j.T / y_i.shape[-1] ** 0.5
     matchable_i, matchable_j = (_linear(x, p, f"{name}.matchability").sigmoid() for x in (x_i, x_j))

@@ -1,18 +1,21 @@
 """ALIKED keypoints (Zhao et al. 2023) matched by LightGlue (Lindenberger et al. 2023), for wide rotations.
 
-Weights: `tumble weights get aliked`.
+The published weights, rounded to 16-bit floats, are part of the package (`docs/make_aliked.py`).
 """
 
+from pathlib import Path
+
 import numpy as np
+import safetensors.torch
 import torch
 from torch import Tensor
 
-from tumble.io import weights
 from tumble.matching import _aliked, _lightglue
 from tumble.matching._window import MARGIN, crop_window, digest, extent
 from tumble.scene import Match, View, empty_match
 
-VERSION = 1
+VERSION = 2
+WEIGHTS = Path(__file__).with_suffix(".safetensors")
 SIZE = 512
 """Height and width of the window around the object that is matched [pixels]."""
 MAX_KEYPOINTS = 1024
@@ -27,13 +30,12 @@ Features = tuple[Tensor, Tensor, Tensor]
 
 
 def load(device: torch.device | str):
-    """Matcher on a device, which caches every frame's keypoints.
-
-    Raises:
-        BadFile: The weights have not been downloaded.
-    """
-    extractor = weights.load("aliked", "aliked-n16rot", device)
-    glue = weights.load("aliked", "aliked_lightglue", device)
+    """Matcher on a device, which caches every frame's keypoints."""
+    tensors = {name: value.float() for name, value in safetensors.torch.load_file(WEIGHTS, str(device)).items()}
+    extractor, glue = (
+        {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+        for prefix in ("aliked.", "lightglue.")
+    )
     cached: dict[str, Features] = {}
 
     def features(view: View) -> Features:

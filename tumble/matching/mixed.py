@@ -7,7 +7,7 @@ SIFT's correspondences remain.
 
 import torch
 
-from tumble.matching import dis, sift
+from tumble.matching import dis, joined, sift
 from tumble.scene import Match, View
 
 VERSION = 1
@@ -23,10 +23,7 @@ def load(device: torch.device | str):
     sparse, dense = sift.load(device), dis.load(device)
 
     def match(view_i: View, view_j: View) -> Match:
-        matches = [matcher(view_i, view_j) for matcher in (sparse, dense)]
-        uv_i, uv_j, confidence = (
-            torch.cat([getattr(m, name) for m in matches]) for name in ("uv_i", "uv_j", "confidence")
-        )
-        return Match(view_i.number, view_j.number, uv_i, uv_j, confidence).select(confidence >= MIN_CONFIDENCE)
+        found = joined([matcher(view_i, view_j) for matcher in (sparse, dense)])
+        return found.select(found.confidence >= MIN_CONFIDENCE)
 
     return match

@@ -54,6 +54,10 @@ MIN_WIDE_MATCHES = 8
 """Smallest number of matches of a pair of frames that are used."""
 WIDE_MATCHER = "sift"
 """Matcher of frames that are far apart in time; it finds what rotates by up to about 30 degrees."""
+LEARNED_MATCHER = "aliked"
+"""Second matcher of frames that are farther apart than `NEAR`; it finds what rotates by up to about 70 degrees."""
+LEARNED_STRIDE = 3
+"""Every how many-th frame the second matcher sees, as it takes ten times as long."""
 FIRST_SCALE = 3
 """Index in `global_scales` of the Cauchy loss in the first round in which a segment is adjusted."""
 FINISHING_SCALES = (1.5, 1.0, 0.7)
@@ -91,13 +95,15 @@ def segmented_poses(
 
 def wide_matches(inputs: Inputs) -> list[Match]:
     """Matches of pairs of frames, also far apart, with at least one end of each correspondence on the object."""
-    n = len(inputs.capture)
-    pairs = [
-        (i, j) for i in range(n) for j in range(i + 1, n) if j - i <= NEAR or not (i % FAR_STRIDE or j % FAR_STRIDE)
-    ]
-    matches = matching.match_pairs(matching.views_of(shown(inputs.capture)), pairs, WIDE_MATCHER)
-    found = [on_object(match, inputs.capture.masks) for match in matches]
-    return [match for match in found if len(match) >= MIN_WIDE_MATCHES]
+    n, views = len(inputs.capture), matching.views_of(shown(inputs.capture))
+    apart = [(i, j) for i in range(n) for j in range(i + 1, n)]
+    pairs = [(i, j) for i, j in apart if j - i <= NEAR or not (i % FAR_STRIDE or j % FAR_STRIDE)]
+    learned = [(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)]
+    found: dict[tuple[int, int], list[Match]] = {}
+    for matcher, chosen in ((WIDE_MATCHER, pairs), (LEARNED_MATCHER, learned)):
+        for match in matching.match_pairs(views, chosen, matcher):
+            found.setdefault((match.i, match.j), []).append(on_object(match, inputs.capture.masks))
+    return [match for parts in found.values() if len(match := matching.joined(parts)) >= MIN_WIDE_MATCHES]
 
 
 def _observed(cfg: Settings, inputs: Inputs, tracks: Tracks, wide: Sequence[Match]) -> Observed:
