@@ -23,6 +23,7 @@ from tumble.preprocess.background import (
     Background,
     BackgroundSamples,
     compensate,
+    crossed_background,
     estimate_background,
     estimate_gains,
     fill_unknown,
@@ -205,6 +206,8 @@ def _segment(
         samples = None
         if any(hands):
             samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
+        else:
+            background = crossed_background(images, masks.labels == OBJECT, background)
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks, hands)
     return images, gains, background, seed, masks, hands
