@@ -5,7 +5,8 @@ rotates and how sharp it is. `tumble check` reports them, and the conversion to 
 with them.
 
 Background and masks depend on each other. They are estimated in turn: a background from static pixels without hands,
-masks from it, then gains and background again without the masked pixels, and the masks once more.
+masks from it, then gains and background again without the masked pixels, and the masks once more. What such masks leave
+undecided is looked at separately, if no hand is in the film (`background.crossed_background`).
 """
 
 import math
