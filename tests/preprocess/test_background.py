@@ -7,7 +7,9 @@ from tests.films import scene
 from tumble.maths.images import linear_from_srgb
 from tumble.preprocess import background as module
 from tumble.preprocess.background import (
+    Background,
     compensate,
+    crossed_background,
     estimate_background,
     estimate_gains,
     fill_unknown,
@@ -51,6 +53,64 @@ def test_a_background_that_is_never_visible_is_unknown() -> None:
     whole = fill_unknown(background, estimate_background(video_of_wall(np.zeros_like(covered))))
     assert whole.known.all()
     assert np.array_equal(whole.image[6:], background.image[6:])
+
+
+def crossing(feet: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A film of 60 frames of the wall, its object, and the pixels that only the object's ends uncover.
+
+    A printed object covers columns 4 to 12 but for six frames, in which it is edge-on and covers columns 7 to 9. Pixels
+    in `feet` show one dark colour whenever nothing else is in front of them.
+    """
+    images, inside = video_of_wall(np.zeros((60, 12, 16), bool)), np.zeros((60, 12, 16), bool)
+    images[:, feet] = 20 + RNG.integers(-1, 2, images[:, feet].shape)
+    inside[:, :, 4:13] = True
+    edge_on = [10, 11, 12, 40, 41, 42]
+    inside[edge_on] = False
+    inside[np.ix_(edge_on, range(12), range(7, 10))] = True
+    images[inside] = RNG.integers(0, 256, (int(inside.sum()), 3))
+    uncovered = np.zeros((12, 16), bool)
+    uncovered[:, [4, 12]] = True
+    return images, inside, uncovered
+
+
+def nothing_known() -> Background:
+    """A background that is known beside columns 2 to 14 only."""
+    known = np.ones((12, 16), bool)
+    known[:, 2:15] = False
+    return Background(np.where(known[..., None], WALL, 99).astype(np.uint8), np.full((12, 16), 2, np.float32), known)
+
+
+def test_what_the_object_crosses_becomes_known() -> None:
+    """In 6 of 60 frames the wall is visible, beside an object whose print has any colour; behind its middle never."""
+    images, inside, uncovered = crossing(np.zeros((12, 16), bool))
+    background = crossed_background(images, inside, nothing_known())
+    assert background.known[uncovered].all()
+    assert np.abs(background.image.astype(int) - WALL)[uncovered].max() <= 2
+    assert not background.known[:, 5:12].any()
+    # Columns 2, 3, 13 and 14 are never covered, so that nothing tells whether an object stays there.
+    assert not background.known[:, [2, 3, 13, 14]].any()
+    assert np.array_equal(background.image[:, [0, 1, 15]], WALL[:, [0, 1, 15]])
+
+
+@pytest.mark.parametrize("recognised", [0, 30])
+def test_dark_feet_that_stay_in_their_place_do_not_become_background(recognised: int) -> None:
+    """Feet are at the same pixels in all frames; masks recognise them in none, or in the first half of them."""
+    feet = np.zeros((12, 16), bool)
+    feet[6:, [3, 4, 12, 13]] = True
+    images, inside, _ = crossing(feet)
+    images[:, feet] = 20 + RNG.integers(-1, 2, images[:, feet].shape)
+    inside[:, feet] = np.arange(60)[:, None] < recognised
+    background = crossed_background(images, inside, nothing_known())
+    assert not (background.known & feet).any()
+    assert background.known[:4, [4, 12]].all()
+
+
+def test_a_background_that_is_known_stays_as_it_is() -> None:
+    images, inside, _ = crossing(np.zeros((12, 16), bool))
+    known = Background(WALL, np.full((12, 16), 2, np.float32), np.ones((12, 16), bool))
+    crossed = crossed_background(images, inside, known)
+    assert crossed.known.all()
+    assert np.array_equal(crossed.image, WALL)
 
 
 def test_the_gain_drift_of_one_channel_is_estimated_and_compensated() -> None:

@@ -23,6 +23,12 @@ MIN_SUPPORT = 3
 """Minimum number of values in the interval around the mode; the background of a pixel visible less often is unknown."""
 HIDDEN_CODE = 700
 """Multiplied by the number of the sample, replaces a covered value: above all code values and far from the others."""
+OBJECT_MARGIN = 2
+"""Distance from the object within which no pixel counts as uncovered [pixels]."""
+MIN_BESIDE_AGREEMENT = 0.8
+"""Minimum fraction of the frames beside the object in which an undecided pixel shows one colour, its background's."""
+MAX_COVERED_AGREEMENT = 0.1
+"""Maximum fraction of the frames with the object in front in which such a pixel shows that colour nevertheless."""
 MAX_NOISE = 8.0
 """Maximum noise of a static pixel; a pixel of larger noise is unknown [code values]."""
 MIN_NOISE = 1.5
@@ -120,7 +126,9 @@ def sample_background(images: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.nda
 
 
 def estimate_background(
-    images: UInt8[np.ndarray, "t h w 3"], covered: Bool[np.ndarray, "t h w"] | None = None
+    images: UInt8[np.ndarray, "t h w 3"],
+    covered: Bool[np.ndarray, "t h w"] | None = None,
+    n_samples: int = N_SAMPLES,
 ) -> Background:
     """Mode over time of every pixel, over the frames in which nothing covers it.
 
@@ -129,13 +137,15 @@ def estimate_background(
 
     Args:
         covered: Pixels known to be covered by the object or a hand.
+        n_samples: Number of frames, evenly spaced, that are looked at.
     """
-    samples = np.unique(np.linspace(0, len(images) - 1, N_SAMPLES).round().astype(int))
-    stack = images[samples].astype(np.int16)
+    samples = np.unique(np.linspace(0, len(images) - 1, n_samples).round().astype(int))
+    dtype = np.int16 if HIDDEN_CODE * len(samples) <= np.iinfo(np.int16).max else np.int32
+    stack = images[samples].astype(dtype)
     n_visible = np.full(stack.shape[1:3], len(stack), np.int64)
     if covered is not None:
         hidden = covered[samples]
-        codes = HIDDEN_CODE * np.arange(1, len(stack) + 1, dtype=np.int16)
+        codes = HIDDEN_CODE * np.arange(1, len(stack) + 1, dtype=dtype)
         stack = np.where(hidden[..., None], codes[:, None, None, None], stack)
         n_visible -= hidden.sum(0)
     stack.sort(axis=0)
@@ -155,6 +165,36 @@ def fill_unknown(background: Background, fallback: Background) -> Background:
     return Background(
         image, np.where(background.known, background.noise, fallback.noise), background.known | fallback.known
     )
+
+
+def crossed_background(
+    images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"], background: Background
+) -> Background:
+    """The background, with the unknown pixels that the object crosses.
+
+    Where nothing is known of the background, masks leave pixels beside the object undecided, and these hide what is
+    there. Three observations together tell that an undecided pixel shows background: in some frames the object covers
+    it; in the others it has one colour; and it does not have this colour while the object covers it. A part of the
+    object that stays in its place and is never recognised, such as dark feet on a turntable, lacks the first; one that
+    is recognised in some frames only lacks the third.
+
+    Args:
+        inside: Pixels that are certainly object.
+    """
+    margin, where = np.ones((2 * OBJECT_MARGIN + 1,) * 2), ~background.known
+    beside = np.stack([cv2.dilate(mask.astype(np.uint8), margin)[where] == 0 for mask in inside])[:, None]
+    covered, colours = inside[:, where][:, None], images[:, where][:, None]
+    found = estimate_background(colours, ~beside, n_samples=len(images))
+    distance = channel_max(np.abs(colours.astype(np.int16) - found.image))
+    agrees = distance < np.maximum(SAME_SIGMAS * found.noise, MIN_DIFFERENCE / 2)
+    n_beside, n_covered = beside.sum(0), covered.sum(0)
+    known = found.known & (np.minimum(n_beside, n_covered) >= MIN_SUPPORT)
+    known &= (agrees & beside).sum(0) >= MIN_BESIDE_AGREEMENT * n_beside
+    known &= (agrees & covered).sum(0) <= MAX_COVERED_AGREEMENT * n_covered
+    image, noise, everywhere = background.image.copy(), background.noise.copy(), background.known.copy()
+    everywhere[where] = known[0]
+    image[everywhere & where], noise[everywhere & where] = found.image[known], found.noise[known]
+    return Background(image, noise, everywhere)
 
 
 def estimate_gains(

@@ -5,7 +5,8 @@ rotates and how sharp it is. `tumble check` reports them, and the conversion to 
 with them.
 
 Background and masks depend on each other. They are estimated in turn: a background from static pixels without hands,
-masks from it, then gains and background again without the masked pixels, and the masks once more.
+masks from it, then gains and background again without the masked pixels, and the masks once more. What such masks leave
+undecided is looked at separately, if no hand is in the film (`background.crossed_background`).
 """
 
 import math
@@ -23,6 +24,7 @@ from tumble.preprocess.background import (
     Background,
     BackgroundSamples,
     compensate,
+    crossed_background,
     estimate_background,
     estimate_gains,
     fill_unknown,
@@ -205,6 +207,8 @@ def _segment(
         samples = None
         if any(hands):
             samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
+        else:
+            background = crossed_background(images, masks.labels == OBJECT, background)
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks, hands)
     return images, gains, background, seed, masks, hands
