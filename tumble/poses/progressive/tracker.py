@@ -29,10 +29,11 @@ from torch import Tensor
 from tumble.engine import State, optim
 from tumble.io import tree
 from tumble.maths import SE3, SO3, angle_between, iou
-from tumble.poses.progressive import neus, pose_networks, ray_sampling, sdf_field, virtual_camera
+from tumble.poses.progressive import adjustment, neus, pose_networks, ray_sampling, registration, sdf_field, virtual_camera
 from tumble.poses.progressive.neus import RayBatch, Rendered
 from tumble.poses.progressive.pose_networks import PoseSource
 from tumble.poses.progressive.ray_sampling import Pixels
+from tumble.poses.progressive.registration import Motion
 from tumble.poses.progressive.sdf_field import Fields, Sdf, Sizes
 from tumble.poses.progressive.virtual_camera import Aim
 from tumble.scene import OBJECT, Capture, Match
@@ -139,8 +140,9 @@ class Config:
 
     poses: Literal["mlps", "vectors"] = "mlps"
     """Parametrisation of the poses. mlps: a network per frame; vectors: six numbers per frame."""
-    motion: Literal["still", "steady"] = "still"
-    """Initial pose of a frame. still: that of the frame before; steady: rotated on with constant angular velocity."""
+    motion: Literal["still", "steady"] | Motion = "still"
+    """Initial pose of a frame. still: that of the frame before; steady: rotated on with constant angular velocity; else
+    by `registration`."""
     start: Literal["first", "largest"] = "first"
     """First frame to track: the first in time or that of the largest silhouette, from which tracking goes both ways."""
     sizes: Sizes = field(default_factory=Sizes)
@@ -200,6 +202,11 @@ class Inputs:
     """Correspondences, in pixels of the capture's frames."""
     aim: Aim
     """Virtual camera."""
+
+    @functools.cached_property
+    def anchors(self) -> adjustment.Anchors:
+        """Anchors of `adjustment`, which take seconds."""
+        return adjustment.gather(self.capture, self.aim, self.matches)
 
 
 @dataclass(frozen=True)
@@ -297,6 +304,8 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
         return {}
     if now.first:
         _initialise_pose(cfg, state, frames, now.index)
+        if isinstance(cfg.motion, Motion):
+            _register(cfg, inputs, state, frames[: now.index + 1])
     known = frames[: max(1, now.index)] if now.phase == "shape" else frames[: now.index + 1]
     terms = _loss_terms(cfg, inputs, state, now, known)
     optim.anneal(state.optimizer, _rates(cfg, now, memory))
@@ -327,6 +336,26 @@ def _initialise_pose(cfg: Config, state: State, frames: list[int], index: int) -
         T_aim_obj = SE3((past[0].rotation @ R_before_last).wxyz, past[0].xyz)
     # A product of three rotations: without normalisation, an error in length would grow 2.4 times with every frame.
     state.memory["base"][frame] = torch.cat([SO3.from_wxyz(T_aim_obj.wxyz).wxyz, T_aim_obj.xyz], -1)
+
+
+@torch.no_grad()
+def _register(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> None:
+    """Estimate the pose of the newest frame, and adjust those of the newest ones."""
+    motion = cfg.motion
+    assert isinstance(motion, Motion)
+    shape = functools.partial(sdf_field.distance, tree.detach(state.params.fields.sdf))
+    T_aim_obj = poses(state.params, state.memory, list(range(len(inputs.capture))))
+    arguments = {"known": known, "shape": shape, "bound": cfg.bound}
+    T_aim_obj = registration.register(motion, inputs.anchors, T_aim_obj, **arguments)
+    T_aim_obj = registration.adjust_window(motion, inputs.anchors, T_aim_obj, **arguments)
+    if len(known) % motion.every == 0 or len(known) == len(inputs.capture):
+        T_aim_obj = registration.adjust_all(motion, inputs.anchors, T_aim_obj, **arguments)
+    state.memory["base"][known] = torch.cat([T_aim_obj.wxyz, T_aim_obj.xyz], -1)[known]
+    assert isinstance(state.params.poses, pose_networks.Vectors) and state.optimizer is not None
+    for frame in known:
+        leaf = state.params.poses.values[str(frame)]
+        leaf.zero_()
+        state.optimizer.state.pop(leaf, None)
 
 
 @torch.no_grad()
