@@ -20,7 +20,7 @@ from torch import Tensor
 from tumble.maths import SE3, SO3
 from tumble.scene import BACKGROUND, OBJECT, Capture, Match
 
-from tumble.poses.progressive.virtual_camera import Aim, camera_to_aim
+from tumble.poses.progressive.virtual_camera import FILL, Aim, camera_to_aim
 
 RADIUS_PIXELS = 50.0
 """Radius of the object in the frame whose pixels are the unit of residuals [pixels]."""
@@ -28,6 +28,8 @@ ANCHORS = 100
 """Number of anchors per frame."""
 NEAREST = 0.012
 """Distance from an anchor to the nearest match from which its own match is taken [image widths]."""
+MIN_MATCHES = 20
+"""Smallest number of matches of a pair of frames that is used: of fewer, most are wrong."""
 BORDER = 48
 """Number of rays through the silhouette's border per frame."""
 
@@ -51,6 +53,8 @@ class Anchors:
     """Rays through the silhouette's border, aim frame, with depth 1."""
     border_weight: Float[Tensor, "t c"]
     """Weight of each ray, 0 where there is none."""
+    focal: float
+    """Focal length at which the largest silhouette's radius is `RADIUS_PIXELS` [pixels]."""
 
     def select(self, frames: Sequence[int]) -> "Anchors":
         """Some frames, with what they observe in each other."""
@@ -63,7 +67,7 @@ class Anchors:
         partner = torch.where(partner >= 0, partner, own)
         picked = (getattr(self, name)[index] for name in ("ray", "seen", "border", "border_weight"))
         ray, seen, border, border_weight = picked
-        return Anchors(ray, partner, seen, weight, border, border_weight)
+        return Anchors(ray, partner, seen, weight, border, border_weight, self.focal)
 
 
 def gather(capture: Capture, aim: Aim, matches: Sequence[Match]) -> Anchors:
@@ -71,7 +75,7 @@ def gather(capture: Capture, aim: Aim, matches: Sequence[Match]) -> Anchors:
     n = len(capture)
     of_frame: list[list[Match]] = [[] for _ in range(n)]
     for match in matches:
-        if len(match):
+        if len(match) >= MIN_MATCHES:
             of_frame[match.i].append(match)
             of_frame[match.j].append(match.reversed())
     k = max(1, max(len(found) for found in of_frame))
@@ -96,7 +100,8 @@ def gather(capture: Capture, aim: Aim, matches: Sequence[Match]) -> Anchors:
             near = distance < NEAREST * capture.camera.width
             weight[frame, : len(uv), slot] = (near * match.confidence[nearest]).double()
             partner[frame, slot] = match.j
-    return Anchors(ray, partner, seen, weight, border, border_weight)
+    focal = RADIUS_PIXELS * float(aim.camera.fx_fy_cx_cy[0]) / (0.5 * FILL * aim.camera.width)
+    return Anchors(ray, partner, seen, weight, border, border_weight, focal)
 
 
 def _rays(capture: Capture, aim: Aim, frame: int, uv: Tensor) -> Float[Tensor, "m 3"]:
@@ -137,6 +142,12 @@ class Priors:
     """Standard deviation of the object's centre from the middle of its silhouette [object radius]."""
     distance: float
     """Standard deviation of the logarithm of the distance between neighbouring frames."""
+    turn: float
+    """Standard deviation of the rotation between neighbouring frames [radians]."""
+    usual_distance: float
+    """Distance of the object at the start [object radius]."""
+    any_distance: float
+    """Standard deviation of the logarithm of the ratio of a frame's distance to it."""
     border: float
     """Weight of the silhouette's rays; that of a match is at most 1."""
     scale: float
@@ -277,6 +288,8 @@ class _Terms:
     own_gradient: Float[Tensor, "t 6"]
     chain: Float[Tensor, "t t"]
     chain_gradient: Float[Tensor, " t"]
+    turns: Float[Tensor, "t t"]
+    turns_gradient: Float[Tensor, "t 3"]
 
 
 def _skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -292,7 +305,7 @@ def _linearise(
     R, xyz, depth = poses.R, poses.xyz, poses.depth
     partner = anchors.partner
     t, a, k = anchors.weight.shape
-    focal = RADIUS_PIXELS * xyz[:, 2].median()
+    focal = anchors.focal
     v = depth[..., None] * anchors.ray - xyz[:, None]
     R_j_i = R[partner] @ R[:, None].mT
     turned = torch.einsum("tkxy,tay->takx", R_j_i, v)
@@ -348,10 +361,24 @@ def _linearise(
     chain_gradient[1:] += step * g[1:]
     chain_gradient[:-1] -= step * g[:-1]
     cost = cost + step.square().sum()
+    turn = SO3.from_matrix(R[1:] @ R[:-1].mT).log() / priors.turn
+    turns, turns_gradient = torch.zeros_like(chain), torch.zeros(t, 3, dtype=R.dtype)
+    turns[rows, rows] += priors.turn**-2
+    turns[rows + 1, rows + 1] += priors.turn**-2
+    turns[rows, rows + 1] -= priors.turn**-2
+    turns[rows + 1, rows] -= priors.turn**-2
+    turns_gradient[1:] += turn / priors.turn
+    turns_gradient[:-1] -= turn / priors.turn
+    cost = cost + turn.square().sum()
+    far = (xyz[:, 2] / priors.usual_distance).log() / priors.any_distance
+    g = 1 / (priors.any_distance * xyz[:, 2])
+    own[:, 5, 5] += g.square()
+    own_gradient[:, 5] += far * g
+    cost = cost + far.square().sum()
     frames = torch.cat([torch.arange(t)[:, None], partner], 1)
     return _Terms(
         float(cost), frames, blocks, gradient, depth_depth, depth_gradient, depth_pose, own, own_gradient, chain,
-        chain_gradient,
+        chain_gradient, turns, turns_gradient,
     )
 
 
@@ -399,6 +426,9 @@ def _moved(poses: Poses, terms: _Terms, free: Bool[Tensor, " t"], lam: float) ->
     every = torch.arange(t)
     H[every, every] += terms.own
     H[:, :, 5, 5] += terms.chain
+    for axis in range(3):
+        H[:, :, axis, axis] += terms.turns
+    g[:, :3] += terms.turns_gradient
     g += terms.own_gradient
     g[:, 5] += terms.chain_gradient
     index = free.nonzero()[:, 0]

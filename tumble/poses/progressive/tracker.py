@@ -33,7 +33,7 @@ from tumble.poses.progressive import adjustment, neus, pose_networks, ray_sampli
 from tumble.poses.progressive.neus import RayBatch, Rendered
 from tumble.poses.progressive.pose_networks import PoseSource
 from tumble.poses.progressive.ray_sampling import Pixels
-from tumble.poses.progressive.registration import Motion
+from tumble.poses.progressive.registration import Motion, Scene
 from tumble.poses.progressive.sdf_field import Fields, Sdf, Sizes
 from tumble.poses.progressive.virtual_camera import Aim
 from tumble.scene import OBJECT, Capture, Match
@@ -143,8 +143,9 @@ class Config:
     motion: Literal["still", "steady"] | Motion = "still"
     """Initial pose of a frame. still: that of the frame before; steady: rotated on with constant angular velocity; else
     by `registration`."""
-    start: Literal["first", "largest"] = "first"
-    """First frame to track: the first in time or that of the largest silhouette, from which tracking goes both ways."""
+    start: Literal["first", "largest", "matched"] = "first"
+    """First frame to track: the first in time, that of the largest silhouette, or the first of those with the most
+    matches; tracking goes both ways from it."""
     sizes: Sizes = field(default_factory=Sizes)
     """Sizes of the networks."""
     samples: int = 32
@@ -259,6 +260,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     n, like = len(inputs.capture), inputs.capture.camera.fx_fy_cx_cy
     radius = torch.stack([_silhouette_radius(inputs, frame) for frame in range(n)])
     start = 0 if cfg.start == "first" else int(radius.argmax())
+    if cfg.start == "matched" and isinstance(cfg.motion, Motion):
+        start = registration.best_start(cfg.motion, inputs.anchors)
     base = SE3.identity((n,), dtype=like.dtype, device=like.device)
     base = SE3(base.wxyz, torch.stack([0 * radius, 0 * radius, (cfg.fill / radius.max()).expand(n)], -1))
     source = pose_networks.vectors(n, 6) if cfg.poses == "vectors" else pose_networks.frame_mlps(n, 6, rng)
@@ -272,6 +275,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         "base": torch.cat([base.wxyz, base.xyz], -1),
         "frame_fit": torch.full((n, 3), math.inf).to(like),
         "start": torch.tensor(start),
+        "distance": base.xyz[0, 2],
         "shape_start": torch.tensor(0),
         "shape_steps": torch.tensor(0),
     }
@@ -299,13 +303,17 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     assert state.optimizer is not None, "init creates the optimizer"
     now, memory = schedule_at(cfg.phases, state.step), state.memory
     frames = tracking_order(int(memory["start"]), len(inputs.capture))
+    first = min(cfg.motion.first, len(frames)) if isinstance(cfg.motion, Motion) else 1
+    # The first frames are registered together, and the shape starts afterwards.
+    if now.index < first - 1 or (now.index == first - 1 and first > 1 and not (now.first or now.last)):
+        return {}
     # A later frame has a shape phase only if the shape was reset after the frame before.
     if now.phase == "shape" and int(memory["shape_start"]) != now.index:
         return {}
-    if now.first:
+    if now.first and isinstance(cfg.motion, Motion):
+        _register(cfg, inputs, state, frames[: now.index + 1])
+    elif now.first:
         _initialise_pose(cfg, state, frames, now.index)
-        if isinstance(cfg.motion, Motion):
-            _register(cfg, inputs, state, frames[: now.index + 1])
     known = frames[: max(1, now.index)] if now.phase == "shape" else frames[: now.index + 1]
     terms = _loss_terms(cfg, inputs, state, now, known)
     optim.anneal(state.optimizer, _rates(cfg, now, memory))
@@ -340,22 +348,31 @@ def _initialise_pose(cfg: Config, state: State, frames: list[int], index: int) -
 
 @torch.no_grad()
 def _register(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> None:
-    """Estimate the pose of the newest frame, and adjust those of the newest ones."""
+    """Estimate the pose of the newest frame, or of all first ones, and adjust those of the frames near it."""
     motion = cfg.motion
-    assert isinstance(motion, Motion)
-    shape = functools.partial(sdf_field.distance, tree.detach(state.params.fields.sdf))
+    assert isinstance(motion, Motion), "other motions need no registration"
     T_aim_obj = poses(state.params, state.memory, list(range(len(inputs.capture))))
-    arguments = {"known": known, "shape": shape, "bound": cfg.bound}
-    T_aim_obj = registration.register(motion, inputs.anchors, T_aim_obj, **arguments)
-    T_aim_obj = registration.adjust_window(motion, inputs.anchors, T_aim_obj, **arguments)
-    if len(known) % motion.every == 0 or len(known) == len(inputs.capture):
-        T_aim_obj = registration.adjust_all(motion, inputs.anchors, T_aim_obj, **arguments)
-    state.memory["base"][known] = torch.cat([T_aim_obj.wxyz, T_aim_obj.xyz], -1)[known]
-    assert isinstance(state.params.poses, pose_networks.Vectors) and state.optimizer is not None
-    for frame in known:
+    shape = functools.partial(sdf_field.distance, tree.detach(state.params.fields.sdf))
+    scene = Scene(inputs.anchors, shape, cfg.bound, float(state.memory["distance"]))
+    if len(known) <= motion.first:
+        T_aim_obj = registration.register_first(motion, scene, T_aim_obj, known)
+    else:
+        T_aim_obj = registration.register(motion, scene, T_aim_obj, known)
+        T_aim_obj = registration.adjust_window(motion, scene, T_aim_obj, known)
+        if len(known) % motion.every == 0 or len(known) == len(inputs.capture):
+            T_aim_obj = registration.adjust_all(motion, scene, T_aim_obj, known)
+    _set_poses(state, T_aim_obj, known)
+
+
+def _set_poses(state: State, T_aim_obj: SE3, frames: list[int]) -> None:
+    """Give some frames new poses, from which their parameters start again."""
+    assert isinstance(state.params.poses, pose_networks.Vectors), "networks have no zero"
+    state.memory["base"][frames] = torch.cat([T_aim_obj.wxyz, T_aim_obj.xyz], -1)[frames]
+    for frame in frames:
         leaf = state.params.poses.values[str(frame)]
         leaf.zero_()
-        state.optimizer.state.pop(leaf, None)
+        if state.optimizer is not None:
+            state.optimizer.state.pop(leaf, None)
 
 
 @torch.no_grad()
@@ -363,8 +380,9 @@ def _finish_frame(cfg: Config, inputs: Inputs, state: State, frames: list[int], 
     """Record how well a frame fits, and reset the shape if the object has rotated far since the last reset."""
     memory = state.memory
     memory["frame_fit"][frames[index]] = _frame_fit(cfg, inputs, state, frames[: index + 1])
+    began = isinstance(cfg.motion, Motion) and index + 1 == min(cfg.motion.first, len(frames))
     pair = poses(state.params, memory, [frames[index], frames[max(0, int(memory["shape_start"]) - 1)]]).rotation
-    if index + 1 == len(frames) or float(angle_between(pair[0], pair[1])) < math.radians(cfg.reset):
+    if index + 1 == len(frames) or (float(angle_between(pair[0], pair[1])) < math.radians(cfg.reset) and not began):
         return
     memory["shape_start"], memory["shape_steps"] = torch.tensor(index + 1), torch.tensor(0)
     fresh = tree.named_tensors(sdf_field.sphere_initialised(cfg.sizes, state.rng))
