@@ -1,13 +1,12 @@
 """Adjustment of the poses of some frames to anchors, silhouettes and the present shape (Levenberg-Marquardt).
 
-An *anchor* is a pixel of one frame with its matched positions in the frames around it. Its depth is one unknown, which
-the shape's depth along the pixel's ray holds softly; depths are eliminated (Schur complement), so that poses and depths
-move together. By turns they would not: in a few frames a smaller rotation of a deeper shape explains the same matches
-(bas-relief ambiguity), and neither changes while the other is held. The rays through the silhouette's border touch the
-shape: the least signed distance along each is zero.
+The depth of each anchor is one unknown, which the shape's depth along its ray holds softly. Depths are eliminated
+(Schur complement), so that poses and depths move together; by turns they would not, because in a few frames a smaller
+rotation of a deeper shape explains the same matches (bas-relief ambiguity). The rays through a silhouette's border touch
+the shape: the least signed distance along each is zero.
 
-Everything is in the aim frame of `virtual_camera`. Residuals are in pixels of a frame in which the object's radius is
-`RADIUS_PIXELS`.
+Everything is in the aim frame of `virtual_camera`, in double precision. A step of a pose is a rotation vector about the
+object's centre and a shift, both in the aim frame. Residuals are in the pixels of `anchors`.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,144 +17,55 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import SE3, SO3
-from tumble.scene import BACKGROUND, OBJECT, Capture, Match
+from tumble.poses.progressive.anchors import RADIUS_PIXELS, Anchors
 
-from tumble.poses.progressive.virtual_camera import FILL, Aim, camera_to_aim
-
-RADIUS_PIXELS = 50.0
-"""Radius of the object in the frame whose pixels are the unit of residuals [pixels]."""
-ANCHORS = 100
-"""Number of anchors per frame."""
-NEAREST = 0.012
-"""Distance from an anchor to the nearest match from which its own match is taken [image widths]."""
-MIN_MATCHES = 20
-"""Smallest number of matches of a pair of frames that is used: of fewer, most are wrong."""
-BORDER = 48
-"""Number of rays through the silhouette's border per frame."""
+DEPTH_SAMPLES = 48
+"""Number of samples along a ray among which its intersection with the shape is found."""
+BORDER_SAMPLES = 32
+"""Number of samples along a ray through the silhouette's border, the closest of which to the shape counts."""
+SLOPE_STEP = 0.03
+"""Half the distance over which the gradient of the signed distance is measured [object radius]."""
+MISSED = 0.02
+"""Weight of the depth of an anchor whose ray misses the shape; that of one that meets it is 1 more."""
+START_DAMPING = 1e-3
+"""Damping of the first step, relative to the diagonal of the normal equations."""
+ACCEPTED = 0.2
+"""Factor on the damping after a step that lowers the cost."""
+REJECTED = 8.0
+"""Factor on the damping after any other step."""
+MAX_DAMPING = 1e4
+"""Damping from which steps are negligible."""
+TOLERANCE = 1e-4
+"""Fraction of the cost: a step that lowers it by less is the last."""
 
 Shape = Callable[[Tensor], Tensor]
-"""Function of points [n 3] that returns the signed distance [n], without gradients."""
-
-
-@dataclass(frozen=True)
-class Anchors:
-    """Anchors and silhouettes of `t` frames."""
-
-    ray: Float[Tensor, "t a 3"]
-    """Ray of each anchor in its own frame, aim frame, with depth 1."""
-    partner: Int64[Tensor, "t k"]
-    """Frames in which the anchors of a frame are observed; the frame itself where there are fewer."""
-    seen: Float[Tensor, "t a k 2"]
-    """Positions x / z, y / z in the partners' aim frames."""
-    weight: Float[Tensor, "t a k"]
-    """Weight of each observation, 0 where there is none."""
-    border: Float[Tensor, "t c 3"]
-    """Rays through the silhouette's border, aim frame, with depth 1."""
-    border_weight: Float[Tensor, "t c"]
-    """Weight of each ray, 0 where there is none."""
-    focal: float
-    """Focal length at which the largest silhouette's radius is `RADIUS_PIXELS` [pixels]."""
-
-    def select(self, frames: Sequence[int]) -> "Anchors":
-        """Some frames, with what they observe in each other."""
-        index = torch.tensor(frames)
-        place = torch.full((len(self.ray),), -1)
-        place[index] = torch.arange(len(index))
-        partner = place[self.partner[index]]
-        weight = self.weight[index] * (partner >= 0)[:, None]
-        own = torch.arange(len(index))[:, None].expand_as(partner)
-        partner = torch.where(partner >= 0, partner, own)
-        picked = (getattr(self, name)[index] for name in ("ray", "seen", "border", "border_weight"))
-        ray, seen, border, border_weight = picked
-        return Anchors(ray, partner, seen, weight, border, border_weight, self.focal)
-
-
-def gather(capture: Capture, aim: Aim, matches: Sequence[Match]) -> Anchors:
-    """Anchors and silhouettes' borders of all frames."""
-    n = len(capture)
-    of_frame: list[list[Match]] = [[] for _ in range(n)]
-    for match in matches:
-        if len(match) >= MIN_MATCHES:
-            of_frame[match.i].append(match)
-            of_frame[match.j].append(match.reversed())
-    k = max(1, max(len(found) for found in of_frame))
-    ray = torch.zeros(n, ANCHORS, 3, dtype=torch.float64)
-    ray[..., 2] = 1
-    partner = torch.arange(n)[:, None].repeat(1, k)
-    seen, weight = torch.zeros(n, ANCHORS, k, 2, dtype=torch.float64), torch.zeros(n, ANCHORS, k, dtype=torch.float64)
-    border, border_weight = ray[:, :BORDER].clone(), weight[:, :BORDER, 0].clone()
-    for frame in range(n):
-        edge = _border(capture, frame)
-        border[frame, : len(edge)] = _rays(capture, aim, frame, edge)
-        border_weight[frame, : len(edge)] = 1
-        if not of_frame[frame]:
-            continue
-        all_uv = torch.cat([match.uv_i for match in of_frame[frame]])
-        uv = _spread(all_uv, ANCHORS)
-        ray[frame, : len(uv)] = _rays(capture, aim, frame, uv)
-        for slot, match in enumerate(of_frame[frame]):
-            distance, nearest = torch.cdist(uv, match.uv_i).min(1)
-            uv_j = match.uv_j[nearest] + uv - match.uv_i[nearest]
-            seen[frame, : len(uv), slot] = _rays(capture, aim, match.j, uv_j)[:, :2]
-            near = distance < NEAREST * capture.camera.width
-            weight[frame, : len(uv), slot] = (near * match.confidence[nearest]).double()
-            partner[frame, slot] = match.j
-    focal = RADIUS_PIXELS * float(aim.camera.fx_fy_cx_cy[0]) / (0.5 * FILL * aim.camera.width)
-    return Anchors(ray, partner, seen, weight, border, border_weight, focal)
-
-
-def _rays(capture: Capture, aim: Aim, frame: int, uv: Tensor) -> Float[Tensor, "m 3"]:
-    """Rays with depth 1 in the aim frame through positions of a frame [pixels]."""
-    uv_aim = camera_to_aim(aim, capture.camera, frame, uv)
-    return aim.camera.unproject(uv_aim, torch.ones_like(uv[:, 0])).double()
-
-
-def _spread(uv: Float[Tensor, "m 2"], n: int) -> Float[Tensor, "b 2"]:
-    """At most `n` of some positions, each of which is far from those chosen before (farthest point sampling)."""
-    distance = torch.full((len(uv),), torch.inf)
-    chosen = [0]
-    while len(chosen) < min(n, len(uv)):
-        distance = torch.minimum(distance, (uv - uv[chosen[-1]]).square().sum(-1))
-        chosen.append(int(distance.argmax()))
-    return uv[chosen]
-
-
-def _border(capture: Capture, frame: int) -> Float[Tensor, "c 2"]:
-    """Positions between neighbouring pixels of object and background, evenly along the border [pixels]."""
-    mask = capture.masks[frame]
-    found = []
-    for axis, shift in ((0, (0.0, 0.5)), (1, (0.5, 0.0))):
-        a, b = mask.narrow(axis, 0, mask.shape[axis] - 1), mask.narrow(axis, 1, mask.shape[axis] - 1)
-        changes = ((a == OBJECT) & (b == BACKGROUND)) | ((a == BACKGROUND) & (b == OBJECT))
-        found.append(changes.nonzero().flip(-1) + 0.5 + torch.tensor(shift))
-    uv = torch.cat(found).to(capture.camera.fx_fy_cx_cy)
-    return _spread(uv, BORDER) if len(uv) else uv
+"""Function of points [n 3] that returns the signed distance [n]; no gradients are taken."""
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What holds poses and depths besides the observations."""
+    """What holds poses and depths besides the observations, and how these count."""
 
     depth: float
     """Standard deviation of an anchor's depth from the shape's [object radius]."""
     centre: float
     """Standard deviation of the object's centre from the middle of its silhouette [object radius]."""
     distance: float
-    """Standard deviation of the logarithm of the distance between neighbouring frames."""
-    turn: float
-    """Standard deviation of the rotation between neighbouring frames [radians]."""
+    """Standard deviation of the logarithm of the ratio of neighbouring frames' distances."""
     usual_distance: float
     """Distance of the object at the start [object radius]."""
     any_distance: float
     """Standard deviation of the logarithm of the ratio of a frame's distance to it."""
+    turn: float
+    """Standard deviation of the rotation between neighbouring frames [radians]."""
     border: float
-    """Weight of the silhouette's rays; that of a match is at most 1."""
+    """Weight of a ray through the silhouette's border; that of a match is at most 1."""
     scale: float
     """Residual from which an observation counts less (Cauchy) [pixels]."""
 
 
 @dataclass(frozen=True)
-class Poses:
+class _Poses:
     """Unknowns of an adjustment."""
 
     R: Float[Tensor, "t 3 3"]
@@ -165,12 +75,46 @@ class Poses:
     depth: Float[Tensor, "t a"]
     """Depth of every anchor [object radius]."""
 
-    @property
-    def T_aim_obj(self) -> SE3:
-        """Poses, float32."""
-        return SE3(SO3.from_matrix(self.R).wxyz.float(), self.xyz.float())
+
+@dataclass(frozen=True)
+class _Known:
+    """What an adjustment does not change."""
+
+    anchors: Anchors
+    """Anchors and silhouettes of the frames."""
+    shape: Shape
+    """Signed distance of the present shape."""
+    bound: float
+    """Radius of the sphere that contains the object [object radius]."""
+    priors: Priors
+    """See there."""
+    depth: Float[Tensor, "t a"]
+    """Depth of the shape along every anchor's ray [object radius]."""
+    hold: Float[Tensor, "t a"]
+    """Weight of this depth."""
 
 
+@dataclass(frozen=True)
+class _Linearised:
+    """Normal equations of the poses, and what the depths follow from."""
+
+    cost: Float[Tensor, ""]
+    """Robust cost [pixels^2]."""
+    hessian: Float[Tensor, "t t 6 6"]
+    """Blocks of the matrix, depths eliminated."""
+    gradient: Float[Tensor, "t 6"]
+    """Right side, negated."""
+    frames: Int64[Tensor, "t b"]
+    """Frames that the anchors of each frame depend on: it and its partners."""
+    depth_pose: Float[Tensor, "t a b 6"]
+    """Second derivatives by depth and by poses of these frames."""
+    depth_depth: Float[Tensor, "t a"]
+    """Second derivative by each depth."""
+    depth_gradient: Float[Tensor, "t a"]
+    """Derivative by each depth."""
+
+
+@torch.no_grad()
 def adjusted(
     anchors: Anchors,
     T_aim_obj: SE3,
@@ -182,114 +126,222 @@ def adjusted(
     steps: int,
     scales: Sequence[float],
 ) -> tuple[SE3, float]:
-    """Poses of least cost, and the cost per free frame [pixels^2]; the shape is met anew for each of the `scales`."""
+    """Poses of least cost, and the cost per free frame [pixels^2].
+
+    Args:
+        anchors: Anchors and silhouettes of the frames.
+        T_aim_obj: Initial poses.
+        free: Frames whose poses may change.
+        shape: Signed distance of the present shape.
+        priors: See `Priors`.
+        bound: Radius of the sphere that contains the object [object radius].
+        steps: Largest number of steps, for each of the scales.
+        scales: Values of `Priors.scale`, one after another; for each the rays meet the shape anew.
+    """
     cost = 0.0
     for scale in scales:
-        poses, hit = start(anchors, T_aim_obj, shape, bound=bound)
-        sharper = replace(priors, scale=scale)
-        poses, cost = adjust(anchors, poses, poses.depth, hit, free, shape, sharper, bound=bound, steps=steps)
-        T_aim_obj = poses.T_aim_obj
-    return T_aim_obj, cost
+        R, xyz = SO3.from_wxyz(T_aim_obj.wxyz.double()).matrix(), T_aim_obj.xyz.double()
+        depth, hit = _shape_depth(anchors.ray, R, xyz, shape, bound)
+        known = _Known(anchors, shape, bound, replace(priors, scale=scale), depth, MISSED + hit)
+        poses, cost = _minimise(known, _Poses(R, xyz, depth), free, steps)
+        T_aim_obj = SE3(SO3.from_matrix(poses.R).wxyz.float(), poses.xyz.float())
+    return T_aim_obj, cost / max(1, int(free.sum()))
 
 
-def start(anchors: Anchors, T_aim_obj: SE3, shape: Shape, *, bound: float) -> tuple[Poses, Float[Tensor, "t a"]]:
-    """Unknowns at given poses, and the weights of the shape's depths: 0 where a ray misses it."""
-    R = SO3.from_wxyz(T_aim_obj.wxyz.double()).matrix()
-    xyz = T_aim_obj.xyz.double()
-    depth, hit = shape_depth(anchors.ray, R, xyz, shape, bound=bound)
-    return Poses(R, xyz, depth), hit
+def _minimise(known: _Known, poses: _Poses, free: Bool[Tensor, " t"], steps: int) -> tuple[_Poses, float]:
+    """Unknowns of least cost, and this cost."""
+    damping, current = START_DAMPING, _linearise(known, poses)
+    for _ in range(steps):
+        moved = _moved(poses, current, free, damping)
+        proposed = _linearise(known, moved)
+        if not proposed.cost < current.cost:
+            damping *= REJECTED
+            if damping > MAX_DAMPING:
+                break
+            continue
+        converged = current.cost - proposed.cost < TOLERANCE * current.cost
+        poses, current, damping = moved, proposed, ACCEPTED * damping
+        if converged:
+            break
+    return poses, float(current.cost)
 
 
-@torch.no_grad()
-def shape_depth(
-    ray: Float[Tensor, "t a 3"], R: Float[Tensor, "t 3 3"], xyz: Float[Tensor, "t 3"], shape: Shape, *, bound: float
+def _moved(poses: _Poses, at: _Linearised, free: Bool[Tensor, " t"], damping: float) -> _Poses:
+    """Unknowns after a damped step."""
+    index = free.nonzero()[:, 0]
+    n = 6 * len(index)
+    matrix = at.hessian[index][:, index].transpose(1, 2).reshape(n, n)
+    matrix = matrix + torch.diag(damping * matrix.diagonal())
+    delta = torch.zeros_like(at.gradient)
+    delta[index] = -torch.linalg.solve(matrix, at.gradient[index].reshape(n)).reshape(-1, 6)
+    by_pose = torch.einsum("tabx,tbx->ta", at.depth_pose, delta[at.frames])
+    depth = poses.depth - (at.depth_gradient + by_pose) / at.depth_depth
+    return _Poses(SO3.exp(delta[:, :3]).matrix() @ poses.R, poses.xyz + delta[:, 3:], depth)
+
+
+# Along rays -----------------------------------------------------------------------------------------------------------
+
+
+def _shape_depth(
+    ray: Float[Tensor, "t a 3"], R: Float[Tensor, "t 3 3"], xyz: Float[Tensor, "t 3"], shape: Shape, bound: float
 ) -> tuple[Float[Tensor, "t a"], Float[Tensor, "t a"]]:
-    """Depth at which rays meet the shape, and 1 where they do; elsewhere the depth of the point closest to it."""
-    depth, distance = _along(ray, R, xyz, shape, bound=bound, n=48)
+    """Depth at which rays enter the shape, and 1; where they miss it, the depth of the point closest to it, and 0."""
+    depth, distance = _along(ray, R, xyz, shape, bound, DEPTH_SAMPLES)
     inside = distance < 0
-    first = inside.float().argmax(-1)
-    hit = inside.any(-1) & (first > 0)
-    before = (first - 1).clamp_min(0)
-    pick = lambda values, index: values.gather(-1, index[..., None])[..., 0]  # noqa: E731
-    d0, d1, f0, f1 = pick(depth, before), pick(depth, first), pick(distance, before), pick(distance, first)
-    crossing = d0 + (d1 - d0) * f0 / (f0 - f1).clamp_min(1e-9)
-    closest = pick(depth, distance.argmin(-1))
-    return torch.where(hit, crossing, closest), hit.double()
+    after = inside.float().argmax(-1, keepdim=True)
+    before = (after - 1).clamp_min(0)
+    outside, within = distance.gather(-1, before), distance.gather(-1, after)
+    step = depth.gather(-1, after) - depth.gather(-1, before)
+    entry = depth.gather(-1, before) + step * outside / (outside - within).clamp_min(1e-9)
+    hit = inside.any(-1, keepdim=True) & (after > 0)
+    closest = depth.gather(-1, distance.argmin(-1, keepdim=True))
+    return torch.where(hit, entry, closest)[..., 0], hit[..., 0].to(depth)
 
 
 def _along(
-    ray: Tensor, R: Tensor, xyz: Tensor, shape: Shape, *, bound: float, n: int
+    ray: Float[Tensor, "t a 3"],
+    R: Float[Tensor, "t 3 3"],
+    xyz: Float[Tensor, "t 3"],
+    shape: Shape,
+    bound: float,
+    n: int,
 ) -> tuple[Float[Tensor, "t a n"], Float[Tensor, "t a n"]]:
-    """Depths of samples along rays inside the sphere around the object, and signed distances there."""
-    length = ray.norm(dim=-1)
-    closest = (ray * xyz[:, None]).sum(-1) / length.square()
-    half = (bound**2 - (closest[..., None] * ray - xyz[:, None]).square().sum(-1)).clamp_min(1e-6).sqrt() / length
-    ticks = (torch.arange(n, dtype=ray.dtype) + 0.5) / n * 2 - 1
+    """Depths of `n` samples along the chord of each ray in the sphere around the object, and signed distances there."""
+    squared = ray.square().sum(-1)
+    closest = (ray * xyz[:, None]).sum(-1) / squared
+    miss = (closest[..., None] * ray - xyz[:, None]).square().sum(-1)
+    half = ((bound**2 - miss).clamp_min(1e-6) / squared).sqrt()
+    ticks = (torch.arange(n).to(ray) + 0.5) / n * 2 - 1
     depth = closest[..., None] + half[..., None] * ticks
     x_obj = (depth[..., None] * ray[:, :, None] - xyz[:, None, None]) @ R[:, None]
     return depth, shape(x_obj.reshape(-1, 3).float()).reshape(depth.shape).to(depth)
 
 
-def adjust(
-    anchors: Anchors,
-    poses: Poses,
-    target: Float[Tensor, "t a"],
-    hit: Float[Tensor, "t a"],
-    free: Bool[Tensor, " t"],
-    shape: Shape,
-    priors: Priors,
-    *,
-    bound: float,
-    steps: int,
-) -> tuple[Poses, float]:
-    """Poses of the free frames and depths of least cost, and the cost per free frame [pixels^2].
-
-    Args:
-        anchors: Anchors and silhouettes of the frames.
-        poses: Where to start.
-        target: Depth of the shape along each anchor's ray.
-        hit: Weight of that depth.
-        free: Frames whose poses may change.
-        shape: Signed distance of the shape.
-        priors: See `Priors`.
-        bound: Radius of the sphere around the object.
-        steps: Number of steps.
-    """
-    lam = 1e-3
-    terms = _linearise(anchors, poses, target, hit, shape, priors, bound)
-    for _ in range(steps):
-        moved = _moved(poses, terms, free, lam)
-        new = _linearise(anchors, moved, target, hit, shape, priors, bound)
-        if new.cost < terms.cost:
-            done = terms.cost - new.cost < 1e-4 * terms.cost
-            poses, terms, lam = moved, new, 0.2 * lam
-            if done:
-                break
-        else:
-            lam *= 8
-            if lam > 1e4:
-                break
-    return poses, terms.cost / max(1, int(free.sum()))
+# Normal equations -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Terms:
-    """Normal equations, with depths still in them."""
+def _linearise(known: _Known, poses: _Poses) -> _Linearised:
+    """Normal equations of all terms."""
+    t = len(poses.R)
+    matches, frames, blocks, gradient = _match_terms(known, poses)
+    hessian = poses.R.new_zeros(t, t, 6, 6)
+    b = frames.shape[1]
+    rows, columns = frames[:, :, None].expand(t, b, b), frames[:, None].expand(t, b, b)
+    hessian.index_put_((rows, columns), blocks, accumulate=True)
+    total = poses.R.new_zeros(t, 6).index_put_((frames,), gradient, accumulate=True)
+    cost, own, own_gradient = _border_terms(known, poses)
+    every = torch.arange(t)
+    hessian[every, every] += own
+    held_cost, held, held_gradient = _prior_terms(known.priors, poses)
+    return replace(
+        matches,
+        cost=matches.cost + cost + held_cost,
+        hessian=hessian + held,
+        gradient=total + own_gradient + held_gradient,
+    )
 
-    cost: float
-    frames: Int64[Tensor, "t b"]
-    """Frames of each block: the anchors' own, then their partners."""
-    blocks: Float[Tensor, "t b b 6 6"]
-    gradient: Float[Tensor, "t b 6"]
-    depth_depth: Float[Tensor, "t a"]
-    depth_gradient: Float[Tensor, "t a"]
-    depth_pose: Float[Tensor, "t a b 6"]
-    own: Float[Tensor, "t 6 6"]
-    own_gradient: Float[Tensor, "t 6"]
-    chain: Float[Tensor, "t t"]
-    chain_gradient: Float[Tensor, " t"]
-    turns: Float[Tensor, "t t"]
-    turns_gradient: Float[Tensor, "t 3"]
+
+def _match_terms(known: _Known, poses: _Poses) -> tuple[_Linearised, Tensor, Tensor, Tensor]:
+    """Terms of the anchors; and per frame the blocks `[t b b 6 6]` and the gradient `[t b 6]` of the frames it sees."""
+    anchors, depth = known.anchors, poses.depth
+    t, k = anchors.partner.shape
+    residual, project, R_j_i, v = _residuals(anchors, poses)
+    cost, w = _robust(residual.square().sum(-1), anchors.weight, known.priors.scale)
+    by_i = project @ R_j_i[:, None]
+    turned = torch.einsum("tkxy,tay->takx", R_j_i, v)
+    J = torch.zeros(t, v.shape[1], k, 2, 2, 6).to(v)
+    J[..., 0, :3], J[..., 0, 3:] = by_i @ _skew(v)[:, :, None], -by_i
+    J[..., 1, :3], J[..., 1, 3:] = -project @ _skew(turned), project
+    J_depth = (by_i @ anchors.ray[:, :, None, :, None])[..., 0]
+    wJ = w[..., None, None, None] * J
+    pairs = torch.einsum("takrux,takrvy->tkuvxy", wJ, J)
+    parts = torch.einsum("takrux,takr->tkux", wJ, residual)
+    mixed = torch.einsum("takrux,takr->takux", wJ, J_depth)
+    blocks, gradient = pairs.new_zeros(t, 1 + k, 1 + k, 6, 6), parts.new_zeros(t, 1 + k, 6)
+    index = torch.arange(1, 1 + k)
+    blocks[:, 0, 0], blocks[:, index, index] = pairs[:, :, 0, 0].sum(1), pairs[:, :, 1, 1]
+    blocks[:, 0, 1:], blocks[:, 1:, 0] = pairs[:, :, 0, 1], pairs[:, :, 1, 0]
+    gradient[:, 0], gradient[:, 1:] = parts[:, :, 0].sum(1), parts[:, :, 1]
+    c = torch.cat([mixed[..., 0, :].sum(2, keepdim=True), mixed[..., 1, :]], 2)
+    # The shape's depth holds robustly as well: the shape may be wrong.
+    off = (depth - known.depth) / known.priors.depth
+    hold = known.hold / (1 + off.square())
+    h = (w[..., None] * J_depth.square()).sum((2, 3)) + hold / known.priors.depth**2
+    g = (w[..., None] * J_depth * residual).sum((2, 3)) + hold * off / known.priors.depth
+    blocks = blocks - torch.einsum("tabx,tacy->tbcxy", c / h[..., None, None], c)
+    gradient = gradient - torch.einsum("tabx,ta->tbx", c, g / h)
+    cost = cost + (known.hold * torch.log1p(off.square())).sum()
+    frames = torch.cat([torch.arange(t)[:, None], anchors.partner], 1)
+    return _Linearised(cost, blocks, gradient, frames, c, h, g), frames, blocks, gradient
+
+
+def _residuals(anchors: Anchors, poses: _Poses) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Residuals `[t a k 2]`, derivative of projections `[t a k 2 3]`, `R_j_i [t k 3 3]`, points about centres `[t a 3]`."""
+    R_j_i = poses.R[anchors.partner] @ poses.R[:, None].mT
+    v = poses.depth[..., None] * anchors.ray - poses.xyz[:, None]
+    x, y, z = (torch.einsum("tkxy,tay->takx", R_j_i, v) + poses.xyz[anchors.partner][:, None]).unbind(-1)
+    # A point behind the camera would change its sign.
+    z = z.clamp_min(0.1)
+    residual = anchors.focal * (torch.stack([x / z, y / z], -1) - anchors.seen)
+    zero = torch.zeros_like(z)
+    project = torch.stack([1 / z, zero, -x / z.square(), zero, 1 / z, -y / z.square()], -1).unflatten(-1, (2, 3))
+    return residual, anchors.focal * project, R_j_i, v
+
+
+def _border_terms(known: _Known, poses: _Poses) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost, blocks `[t 6 6]` and gradient `[t 6]` of the rays through the silhouettes' borders."""
+    ray, weight = known.anchors.border, known.priors.border * known.anchors.border_weight
+    depth, distance = _along(ray, poses.R, poses.xyz, known.shape, known.bound, BORDER_SAMPLES)
+    least, at = distance.min(-1)
+    y = depth.gather(-1, at[..., None]) * ray - poses.xyz[:, None]
+    x_obj = (y @ poses.R).float().reshape(-1, 3)
+    shifts = SLOPE_STEP * torch.eye(3)
+    around = known.shape((x_obj + torch.cat([shifts, -shifts])[:, None]).reshape(-1, 3)).reshape(2, 3, -1)
+    slope = ((around[0] - around[1]) / (2 * SLOPE_STEP)).T.reshape(ray.shape).to(ray)
+    residual = RADIUS_PIXELS * least
+    cost, w = _robust(residual.square(), weight, known.priors.scale)
+    n_aim = RADIUS_PIXELS * slope @ poses.R.mT
+    J = torch.cat([torch.linalg.cross(n_aim, y), -n_aim], -1)
+    return cost, torch.einsum("tc,tcx,tcy->txy", w, J, J), torch.einsum("tc,tcx,tc->tx", w, J, residual)
+
+
+def _prior_terms(priors: Priors, poses: _Poses) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost, blocks `[t t 6 6]` and gradient `[t 6]` of centres, distances, and turns between neighbours in the list."""
+    R, xyz = poses.R, poses.xyz
+    t = len(R)
+    hessian, gradient = R.new_zeros(t, t, 6, 6), R.new_zeros(t, 6)
+    own = hessian.diagonal(dim1=0, dim2=1)
+    centre = xyz[:, :2] / priors.centre
+    own[3, 3] += priors.centre**-2
+    own[4, 4] += priors.centre**-2
+    gradient[:, 3:5] += centre / priors.centre
+    far = (xyz[:, 2] / priors.usual_distance).log() / priors.any_distance
+    slope = 1 / (priors.any_distance * xyz[:, 2])
+    own[5, 5] += slope.square()
+    gradient[:, 5] += far * slope
+    turn = SO3.from_matrix(R[1:] @ R[:-1].mT).log() / priors.turn
+    nearer = (xyz[1:, 2] / xyz[:-1, 2]).log() / priors.distance
+    # Derivatives by the later frame of each pair, and by the earlier one; those of turns hold for small ones.
+    later = torch.full((t - 1, 4), 1 / priors.turn).to(R)
+    earlier = -later
+    later[:, 3], earlier[:, 3] = 1 / (priors.distance * xyz[1:, 2]), -1 / (priors.distance * xyz[:-1, 2])
+    residual = torch.cat([turn, nearer[:, None]], 1)
+    a, b = torch.arange(t - 1), torch.arange(1, t)
+    for column, axis in enumerate((0, 1, 2, 5)):
+        first, second = earlier[:, column], later[:, column]
+        hessian[a, a, axis, axis] += first.square()
+        hessian[b, b, axis, axis] += second.square()
+        hessian[a, b, axis, axis] += first * second
+        hessian[b, a, axis, axis] += first * second
+        gradient[a, axis] += first * residual[:, column]
+        gradient[b, axis] += second * residual[:, column]
+    return centre.square().sum() + far.square().sum() + residual.square().sum(), hessian, gradient
+
+
+def _robust(squared: Tensor, weight: Tensor, scale: float) -> tuple[Float[Tensor, ""], Tensor]:
+    """Sum of Cauchy's loss of squared residuals, and the weights of the residuals in the normal equations."""
+    ratio = squared / scale**2
+    return (weight * scale**2 * torch.log1p(ratio)).sum(), weight / (1 + ratio)
 
 
 def _skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -297,146 +349,3 @@ def _skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-
-
-def _linearise(
-    anchors: Anchors, poses: Poses, target: Tensor, hit: Tensor, shape: Shape, priors: Priors, bound: float
-) -> _Terms:
-    R, xyz, depth = poses.R, poses.xyz, poses.depth
-    partner = anchors.partner
-    t, a, k = anchors.weight.shape
-    focal = anchors.focal
-    v = depth[..., None] * anchors.ray - xyz[:, None]
-    R_j_i = R[partner] @ R[:, None].mT
-    turned = torch.einsum("tkxy,tay->takx", R_j_i, v)
-    z = turned + xyz[partner][:, None]
-    uv = z[..., :2] / z[..., 2:]
-    residual = focal * (uv - anchors.seen)
-    inverse = focal / z[..., 2]
-    project = torch.zeros(t, a, k, 2, 3, dtype=R.dtype)
-    project[..., 0, 0] = project[..., 1, 1] = inverse
-    project[..., 2] = -inverse[..., None] * uv
-    squared = residual.square().sum(-1) / priors.scale**2
-    cost = (anchors.weight * priors.scale**2 * torch.log1p(squared)).sum()
-    w = anchors.weight / (1 + squared)
-    by_i = project @ R_j_i[:, None]
-    J_i = torch.cat([by_i @ _skew(v)[:, :, None], -by_i], -1)
-    J_j = torch.cat([-project @ _skew(turned), project], -1)
-    J_s = (by_i @ anchors.ray[:, :, None, :, None])[..., 0]
-    wJ_i, wJ_j = w[..., None, None] * J_i, w[..., None, None] * J_j
-    blocks = torch.zeros(t, 1 + k, 1 + k, 6, 6, dtype=R.dtype)
-    gradient = torch.zeros(t, 1 + k, 6, dtype=R.dtype)
-    blocks[:, 0, 0] = torch.einsum("takrx,takry->txy", wJ_i, J_i)
-    cross = torch.einsum("takrx,takry->tkxy", wJ_i, J_j)
-    blocks[:, 0, 1:], blocks[:, 1:, 0] = cross, cross.mT
-    index = torch.arange(1, 1 + k)
-    blocks[:, index, index] = torch.einsum("takrx,takry->tkxy", wJ_j, J_j)
-    gradient[:, 0] = torch.einsum("takrx,takr->tx", wJ_i, residual)
-    gradient[:, 1:] = torch.einsum("takrx,takr->tkx", wJ_j, residual)
-    depth_pose = torch.zeros(t, a, 1 + k, 6, dtype=R.dtype)
-    depth_pose[:, :, 0] = torch.einsum("takrx,takr->tax", wJ_i, J_s)
-    depth_pose[:, :, 1:] = torch.einsum("takrx,takr->takx", wJ_j, J_s)
-    # The shape's depth, robust as well: the shape may be wrong.
-    off = (depth - target) / priors.depth
-    hold = (0.02 + hit) / (1 + off.square())
-    cost = cost + ((0.02 + hit) * torch.log1p(off.square())).sum()
-    depth_depth = torch.einsum("tak,takr,takr->ta", w, J_s, J_s) + hold / priors.depth**2
-    depth_gradient = torch.einsum("tak,takr,takr->ta", w, J_s, residual) + hold * off / priors.depth
-    own, own_gradient, own_cost = _border_terms(anchors, poses, shape, priors, bound)
-    centre = xyz[:, :2] / priors.centre
-    own[:, 3, 3] += 1 / priors.centre**2
-    own[:, 4, 4] += 1 / priors.centre**2
-    own_gradient[:, 3:5] += centre / priors.centre
-    cost = cost + own_cost + centre.square().sum()
-    # Neighbours in the selection have about the same distance.
-    chain = torch.zeros(t, t, dtype=R.dtype)
-    step = (xyz[1:, 2] / xyz[:-1, 2]).log() / priors.distance
-    rows = torch.arange(t - 1)
-    g = 1 / (priors.distance * xyz[:, 2])
-    chain[rows, rows] += g[:-1].square()
-    chain[rows + 1, rows + 1] += g[1:].square()
-    chain[rows, rows + 1] -= g[:-1] * g[1:]
-    chain[rows + 1, rows] -= g[:-1] * g[1:]
-    chain_gradient = torch.zeros(t, dtype=R.dtype)
-    chain_gradient[1:] += step * g[1:]
-    chain_gradient[:-1] -= step * g[:-1]
-    cost = cost + step.square().sum()
-    turn = SO3.from_matrix(R[1:] @ R[:-1].mT).log() / priors.turn
-    turns, turns_gradient = torch.zeros_like(chain), torch.zeros(t, 3, dtype=R.dtype)
-    turns[rows, rows] += priors.turn**-2
-    turns[rows + 1, rows + 1] += priors.turn**-2
-    turns[rows, rows + 1] -= priors.turn**-2
-    turns[rows + 1, rows] -= priors.turn**-2
-    turns_gradient[1:] += turn / priors.turn
-    turns_gradient[:-1] -= turn / priors.turn
-    cost = cost + turn.square().sum()
-    far = (xyz[:, 2] / priors.usual_distance).log() / priors.any_distance
-    g = 1 / (priors.any_distance * xyz[:, 2])
-    own[:, 5, 5] += g.square()
-    own_gradient[:, 5] += far * g
-    cost = cost + far.square().sum()
-    frames = torch.cat([torch.arange(t)[:, None], partner], 1)
-    return _Terms(
-        float(cost), frames, blocks, gradient, depth_depth, depth_gradient, depth_pose, own, own_gradient, chain,
-        chain_gradient, turns, turns_gradient,
-    )
-
-
-@torch.no_grad()
-def _border_terms(
-    anchors: Anchors, poses: Poses, shape: Shape, priors: Priors, bound: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Normal equations of the rays through the silhouettes' borders, whose least signed distance is zero."""
-    t = len(poses.R)
-    zero = torch.zeros((), dtype=poses.R.dtype)
-    if priors.border == 0:
-        return zero.expand(t, 6, 6).clone(), zero.expand(t, 6).clone(), zero
-    ray = anchors.border
-    depth, distance = _along(ray, poses.R, poses.xyz, shape, bound=bound, n=32)
-    least, at = distance.min(-1)
-    y = depth.gather(-1, at[..., None]) * ray - poses.xyz[:, None]
-    x_obj = (y @ poses.R).float().reshape(-1, 3)
-    h = 0.03
-    shifts = h * torch.eye(3)
-    around = shape(torch.cat([x_obj + s for s in shifts] + [x_obj - s for s in shifts])).reshape(2, 3, -1)
-    slope = ((around[0] - around[1]) / (2 * h)).T.reshape(*least.shape, 3).to(least)
-    residual = RADIUS_PIXELS * least
-    squared = residual.square() / priors.scale**2
-    weight = priors.border * anchors.border_weight
-    cost = (weight * priors.scale**2 * torch.log1p(squared)).sum()
-    w = weight / (1 + squared)
-    n_aim = RADIUS_PIXELS * slope @ poses.R.mT
-    J = torch.cat([torch.linalg.cross(n_aim, y), -n_aim], -1)
-    return torch.einsum("tc,tcx,tcy->txy", w, J, J), torch.einsum("tc,tcx,tc->tx", w, J, residual), cost
-
-
-def _moved(poses: Poses, terms: _Terms, free: Bool[Tensor, " t"], lam: float) -> Poses:
-    """Poses and depths after a damped step."""
-    t = len(free)
-    h = terms.depth_depth * (1 + lam) + 1e-9
-    c = terms.depth_pose
-    blocks = terms.blocks - torch.einsum("tabx,tacy->tbcxy", c / h[..., None, None], c)
-    gradient = terms.gradient - torch.einsum("tabx,ta->tbx", c, terms.depth_gradient / h)
-    H, g = torch.zeros(t, t, 6, 6, dtype=h.dtype), torch.zeros(t, 6, dtype=h.dtype)
-    frames = terms.frames
-    b = frames.shape[1]
-    rows, columns = frames[:, :, None].expand(t, b, b), frames[:, None].expand(t, b, b)
-    H.index_put_((rows, columns), blocks, accumulate=True)
-    g.index_put_((frames,), gradient, accumulate=True)
-    every = torch.arange(t)
-    H[every, every] += terms.own
-    H[:, :, 5, 5] += terms.chain
-    for axis in range(3):
-        H[:, :, axis, axis] += terms.turns
-    g[:, :3] += terms.turns_gradient
-    g += terms.own_gradient
-    g[:, 5] += terms.chain_gradient
-    index = free.nonzero()[:, 0]
-    m = len(index)
-    matrix = H[index][:, index].transpose(1, 2).reshape(6 * m, 6 * m)
-    matrix = matrix + torch.diag(lam * matrix.diagonal() + 1e-6)
-    delta = torch.zeros(t, 6, dtype=h.dtype)
-    delta[index] = -torch.linalg.solve(matrix, g[index].reshape(-1)).reshape(m, 6)
-    depth_step = -(terms.depth_gradient + torch.einsum("tabx,tbx->ta", c, delta[frames])) / h
-    R = SO3.exp(delta[:, :3]).matrix() @ poses.R
-    return replace(poses, R=R, xyz=poses.xyz + delta[:, 3:], depth=poses.depth + depth_step)

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from tumble.maths import SE3, SO3
-from tumble.poses.progressive.adjustment import Anchors, Priors, Shape, adjusted
+from tumble.poses.progressive.adjustment import Priors, Shape, adjusted
+from tumble.poses.progressive.anchors import Anchors
 
 STEP = math.radians(10)
 """Rotation of the starts of a new frame from the pose of the frame before [radians]."""
@@ -48,6 +49,8 @@ class Motion:
     """Number of frames after which all frames are adjusted together."""
     depth: float = 0.3
     """Standard deviation of an anchor's depth from the shape's [object radius]."""
+    all_depth: float = 1.0
+    """The same where all frames are adjusted together, so that silhouettes and matches decide."""
     centre: float = 0.07
     """Standard deviation of the object's centre from the middle of its silhouette [object radius]."""
     distance: float = 0.05
@@ -58,6 +61,8 @@ class Motion:
     """Standard deviation of the rotation between neighbouring frames [radians]."""
     border: float = 0.5
     """Weight of a ray through the silhouette's border; that of a match is at most 1."""
+    all_border: float = 1.0
+    """The same where all frames are adjusted together."""
     scale: float = 0.5
     """Residual from which an observation counts less [pixels]."""
 
@@ -126,7 +131,8 @@ def adjust_all(motion: Motion, scene: Scene, T_aim_obj: SE3, known: Sequence[int
     """All poses, with those of the known frames adjusted together."""
     order, free = sorted(known), torch.ones(len(known), dtype=torch.bool)
     local = scene.anchors.select(order)
-    found, _ = _adjusted(motion, scene, local, T_aim_obj[order], free, _priors(motion, scene), (1.0, 1.0))
+    priors = replace(_priors(motion, scene), depth=motion.all_depth, border=motion.all_border)
+    found, _ = _adjusted(motion, scene, local, T_aim_obj[order], free, priors, (1.0, 1.0))
     return _with(T_aim_obj, order, found)
 
 

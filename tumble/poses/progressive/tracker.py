@@ -29,7 +29,7 @@ from torch import Tensor
 from tumble.engine import State, optim
 from tumble.io import tree
 from tumble.maths import SE3, SO3, angle_between, iou
-from tumble.poses.progressive import adjustment, neus, pose_networks, ray_sampling, registration, sdf_field, virtual_camera
+from tumble.poses.progressive import anchors, neus, pose_networks, ray_sampling, registration, sdf_field, virtual_camera
 from tumble.poses.progressive.neus import RayBatch, Rendered
 from tumble.poses.progressive.pose_networks import PoseSource
 from tumble.poses.progressive.ray_sampling import Pixels
@@ -156,6 +156,10 @@ class Config:
     """Number of steps per frame for its pose alone (appendix A)."""
     joint_steps: int = 500
     """Number of steps per frame for poses and shape (appendix A)."""
+    closing: int = 0
+    """Number of rounds after the last frame; in each the shape is trained on all frames, then all poses are adjusted."""
+    closing_steps: int = 0
+    """Number of steps of the shape in each of these rounds."""
     rays: int = 512
     """Number of rays per step from a recent frame (FMOV)."""
     old_rays: int = 512
@@ -205,9 +209,9 @@ class Inputs:
     """Virtual camera."""
 
     @functools.cached_property
-    def anchors(self) -> adjustment.Anchors:
-        """Anchors of `adjustment`, which take seconds."""
-        return adjustment.gather(self.capture, self.aim, self.matches)
+    def anchors(self) -> anchors.Anchors:
+        """Anchors of all frames, which take seconds."""
+        return anchors.gather(self.capture, self.aim, self.matches)
 
 
 @dataclass(frozen=True)
@@ -248,7 +252,7 @@ class ProgressiveResult:
 
 def length(cfg: Config, inputs: Inputs) -> int:
     """Number of steps, including those of a shape reset in every frame; these are skipped where there is no reset."""
-    return n_steps(cfg.phases, len(inputs.capture))
+    return n_steps(cfg.phases, len(inputs.capture)) + cfg.closing * cfg.closing_steps
 
 
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
@@ -301,6 +305,9 @@ def poses(params: Params, memory: dict[str, Tensor], frames: list[int]) -> SE3:
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """One step of the schedule; nothing in shape phases without a reset."""
     assert state.optimizer is not None, "init creates the optimizer"
+    tracked = n_steps(cfg.phases, len(inputs.capture))
+    if state.step >= tracked:
+        return _closing_step(cfg, inputs, state, state.step - tracked)
     now, memory = schedule_at(cfg.phases, state.step), state.memory
     frames = tracking_order(int(memory["start"]), len(inputs.capture))
     first = min(cfg.motion.first, len(frames)) if isinstance(cfg.motion, Motion) else 1
@@ -349,11 +356,9 @@ def _initialise_pose(cfg: Config, state: State, frames: list[int], index: int) -
 @torch.no_grad()
 def _register(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> None:
     """Estimate the pose of the newest frame, or of all first ones, and adjust those of the frames near it."""
-    motion = cfg.motion
+    motion, scene = cfg.motion, _scene(cfg, inputs, state)
     assert isinstance(motion, Motion), "other motions need no registration"
     T_aim_obj = poses(state.params, state.memory, list(range(len(inputs.capture))))
-    shape = functools.partial(sdf_field.distance, tree.detach(state.params.fields.sdf))
-    scene = Scene(inputs.anchors, shape, cfg.bound, float(state.memory["distance"]))
     if len(known) <= motion.first:
         T_aim_obj = registration.register_first(motion, scene, T_aim_obj, known)
     else:
@@ -362,6 +367,28 @@ def _register(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> No
         if len(known) % motion.every == 0 or len(known) == len(inputs.capture):
             T_aim_obj = registration.adjust_all(motion, scene, T_aim_obj, known)
     _set_poses(state, T_aim_obj, known)
+
+
+def _scene(cfg: Config, inputs: Inputs, state: State) -> Scene:
+    """What poses are registered against."""
+    shape = functools.partial(sdf_field.distance, tree.detach(state.params.fields.sdf))
+    return Scene(inputs.anchors, shape, cfg.bound, float(state.memory["distance"]))
+
+
+def _closing_step(cfg: Config, inputs: Inputs, state: State, step: int) -> dict[str, Tensor | float]:
+    """A step after all frames are known: of the shape alone, and at the ends of a round also of all poses."""
+    assert isinstance(cfg.motion, Motion) and state.optimizer is not None, "closing rounds need a registration"
+    known = tracking_order(int(state.memory["start"]), len(inputs.capture))
+    now = SchedulePoint(len(known) - 1, "shape", 0.5, 1.0, first=False, last=False)
+    terms = _loss_terms(cfg, inputs, state, now, known)
+    optim.anneal(state.optimizer, _rates(cfg, now, state.memory))
+    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    if (step + 1) % cfg.closing_steps == 0:
+        with torch.no_grad():
+            T_aim_obj = poses(state.params, state.memory, sorted(known))
+            scene = _scene(cfg, inputs, state)
+            _set_poses(state, registration.adjust_all(cfg.motion, scene, T_aim_obj, known), known)
+    return {name: value.detach() for name, value in terms.items()}
 
 
 def _set_poses(state: State, T_aim_obj: SE3, frames: list[int]) -> None:
@@ -405,7 +432,8 @@ def _loss_terms(cfg: Config, inputs: Inputs, state: State, now: SchedulePoint, k
         samples.append((main, now.phase != "shape", _draw(cfg, inputs, state, now, main, n_rays)))
     if now.phase != "pose" and cfg.old_rays:
         older = known[: -cfg.window] or known
-        frame = known[0] if now.phase == "shape" else older[_random_index(state, len(older))]
+        only_first = now.phase == "shape" and not isinstance(cfg.motion, Motion)
+        frame = known[0] if only_first else older[_random_index(state, len(older))]
         samples.append((frame, False, _draw(cfg, inputs, state, now, frame, cfg.old_rays)))
     if match is not None:
         for frame, uv in ((match.i, match.uv_i), (match.j, match.uv_j)):
