@@ -180,9 +180,9 @@ def report(rows: Sequence[Row]) -> str:
         parts += [
             "\n## The paper's stage 1 (route `progressive`) against route `graph`\n",
             "Route `progressive` is `tumble.poses.progressive` with `recipes.QUICK_TRACK`: voxel grids in place of the "
-            "paper's networks and initial poses from matches. Its constants were chosen on the knight, the cracker box, "
-            "the mustard bottle and the soup can, not on the duck. The paper's own form takes days on a CPU and has not "
-            "been run: the table is no evidence about that.\n",
+            "paper's networks, and initial poses from matches. Its constants were chosen on the knight, the cracker "
+            "box, the mustard bottle and the soup can, not on the duck. The paper's own form takes days on a CPU and "
+            "has not been run: the table is no evidence about that.\n",
             table(["name", "route", *SCORES], both),
         ]
     return "\n".join(parts) + "\n"

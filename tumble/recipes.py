@@ -205,8 +205,8 @@ QUICK_TRACK = progressive.Config(
     weights=progressive.Weights(mask=2.0, match=0.2),
     rates=progressive.Rates(poses=1e-4, poses_decay=0.3, fields=5e-3, sharpness=2e-3, ramp=1),
 )
-"""The progressive stage for two CPU cores: voxel grids in place of the paper's networks, initial poses from matches with
-several frames, and no reset of the shape, in a hundredth of the paper's steps."""
+"""The progressive stage for two CPU cores: voxel grids in place of the paper's networks, initial poses from matches
+with several frames, no reset of the shape, and a hundredth of the paper's computation."""
 
 QUALITIES = {"draft": DRAFT, "standard": STANDARD, "full": FULL, "paper": PAPER}
 """Recipes by the value of `--quality`."""
@@ -341,8 +341,8 @@ def no_specular_fit(recipe: Recipe) -> Recipe:
 def progressive_poses(recipe: Recipe) -> Recipe:
     """Stage 1 as in the paper: a neural SDF that grows frame by frame.
 
-    PAPER has it, with the paper's numbers, which take days on a CPU; other recipes get a small network with few rays
-    and steps, which take minutes.
+    PAPER has it, with the paper's numbers, which take days on a CPU; other recipes get voxel grids and initial poses
+    from matches, which take minutes.
     """
     return recipe if isinstance(recipe.track, progressive.Config) else replace(recipe, track=QUICK_TRACK)
 

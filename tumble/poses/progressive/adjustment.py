@@ -2,8 +2,8 @@
 
 The depth of each anchor is one unknown, which the shape's depth along its ray holds softly. Depths are eliminated
 (Schur complement), so that poses and depths move together; by turns they would not, because in a few frames a smaller
-rotation of a deeper shape explains the same matches (bas-relief ambiguity). The rays through a silhouette's border touch
-the shape: the least signed distance along each is zero.
+rotation of a deeper shape explains the same matches (bas-relief ambiguity). The rays through a silhouette's border
+touch the shape: the least signed distance along each is zero.
 
 Everything is in the aim frame of `virtual_camera`, in double precision. A step of a pose is a rotation vector about the
 object's centre and a shift, both in the aim frame. Residuals are in the pixels of `anchors`.
@@ -33,6 +33,8 @@ ACCEPTED = 0.2
 """Factor on the damping after a step that lowers the cost."""
 REJECTED = 8.0
 """Factor on the damping after any other step."""
+MIN_DAMPING = 1e-9
+"""Smallest damping; where all frames are free, nothing else holds the orientation of the object frame."""
 MAX_DAMPING = 1e4
 """Damping from which steps are negligible."""
 TOLERANCE = 1e-4
@@ -95,8 +97,22 @@ class _Known:
 
 
 @dataclass(frozen=True)
+class _Depths:
+    """Equations from which the depths follow when the poses have moved."""
+
+    frames: Int64[Tensor, "t b"]
+    """Frames that the anchors of each frame depend on: it and its partners."""
+    mixed: Float[Tensor, "t a b 6"]
+    """Second derivatives by depth and by poses of these frames."""
+    own: Float[Tensor, "t a"]
+    """Second derivative by each depth."""
+    gradient: Float[Tensor, "t a"]
+    """Derivative by each depth."""
+
+
+@dataclass(frozen=True)
 class _Linearised:
-    """Normal equations of the poses, and what the depths follow from."""
+    """Normal equations of the poses."""
 
     cost: Float[Tensor, ""]
     """Robust cost [pixels^2]."""
@@ -104,14 +120,8 @@ class _Linearised:
     """Blocks of the matrix, depths eliminated."""
     gradient: Float[Tensor, "t 6"]
     """Right side, negated."""
-    frames: Int64[Tensor, "t b"]
-    """Frames that the anchors of each frame depend on: it and its partners."""
-    depth_pose: Float[Tensor, "t a b 6"]
-    """Second derivatives by depth and by poses of these frames."""
-    depth_depth: Float[Tensor, "t a"]
-    """Second derivative by each depth."""
-    depth_gradient: Float[Tensor, "t a"]
-    """Derivative by each depth."""
+    depths: _Depths
+    """Equations of the depths."""
 
 
 @torch.no_grad()
@@ -160,7 +170,7 @@ def _minimise(known: _Known, poses: _Poses, free: Bool[Tensor, " t"], steps: int
                 break
             continue
         converged = current.cost - proposed.cost < TOLERANCE * current.cost
-        poses, current, damping = moved, proposed, ACCEPTED * damping
+        poses, current, damping = moved, proposed, max(MIN_DAMPING, ACCEPTED * damping)
         if converged:
             break
     return poses, float(current.cost)
@@ -174,8 +184,8 @@ def _moved(poses: _Poses, at: _Linearised, free: Bool[Tensor, " t"], damping: fl
     matrix = matrix + torch.diag(damping * matrix.diagonal())
     delta = torch.zeros_like(at.gradient)
     delta[index] = -torch.linalg.solve(matrix, at.gradient[index].reshape(n)).reshape(-1, 6)
-    by_pose = torch.einsum("tabx,tbx->ta", at.depth_pose, delta[at.frames])
-    depth = poses.depth - (at.depth_gradient + by_pose) / at.depth_depth
+    by_pose = torch.einsum("tabx,tbx->ta", at.depths.mixed, delta[at.depths.frames])
+    depth = poses.depth - (at.depths.gradient + by_pose) / at.depths.own
     return _Poses(SO3.exp(delta[:, :3]).matrix() @ poses.R, poses.xyz + delta[:, 3:], depth)
 
 
@@ -223,26 +233,22 @@ def _along(
 def _linearise(known: _Known, poses: _Poses) -> _Linearised:
     """Normal equations of all terms."""
     t = len(poses.R)
-    matches, frames, blocks, gradient = _match_terms(known, poses)
+    match_cost, depths, blocks, gradient = _match_terms(known, poses)
     hessian = poses.R.new_zeros(t, t, 6, 6)
-    b = frames.shape[1]
-    rows, columns = frames[:, :, None].expand(t, b, b), frames[:, None].expand(t, b, b)
+    b = depths.frames.shape[1]
+    rows, columns = depths.frames[:, :, None].expand(t, b, b), depths.frames[:, None].expand(t, b, b)
     hessian.index_put_((rows, columns), blocks, accumulate=True)
-    total = poses.R.new_zeros(t, 6).index_put_((frames,), gradient, accumulate=True)
-    cost, own, own_gradient = _border_terms(known, poses)
+    total = poses.R.new_zeros(t, 6).index_put_((depths.frames,), gradient, accumulate=True)
+    border_cost, own, own_gradient = _border_terms(known, poses)
     every = torch.arange(t)
     hessian[every, every] += own
-    held_cost, held, held_gradient = _prior_terms(known.priors, poses)
-    return replace(
-        matches,
-        cost=matches.cost + cost + held_cost,
-        hessian=hessian + held,
-        gradient=total + own_gradient + held_gradient,
-    )
+    prior_cost, held, held_gradient = _prior_terms(known.priors, poses)
+    cost = match_cost + border_cost + prior_cost
+    return _Linearised(cost, hessian + held, total + own_gradient + held_gradient, depths)
 
 
-def _match_terms(known: _Known, poses: _Poses) -> tuple[_Linearised, Tensor, Tensor, Tensor]:
-    """Terms of the anchors; and per frame the blocks `[t b b 6 6]` and the gradient `[t b 6]` of the frames it sees."""
+def _match_terms(known: _Known, poses: _Poses) -> tuple[Tensor, _Depths, Tensor, Tensor]:
+    """Cost and depths of the anchors; per frame, blocks `[t b b 6 6]` and gradient `[t b 6]` of what it depends on."""
     anchors, depth = known.anchors, poses.depth
     t, k = anchors.partner.shape
     residual, project, R_j_i, v = _residuals(anchors, poses)
@@ -272,11 +278,11 @@ def _match_terms(known: _Known, poses: _Poses) -> tuple[_Linearised, Tensor, Ten
     gradient = gradient - torch.einsum("tabx,ta->tbx", c, g / h)
     cost = cost + (known.hold * torch.log1p(off.square())).sum()
     frames = torch.cat([torch.arange(t)[:, None], anchors.partner], 1)
-    return _Linearised(cost, blocks, gradient, frames, c, h, g), frames, blocks, gradient
+    return cost, _Depths(frames, c, h, g), blocks, gradient
 
 
 def _residuals(anchors: Anchors, poses: _Poses) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Residuals `[t a k 2]`, derivative of projections `[t a k 2 3]`, `R_j_i [t k 3 3]`, points about centres `[t a 3]`."""
+    """Residuals `[t a k 2]`, their derivatives by points, `R_j_i [t k 3 3]`, and points about the centre `[t a 3]`."""
     R_j_i = poses.R[anchors.partner] @ poses.R[:, None].mT
     v = poses.depth[..., None] * anchors.ray - poses.xyz[:, None]
     x, y, z = (torch.einsum("tkxy,tay->takx", R_j_i, v) + poses.xyz[anchors.partner][:, None]).unbind(-1)

@@ -1,4 +1,4 @@
-"""Anchors: pixels of a frame with their matched positions in the frames around it, and rays through silhouettes' borders.
+"""Anchors: pixels of a frame with their matched positions in other frames, and rays through silhouettes' borders.
 
 They are what `adjustment` explains by poses and a shape. All rays are in the aim frame of `virtual_camera` and have
 depth 1.
@@ -91,8 +91,8 @@ def gather(capture: Capture, aim: Aim, matches: Sequence[Match]) -> Anchors:
 
 def _rays(capture: Capture, aim: Aim, frame: int, uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
     """Rays through positions of a frame [pixels]."""
-    uv_aim = camera_to_aim(aim, capture.camera, frame, uv)
-    return aim.camera.unproject(uv_aim, torch.ones_like(uv[:, 0])).double()
+    uv_aim = camera_to_aim(aim, capture.camera, frame, uv.to(capture.camera.fx_fy_cx_cy))
+    return aim.camera.unproject(uv_aim, torch.ones_like(uv_aim[:, 0])).double()
 
 
 def _spread(uv: Float[Tensor, "m 2"], n: int) -> Float[Tensor, "b 2"]:

@@ -53,7 +53,7 @@ def distance(grids: Grids, x: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
 def distance_and_gradient(
     grids: Grids, x: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n f"]]:
-    """Signed distance, its gradient by differences over half a cell of the finest grid, and features; differentiable."""
+    """Signed distance, its gradient by differences over a cell of the finest grid, and features; differentiable."""
     h = grids.bound / (max(map(int, grids.offsets)) - 1)
     shifts = h * torch.eye(3, dtype=x.dtype, device=x.device)
     shifted = (x + torch.cat([torch.zeros_like(shifts[:1]), shifts, -shifts])[:, None]).flatten(0, 1)

@@ -123,7 +123,9 @@ def adjust_window(motion: Motion, scene: Scene, T_aim_obj: SE3, known: Sequence[
     near = _nearest(known, motion.window)
     far = sorted(near, key=lambda frame: -abs(frame - known[-1]))[: motion.held if len(known) > len(near) else 0]
     free = torch.tensor([frame not in far for frame in near])
-    found, _ = _adjusted(motion, scene, scene.anchors.select(near), T_aim_obj[near], free, _priors(motion, scene), (1.0,))
+    found, _ = _adjusted(
+        motion, scene, scene.anchors.select(near), T_aim_obj[near], free, _priors(motion, scene), (1.0,)
+    )
     return _with(T_aim_obj, near, found)
 
 

@@ -5,6 +5,9 @@ against the shape so far, then pose and shape together. When the object has rota
 the shape is reset to a sphere and trained on all frames so far, whose poses are kept. Poses are parametrised by
 `pose_networks.orbit` in the aim frame of `virtual_camera`.
 
+With `Config.motion = Motion(...)` poses come from `registration` instead: the first frames together, before there is a
+shape, then every new frame against the shape so far, and at the end all frames in rounds with the shape.
+
 Deliberate differences from the paper and FMOV:
 - The virtual camera rotates rays, which is exact and does not resample images (FMOV shifts images).
 - The match loss is robust, weighted by confidence, and normalised by the sum of the compositing weights (the gradient
@@ -30,6 +33,7 @@ from tumble.engine import State, optim
 from tumble.io import tree
 from tumble.maths import SE3, SO3, angle_between, iou
 from tumble.poses.progressive import anchors, neus, pose_networks, ray_sampling, registration, sdf_field, virtual_camera
+from tumble.poses.progressive.grid_field import Grids
 from tumble.poses.progressive.neus import RayBatch, Rendered
 from tumble.poses.progressive.pose_networks import PoseSource
 from tumble.poses.progressive.ray_sampling import Pixels
@@ -38,7 +42,7 @@ from tumble.poses.progressive.sdf_field import Fields, Sdf, Sizes
 from tumble.poses.progressive.virtual_camera import Aim
 from tumble.scene import OBJECT, Capture, Match
 
-VERSION = 3
+VERSION = 4
 OBJECT_PIXELS = 160
 """Diameter of the object in the frame whose pixels are the unit of match residuals [pixels].
 
@@ -157,7 +161,7 @@ class Config:
     joint_steps: int = 500
     """Number of steps per frame for poses and shape (appendix A)."""
     closing: int = 0
-    """Number of rounds after the last frame; in each the shape is trained on all frames, then all poses are adjusted."""
+    """Number of rounds after the last frame: the shape is trained on all frames, then all poses are adjusted to it."""
     closing_steps: int = 0
     """Number of steps of the shape in each of these rounds."""
     rays: int = 512
@@ -226,7 +230,10 @@ class Params:
 
 @dataclass(frozen=True)
 class FrameFit:
-    """Residuals of each frame right after it was tracked; large ones indicate a lost frame."""
+    """Residuals of each frame right after it was tracked; large ones indicate a lost frame.
+
+    Of frames that are registered together, before there is a shape, only the last one has some, those of the sphere.
+    """
 
     match: Float[Tensor, " t"]
     """Median match residual [pixels, see OBJECT_PIXELS]; infinite without matches."""
@@ -244,7 +251,7 @@ class ProgressiveResult:
     """Object to virtual camera, one per frame [object radius]."""
     aim: Aim
     """Virtual camera."""
-    sdf: Sdf
+    sdf: Sdf | Grids
     """The last shape, trained mostly on the frames since its last reset."""
     fit: FrameFit
     """Residuals per frame."""
@@ -377,7 +384,8 @@ def _scene(cfg: Config, inputs: Inputs, state: State) -> Scene:
 
 def _closing_step(cfg: Config, inputs: Inputs, state: State, step: int) -> dict[str, Tensor | float]:
     """A step after all frames are known: of the shape alone, and at the ends of a round also of all poses."""
-    assert isinstance(cfg.motion, Motion) and state.optimizer is not None, "closing rounds need a registration"
+    assert isinstance(cfg.motion, Motion), "closing rounds need a registration"
+    assert state.optimizer is not None, "init creates the optimizer"
     known = tracking_order(int(state.memory["start"]), len(inputs.capture))
     now = SchedulePoint(len(known) - 1, "shape", 0.5, 1.0, first=False, last=False)
     terms = _loss_terms(cfg, inputs, state, now, known)
