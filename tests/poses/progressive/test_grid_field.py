@@ -61,6 +61,6 @@ def test_sections_that_contribute_nothing_are_left_out() -> None:
     assert where.any(1).all()
     assert where.float().mean() < 0.3
     # What is left out weighs little where a ray meets the surface head on; grazing rays lose up to a sixteenth.
-    assert (some.opacity - every.opacity).abs().median() < 1e-3
+    assert (some.opacity - every.opacity).abs().median() < 5e-3
     assert (some.opacity - every.opacity).abs().max() < 0.08
     assert (some.rgb - every.rgb).abs().max() < 0.08
