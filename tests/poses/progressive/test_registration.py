@@ -113,6 +113,7 @@ def photographed() -> tuple[Inputs, Trajectory]:
     return Inputs(replace(capture, trajectory=None), tuple(found), aim), capture.trajectory
 
 
+@pytest.mark.slow
 def test_the_quick_recipe_tracks_a_scene_by_mitsuba(photographed: tuple[Inputs, Trajectory]) -> None:
     """Frames 16 to 24 degrees apart, twice as far as a hand-held video's, so that only neighbours have matches, and 64
     pixels wide: seen 12 degrees (9 with all steps of the recipe), where no rotation at all is 80 off and more."""
@@ -134,7 +135,7 @@ def test_a_run_with_registration_is_resumed_bit_for_bit(
     matches = tuple(match for match in inputs.matches if max(match.i, match.j) < n)
     inputs = Inputs(capture, matches, replace(inputs.aim, R_cam_aim=inputs.aim.R_cam_aim[:n]))
     few = {k: v for k, v in vars(QUICK).items() if k != "lift"} | {"warmup": 4, "joint_steps": 2, "closing_steps": 3}
-    cfg = tracker.Config(**few)
+    cfg = tracker.Config(**few | {"sizes": replace(QUICK.sizes, nodes=(6, 12)), "motion": Motion(steps=4)})
     uninterrupted = bits(drive(tracker, cfg, inputs, seed=3))
     first_shape = 8 * 4 + 7 * 2
     for stop in (first_shape + 2, first_shape + 5, tracker.length(cfg, inputs) - 2):
