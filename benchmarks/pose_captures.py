@@ -152,7 +152,7 @@ ODDITIES: dict[str, Callable[[Capture], Capture]] = {"wrong masks": wrong_masks,
 """Modifications of a capture by name."""
 PLAIN = [Case(model, light, seed) for seed in SEEDS for light in LIGHTS for model in (*TEXTURED, *OTHERS)]
 """All objects, lights and trajectories at the default resolution."""
-COMPARED = [Case(TEXTURED[0]), Case(OTHERS[0]), Case(TEXTURED[1])]
+COMPARED = [Case(model) for model in (*TEXTURED, *OTHERS)]
 """Captures on which the two routes of stage 1 are compared."""
 LARGE = [Case(TEXTURED[0], resolution=256), Case(OTHERS[0], LIGHTS[1], resolution=256)]
 """Captures at twice the resolution."""

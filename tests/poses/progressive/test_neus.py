@@ -18,7 +18,7 @@ SIZES = Sizes(width=64, depth=3, skip=0, features=4, octaves=0, colour_width=8, 
 def rendered_rays(opacity: torch.Tensor, rgb: torch.Tensor, points: torch.Tensor | None = None) -> Rendered:
     """Rendered rays with one section each."""
     points = torch.zeros(len(opacity), 3) if points is None else points
-    return Rendered(rgb, opacity, opacity[:, None], points[:, None], 2 * torch.ones(len(opacity), 1, 3))
+    return Rendered(rgb, opacity, opacity[:, None], points[:, None], 2 * torch.ones(len(opacity), 3))
 
 
 def target_pixels(mask: torch.Tensor, rgb: torch.Tensor) -> Pixels:

@@ -1,5 +1,8 @@
 """Neural fields: the initial sphere, and the analytic gradient against that of autograd."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -71,10 +74,11 @@ def test_the_seed_determines_the_weights() -> None:
     assert a.sharpness == pytest.approx(20.0855, rel=1e-4)
 
 
-def test_fields_are_saved_and_loaded(tmp_path) -> None:
-    net = sdf_field.sphere_initialised(SMALL, torch.Generator().manual_seed(0))
-    tree.save(net, tmp_path / "net.safetensors")
-    back = tree.load(sdf_field.Fields, tmp_path / "net.safetensors")
-    assert torch.equal(
-        sdf_field.distance(net.sdf, points_in_sphere(5)), sdf_field.distance(back.sdf, points_in_sphere(5))
-    )
+@pytest.mark.parametrize("nodes", [(), (4, 8)])
+def test_shapes_are_saved_and_loaded(tmp_path: Path, nodes: tuple[int, ...]) -> None:
+    """The network and the grids."""
+    sdf = sdf_field.sphere_initialised(replace(SMALL, nodes=nodes), torch.Generator().manual_seed(0)).sdf
+    tree.save(sdf, tmp_path / "sdf.safetensors")
+    back = tree.load(type(sdf), tmp_path / "sdf.safetensors")
+    x = points_in_sphere(5)
+    assert torch.equal(sdf_field.distance(sdf, x), sdf_field.distance(back, x))

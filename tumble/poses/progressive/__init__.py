@@ -4,8 +4,9 @@ An alternative to `poses.sfm`, which the default recipe uses; `recipes.progressi
 """
 
 from tumble.poses.progressive import stage
+from tumble.poses.progressive.registration import Motion
 from tumble.poses.progressive.sdf_field import Sizes
 from tumble.poses.progressive.stage import Config, gather
 from tumble.poses.progressive.tracker import Rates, Weights
 
-__all__ = ["Config", "Rates", "Sizes", "Weights", "gather", "stage"]
+__all__ = ["Config", "Motion", "Rates", "Sizes", "Weights", "gather", "stage"]

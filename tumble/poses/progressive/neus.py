@@ -6,20 +6,25 @@ frames (section 4.1 of the paper).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 from torch.nn.functional import binary_cross_entropy, smooth_l1_loss
 
 from tumble.maths import SE3
 from tumble.poses.progressive import sdf_field
+from tumble.poses.progressive.grid_field import Grids
 from tumble.poses.progressive.ray_sampling import Pixels
 from tumble.poses.progressive.sdf_field import Fields
 from tumble.scene import Camera
 
 OPACITY_MARGIN = 1e-3
 """Smallest distance of opacities from 0 and 1 in the mask loss (NeuS)."""
+MIN_WEIGHT = 1e-3
+"""Weight below which a section of a ray through voxel grids is left out."""
 MIN_HIT_OPACITY = 0.05
 """Opacity of a ray below which its intersection with the object is undefined."""
 
@@ -51,8 +56,8 @@ class Rendered:
     """Weight of each section in the colour."""
     points: Float[Tensor, "r k 3"]
     """Centres of the sections, object frame."""
-    gradients: Float[Tensor, "r k 3"]
-    """Gradient of the signed distance at the centres."""
+    gradients: Float[Tensor, "n 3"]
+    """Gradient of the signed distance at the centres of the sections that were evaluated."""
 
 
 @torch.no_grad()
@@ -87,11 +92,11 @@ def sections(
 
 
 def opacities(
-    sdf: Float[Tensor, "r k"],
-    slope: Float[Tensor, "r k"],
-    lengths: Float[Tensor, "r k"],
+    sdf: Float[Tensor, "*b"],
+    slope: Float[Tensor, "*b"],
+    lengths: Float[Tensor, "*b"],
     sharpness: Float[Tensor, ""],
-) -> Float[Tensor, "r k"]:
+) -> Float[Tensor, "*b"]:
     """Opacity of each section: `(F(s0) - F(s1)) / F(s0)` with the logistic function F (NeuS eq. 13).
 
     Args:
@@ -119,17 +124,59 @@ def render(
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     intervals: Sections,
+    *,
+    where: Bool[Tensor, "r k"] | None = None,
 ) -> Rendered:
-    """Volume rendering of rays over black; differentiable in both functions, origins and directions."""
+    """Volume rendering of rays over black; differentiable in both functions, origins and directions.
+
+    Args:
+        sdf: Shape.
+        colour: Colour.
+        sharpness: Sharpness of the logistic function [1 / object radius].
+        origins: Origins of the rays.
+        directions: Directions of the rays, unit length.
+        intervals: Sections of the rays.
+        where: Sections that are evaluated; the others are empty. None for all.
+    """
     r, k = intervals.middles.shape
     points = origins[:, None] + intervals.middles[..., None] * directions[:, None]
-    flat = points.reshape(-1, 3)
-    views = directions[:, None].expand(r, k, 3).reshape(-1, 3)
+    if where is None:
+        where = torch.ones_like(intervals.middles, dtype=torch.bool)
+    index = where.flatten().nonzero()[:, 0]
+    flat, ray = points.reshape(-1, 3)[index], index // k
+    views = directions[ray]
     distance, gradient, features = sdf(flat)
     slope = (gradient * views).sum(-1)
-    weights = composite(opacities(distance.reshape(r, k), slope.reshape(r, k), intervals.lengths, sharpness))
-    rgb = (weights[..., None] * colour(flat, views, gradient, features).reshape(r, k, 3)).sum(1)
-    return Rendered(rgb, weights.sum(1), weights, points, gradient.reshape(r, k, 3))
+    alpha = opacities(distance, slope, intervals.lengths.reshape(-1)[index], sharpness)
+    weights = composite(alpha.new_zeros(r * k).index_put((index,), alpha).reshape(r, k))
+    own = weights.reshape(-1)[index]
+    rgb = torch.zeros_like(origins).index_add(0, ray, own[:, None] * colour(flat, views, gradient, features))
+    return Rendered(rgb, weights.sum(1), weights, points, gradient)
+
+
+@torch.no_grad()
+def near_surface(
+    distance: Callable[[Tensor], Tensor],
+    sharpness: Float[Tensor, ""],
+    origins: Float[Tensor, "r 3"],
+    directions: Float[Tensor, "r 3"],
+    intervals: Sections,
+) -> Bool[Tensor, "r k"]:
+    """Sections that contribute to a ray, and the one of each ray that lies closest to the surface.
+
+    Args:
+        distance: Signed distance [n] of points [n 3].
+        sharpness: Sharpness of the logistic function [1 / object radius].
+        origins: Origins of the rays.
+        directions: Directions of the rays, unit length.
+        intervals: Sections of the rays.
+    """
+    points = origins[:, None] + intervals.middles[..., None] * directions[:, None]
+    sdf = distance(points.reshape(-1, 3)).reshape(intervals.middles.shape)
+    # As if the ray met the surface at a right angle.
+    weights = composite(opacities(sdf, -torch.ones_like(sdf), intervals.lengths, sharpness))
+    closest = functional.one_hot(sdf.abs().argmin(1), sdf.shape[1]).bool()
+    return (weights > MIN_WEIGHT) | closest
 
 
 # Frames and losses ----------------------------------------------------------------------------------------------------
@@ -163,6 +210,9 @@ def render_batches(
     origins = torch.cat([T.xyz.expand(len(batch.pixels), 3) for T, batch in pairs])
     jitter = None if rng is None else torch.rand(len(origins), generator=rng).to(origins) - 0.5
     intervals: Sections = sections(origins, directions, n_sections, bound=bound, jitter=jitter)
+    where = None
+    if isinstance(fields.sdf, Grids):
+        where = near_surface(partial(sdf_field.distance, fields.sdf), fields.sharpness, origins, directions, intervals)
     return render(
         lambda x: sdf_field.distance_and_gradient(fields.sdf, x),
         lambda x, view, gradient, features: sdf_field.colour(fields.colour, x, view, gradient, features),
@@ -170,6 +220,7 @@ def render_batches(
         origins,
         directions,
         intervals,
+        where=where,
     )
 
 
@@ -189,7 +240,7 @@ def mask_loss(rendered: Rendered, pixels: Pixels) -> Float[Tensor, ""]:
 
 def eikonal_loss(rendered: Rendered) -> Float[Tensor, ""]:
     """Eikonal loss of the signed distance, the mean of `(|gradient| - 1)^2`; 0 without rays."""
-    return (rendered.gradients.norm(dim=-1) - 1).square().sum() / max(1, rendered.weights.numel())
+    return (rendered.gradients.norm(dim=-1) - 1).square().sum() / max(1, len(rendered.gradients))
 
 
 def transfer_residuals(

@@ -14,6 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize, relu, softplus
 
+from tumble.poses.progressive import grid_field
+from tumble.poses.progressive.grid_field import Grids
+
 BETA = 100.0
 """Sharpness of softplus, which is then nearly a ReLU but twice differentiable (NeuS)."""
 
@@ -40,6 +43,10 @@ class Sizes:
     """Octaves of the positional encoding of view directions."""
     radius: float = 0.5
     """Radius of the initial sphere [object radius]."""
+    nodes: tuple[int, ...] = ()
+    """Nodes per side of each of the voxel grids that replace the distance network (`grid_field`); none: the network."""
+    bound: float = 1.1
+    """Half the side of the cube that the grids cover [object radius]."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +91,8 @@ class Colour:
 class Fields:
     """Distance network, colour network and sharpness of one object."""
 
-    sdf: Sdf
-    """Distance network."""
+    sdf: Sdf | Grids
+    """Distance network, or voxel grids in its place."""
     colour: Colour
     """Colour network."""
     log_sharpness: Float[Tensor, ""]
@@ -103,6 +110,9 @@ def sphere_initialised(sizes: Sizes, rng: torch.Generator) -> Fields:
     Geometric initialisation as in NeuS (Atzmon and Lipman 2020) gives a sphere only on average over random weights. The
     row of the last layer that outputs the distance is therefore corrected by ridge regression to fit the sphere.
     """
+    if sizes.nodes:
+        grids = grid_field.sphere(sizes.nodes, sizes.features, radius=sizes.radius, bound=sizes.bound, rng=rng)
+        return Fields(grids, _colour_network(sizes, rng), torch.tensor(0.3))
     skip = sizes.skip if 0 < sizes.skip < sizes.depth else 0
     layers = _layers(_geometric_init(sizes, skip, rng))
     sdf = Sdf(layers, sizes.octaves, skip)
@@ -113,6 +123,11 @@ def sphere_initialised(sizes: Sizes, rng: torch.Generator) -> Fields:
     row = layers.linear(sizes.depth)[0][0] + torch.linalg.solve(h.T @ h + ridge, h.T @ correction).float()
     layers.weights[f"direction{sizes.depth}"][0] = row
     layers.weights[f"length{sizes.depth}"][0] = row.norm()
+    return Fields(sdf, _colour_network(sizes, rng), torch.tensor(0.3))
+
+
+def _colour_network(sizes: Sizes, rng: torch.Generator) -> Colour:
+    """Initial colour network."""
     colour, n_in = [], 6 + 3 + 6 * sizes.colour_octaves + sizes.features
     for layer in range(sizes.colour_depth + 1):
         n_out = 3 if layer == sizes.colour_depth else sizes.colour_width
@@ -120,7 +135,7 @@ def sphere_initialised(sizes: Sizes, rng: torch.Generator) -> Fields:
         matrix, bias = (limit * (2 * torch.rand(*s, generator=rng) - 1) for s in ((n_out, n_in), (n_out,)))
         colour.append((matrix, bias))
         n_in = n_out
-    return Fields(sdf, Colour(_layers(colour), sizes.colour_octaves), torch.tensor(0.3))
+    return Colour(_layers(colour), sizes.colour_octaves)
 
 
 def _geometric_init(sizes: Sizes, skip: int, rng: torch.Generator) -> list[tuple[Tensor, Tensor]]:
@@ -149,15 +164,19 @@ def _layers(pairs: list[tuple[Tensor, Tensor]]) -> Layers:
     return Layers(weights)
 
 
-def distance(net: Sdf, x: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def distance(net: Sdf | Grids, x: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Signed distance without its gradient, for the extraction of surfaces."""
+    if isinstance(net, Grids):
+        return grid_field.distance(net, x)
     return _forward(net, x)[0][:, 0]
 
 
 def distance_and_gradient(
-    net: Sdf, x: Float[Tensor, "n 3"]
+    net: Sdf | Grids, x: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n f"]]:
     """Signed distance, its gradient, and the features for the colour network; all differentiable."""
+    if isinstance(net, Grids):
+        return grid_field.distance_and_gradient(net, x)
     out, slopes, matrices = _forward(net, x)
     encoded = 3 + 6 * net.octaves
     gradient = matrices[-1][0].expand(len(x), -1)

@@ -5,6 +5,9 @@ against the shape so far, then pose and shape together. When the object has rota
 the shape is reset to a sphere and trained on all frames so far, whose poses are kept. Poses are parametrised by
 `pose_networks.orbit` in the aim frame of `virtual_camera`.
 
+With `Config.motion = Motion(...)` poses come from `registration` instead: the first frames together, before there is a
+shape, then every new frame against the shape so far, and at the end all frames in rounds with the shape.
+
 Deliberate differences from the paper and FMOV:
 - The virtual camera rotates rays, which is exact and does not resample images (FMOV shifts images).
 - The match loss is robust, weighted by confidence, and normalised by the sum of the compositing weights (the gradient
@@ -29,15 +32,17 @@ from torch import Tensor
 from tumble.engine import State, optim
 from tumble.io import tree
 from tumble.maths import SE3, SO3, angle_between, iou
-from tumble.poses.progressive import neus, pose_networks, ray_sampling, sdf_field, virtual_camera
+from tumble.poses.progressive import anchors, neus, pose_networks, ray_sampling, registration, sdf_field, virtual_camera
+from tumble.poses.progressive.grid_field import Grids
 from tumble.poses.progressive.neus import RayBatch, Rendered
 from tumble.poses.progressive.pose_networks import PoseSource
 from tumble.poses.progressive.ray_sampling import Pixels
+from tumble.poses.progressive.registration import Motion, Scene
 from tumble.poses.progressive.sdf_field import Fields, Sdf, Sizes
 from tumble.poses.progressive.virtual_camera import Aim
 from tumble.scene import OBJECT, Capture, Match
 
-VERSION = 3
+VERSION = 4
 OBJECT_PIXELS = 160
 """Diameter of the object in the frame whose pixels are the unit of match residuals [pixels].
 
@@ -139,10 +144,12 @@ class Config:
 
     poses: Literal["mlps", "vectors"] = "mlps"
     """Parametrisation of the poses. mlps: a network per frame; vectors: six numbers per frame."""
-    motion: Literal["still", "steady"] = "still"
-    """Initial pose of a frame. still: that of the frame before; steady: rotated on with constant angular velocity."""
-    start: Literal["first", "largest"] = "first"
-    """First frame to track: the first in time or that of the largest silhouette, from which tracking goes both ways."""
+    motion: Literal["still", "steady"] | Motion = "still"
+    """Initial pose of a frame. still: that of the frame before; steady: rotated on with constant angular velocity; else
+    by `registration`."""
+    start: Literal["first", "largest", "matched"] = "first"
+    """First frame to track: the first in time, that of the largest silhouette, or the first of those with the most
+    matches; tracking goes both ways from it."""
     sizes: Sizes = field(default_factory=Sizes)
     """Sizes of the networks."""
     samples: int = 32
@@ -153,6 +160,10 @@ class Config:
     """Number of steps per frame for its pose alone (appendix A)."""
     joint_steps: int = 500
     """Number of steps per frame for poses and shape (appendix A)."""
+    closing: int = 0
+    """Number of rounds after the last frame: the shape is trained on all frames, then all poses are adjusted to it."""
+    closing_steps: int = 0
+    """Number of steps of the shape in each of these rounds."""
     rays: int = 512
     """Number of rays per step from a recent frame (FMOV)."""
     old_rays: int = 512
@@ -201,6 +212,11 @@ class Inputs:
     aim: Aim
     """Virtual camera."""
 
+    @functools.cached_property
+    def anchors(self) -> anchors.Anchors:
+        """Anchors of all frames, which take seconds."""
+        return anchors.gather(self.capture, self.aim, self.matches)
+
 
 @dataclass(frozen=True)
 class Params:
@@ -214,7 +230,10 @@ class Params:
 
 @dataclass(frozen=True)
 class FrameFit:
-    """Residuals of each frame right after it was tracked; large ones indicate a lost frame."""
+    """Residuals of each frame right after it was tracked; large ones indicate a lost frame.
+
+    Of frames that are registered together, before there is a shape, only the last one has some, those of the sphere.
+    """
 
     match: Float[Tensor, " t"]
     """Median match residual [pixels, see OBJECT_PIXELS]; infinite without matches."""
@@ -232,7 +251,7 @@ class ProgressiveResult:
     """Object to virtual camera, one per frame [object radius]."""
     aim: Aim
     """Virtual camera."""
-    sdf: Sdf
+    sdf: Sdf | Grids
     """The last shape, trained mostly on the frames since its last reset."""
     fit: FrameFit
     """Residuals per frame."""
@@ -240,7 +259,7 @@ class ProgressiveResult:
 
 def length(cfg: Config, inputs: Inputs) -> int:
     """Number of steps, including those of a shape reset in every frame; these are skipped where there is no reset."""
-    return n_steps(cfg.phases, len(inputs.capture))
+    return n_steps(cfg.phases, len(inputs.capture)) + cfg.closing * cfg.closing_steps
 
 
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
@@ -252,6 +271,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     n, like = len(inputs.capture), inputs.capture.camera.fx_fy_cx_cy
     radius = torch.stack([_silhouette_radius(inputs, frame) for frame in range(n)])
     start = 0 if cfg.start == "first" else int(radius.argmax())
+    if cfg.start == "matched" and isinstance(cfg.motion, Motion):
+        start = registration.best_start(cfg.motion, inputs.anchors)
     base = SE3.identity((n,), dtype=like.dtype, device=like.device)
     base = SE3(base.wxyz, torch.stack([0 * radius, 0 * radius, (cfg.fill / radius.max()).expand(n)], -1))
     source = pose_networks.vectors(n, 6) if cfg.poses == "vectors" else pose_networks.frame_mlps(n, 6, rng)
@@ -265,6 +286,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         "base": torch.cat([base.wxyz, base.xyz], -1),
         "frame_fit": torch.full((n, 3), math.inf).to(like),
         "start": torch.tensor(start),
+        "distance": base.xyz[0, 2],
         "shape_start": torch.tensor(0),
         "shape_steps": torch.tensor(0),
     }
@@ -290,12 +312,21 @@ def poses(params: Params, memory: dict[str, Tensor], frames: list[int]) -> SE3:
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """One step of the schedule; nothing in shape phases without a reset."""
     assert state.optimizer is not None, "init creates the optimizer"
+    tracked = n_steps(cfg.phases, len(inputs.capture))
+    if state.step >= tracked:
+        return _closing_step(cfg, inputs, state, state.step - tracked)
     now, memory = schedule_at(cfg.phases, state.step), state.memory
     frames = tracking_order(int(memory["start"]), len(inputs.capture))
+    first = min(cfg.motion.first, len(frames)) if isinstance(cfg.motion, Motion) else 1
+    # The first frames are registered together, and the shape starts afterwards.
+    if now.index < first - 1 or (now.index == first - 1 and first > 1 and not (now.first or now.last)):
+        return {}
     # A later frame has a shape phase only if the shape was reset after the frame before.
     if now.phase == "shape" and int(memory["shape_start"]) != now.index:
         return {}
-    if now.first:
+    if now.first and isinstance(cfg.motion, Motion):
+        _register(cfg, inputs, state, frames[: now.index + 1])
+    elif now.first:
         _initialise_pose(cfg, state, frames, now.index)
     known = frames[: max(1, now.index)] if now.phase == "shape" else frames[: now.index + 1]
     terms = _loss_terms(cfg, inputs, state, now, known)
@@ -330,12 +361,63 @@ def _initialise_pose(cfg: Config, state: State, frames: list[int], index: int) -
 
 
 @torch.no_grad()
+def _register(cfg: Config, inputs: Inputs, state: State, known: list[int]) -> None:
+    """Estimate the pose of the newest frame, or of all first ones, and adjust those of the frames near it."""
+    motion, scene = cfg.motion, _scene(cfg, inputs, state)
+    assert isinstance(motion, Motion), "other motions need no registration"
+    T_aim_obj = poses(state.params, state.memory, list(range(len(inputs.capture))))
+    if len(known) <= motion.first:
+        T_aim_obj = registration.register_first(motion, scene, T_aim_obj, known)
+    else:
+        T_aim_obj = registration.register(motion, scene, T_aim_obj, known)
+        T_aim_obj = registration.adjust_window(motion, scene, T_aim_obj, known)
+        if len(known) % motion.every == 0 or len(known) == len(inputs.capture):
+            T_aim_obj = registration.adjust_all(motion, scene, T_aim_obj, known)
+    _set_poses(state, T_aim_obj, known)
+
+
+def _scene(cfg: Config, inputs: Inputs, state: State) -> Scene:
+    """What poses are registered against."""
+    shape = functools.partial(sdf_field.distance, tree.detach(state.params.fields.sdf))
+    return Scene(inputs.anchors, shape, cfg.bound, float(state.memory["distance"]))
+
+
+def _closing_step(cfg: Config, inputs: Inputs, state: State, step: int) -> dict[str, Tensor | float]:
+    """A step after all frames are known: of the shape alone, and at the ends of a round also of all poses."""
+    assert isinstance(cfg.motion, Motion), "closing rounds need a registration"
+    assert state.optimizer is not None, "init creates the optimizer"
+    known = tracking_order(int(state.memory["start"]), len(inputs.capture))
+    now = SchedulePoint(len(known) - 1, "shape", 0.5, 1.0, first=False, last=False)
+    terms = _loss_terms(cfg, inputs, state, now, known)
+    optim.anneal(state.optimizer, _rates(cfg, now, state.memory))
+    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    if (step + 1) % cfg.closing_steps == 0:
+        with torch.no_grad():
+            T_aim_obj = poses(state.params, state.memory, sorted(known))
+            scene = _scene(cfg, inputs, state)
+            _set_poses(state, registration.adjust_all(cfg.motion, scene, T_aim_obj, known), known)
+    return {name: value.detach() for name, value in terms.items()}
+
+
+def _set_poses(state: State, T_aim_obj: SE3, frames: list[int]) -> None:
+    """Give some frames new poses, from which their parameters start again."""
+    assert isinstance(state.params.poses, pose_networks.Vectors), "networks have no zero"
+    state.memory["base"][frames] = torch.cat([T_aim_obj.wxyz, T_aim_obj.xyz], -1)[frames]
+    for frame in frames:
+        leaf = state.params.poses.values[str(frame)]
+        leaf.zero_()
+        if state.optimizer is not None:
+            state.optimizer.state.pop(leaf, None)
+
+
+@torch.no_grad()
 def _finish_frame(cfg: Config, inputs: Inputs, state: State, frames: list[int], index: int) -> None:
     """Record how well a frame fits, and reset the shape if the object has rotated far since the last reset."""
     memory = state.memory
     memory["frame_fit"][frames[index]] = _frame_fit(cfg, inputs, state, frames[: index + 1])
+    began = isinstance(cfg.motion, Motion) and index + 1 == min(cfg.motion.first, len(frames))
     pair = poses(state.params, memory, [frames[index], frames[max(0, int(memory["shape_start"]) - 1)]]).rotation
-    if index + 1 == len(frames) or float(angle_between(pair[0], pair[1])) < math.radians(cfg.reset):
+    if index + 1 == len(frames) or (float(angle_between(pair[0], pair[1])) < math.radians(cfg.reset) and not began):
         return
     memory["shape_start"], memory["shape_steps"] = torch.tensor(index + 1), torch.tensor(0)
     fresh = tree.named_tensors(sdf_field.sphere_initialised(cfg.sizes, state.rng))
@@ -358,7 +440,8 @@ def _loss_terms(cfg: Config, inputs: Inputs, state: State, now: SchedulePoint, k
         samples.append((main, now.phase != "shape", _draw(cfg, inputs, state, now, main, n_rays)))
     if now.phase != "pose" and cfg.old_rays:
         older = known[: -cfg.window] or known
-        frame = known[0] if now.phase == "shape" else older[_random_index(state, len(older))]
+        only_first = now.phase == "shape" and not isinstance(cfg.motion, Motion)
+        frame = known[0] if only_first else older[_random_index(state, len(older))]
         samples.append((frame, False, _draw(cfg, inputs, state, now, frame, cfg.old_rays)))
     if match is not None:
         for frame, uv in ((match.i, match.uv_i), (match.j, match.uv_j)):

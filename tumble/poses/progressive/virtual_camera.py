@@ -18,8 +18,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from tumble.io import tree
 from tumble.maths import SE3, SO3
 from tumble.poses.progressive import sdf_field
+from tumble.poses.progressive.grid_field import Grids
 from tumble.poses.progressive.sdf_field import Sdf
 from tumble.scene import OBJECT, Camera, Light, Trajectory, visual_hull
 
@@ -102,7 +104,7 @@ def lift(aim: Aim, T_aim_obj: SE3, light: Light) -> Trajectory:
 
 
 @torch.no_grad()
-def surface_points(sdf: Sdf, n: int, rng: torch.Generator, *, resolution: int = 64) -> Float[Tensor, "n 3"]:
+def surface_points(sdf: Sdf | Grids, n: int, rng: torch.Generator, *, resolution: int = 64) -> Float[Tensor, "n 3"]:
     """The paper's surface points for 2D-3D correspondences (section 4.2), input of `by_pnp`.
 
     Args:
@@ -117,7 +119,7 @@ def surface_points(sdf: Sdf, n: int, rng: torch.Generator, *, resolution: int = 
     Raises:
         ValueError: There is no surface in the unit sphere.
     """
-    like = sdf.layers.weights["bias0"]
+    like = next(iter(tree.named_tensors(sdf).values()))
     ticks = (torch.arange(resolution, dtype=like.dtype, device=like.device) + 0.5) / resolution * 2 - 1
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     distance = torch.cat([sdf_field.distance(sdf, part) for part in x_obj.split(1 << 16)])
