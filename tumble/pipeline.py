@@ -46,8 +46,6 @@ ROTATIONS_TO_UP = {
     "-z": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 }
 """Rotations of the object frame, row by row, that take each axis to +y."""
-HELD_MATCHER = "held"
-"""Matcher in place of the default one for an object that hands hide in part."""
 
 
 def read_capture(path: Path | str) -> Capture:
@@ -282,17 +280,16 @@ def _track(
     near = neighbours(len(capture))
     hidden = sfm.is_hidden(capture)
     views = matching.views_of(sfm.shown(capture) if hidden else capture)
-    matcher = HELD_MATCHER if hidden and recipe.matcher == Recipe.matcher else recipe.matcher
-    matches = matching.match_pairs(views, near, matcher, device=device, cache=cache)
+    matches = matching.match_pairs(views, near, recipe.matcher, device=device, cache=cache)
     route = stage_of(recipe.track)
     try:
         with progress.task("observations in all frames"):
-            inputs: Any = sfm.gather(capture, matches, matcher, hidden=hidden)
+            inputs: Any = sfm.gather(capture, matches, recipe.matcher, hidden=hidden)
             if route is progressive:
                 inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
-    keys = [content, matching.settings(matcher)]
+    keys = [content, matching.settings(recipe.matcher)]
     return run.stage(opened, mask_refinement.folder(number), route, recipe.track, inputs, keys)
 
 

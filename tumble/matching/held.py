@@ -1,7 +1,7 @@
-"""Matcher of an object that hands hide in part: the default one, together with ALIKED.
+"""Matcher for an object that hands hide in part, in place of the default one: that and ALIKED.
 
 Between frames of which hands leave little of the object, optical flow and SIFT lose nearly all points as soon as it
-rotates by 20 degrees; the network keeps some up to 60.
+rotates by 20 degrees; the network keeps some up to 60. Chosen by `--matcher held` only (docs/method.md).
 """
 
 import torch
