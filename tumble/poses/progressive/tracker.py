@@ -311,13 +311,12 @@ def poses(params: Params, memory: dict[str, Tensor], frames: list[int]) -> SE3:
 
 def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]:
     """One step of the schedule; nothing in shape phases without a reset."""
-    assert state.optimizer is not None, "init creates the optimizer"
     tracked = n_steps(cfg.phases, len(inputs.capture))
     if state.step >= tracked:
         return _closing_step(cfg, inputs, state, state.step - tracked)
     now, memory = schedule_at(cfg.phases, state.step), state.memory
     frames = tracking_order(int(memory["start"]), len(inputs.capture))
-    first = min(cfg.motion.first, len(frames)) if isinstance(cfg.motion, Motion) else 1
+    first = _n_first(cfg, len(frames))
     # The first frames are registered together, and the shape starts afterwards.
     if now.index < first - 1 or (now.index == first - 1 and first > 1 and not (now.first or now.last)):
         return {}
@@ -329,14 +328,28 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
     elif now.first:
         _initialise_pose(cfg, state, frames, now.index)
     known = frames[: max(1, now.index)] if now.phase == "shape" else frames[: now.index + 1]
-    terms = _loss_terms(cfg, inputs, state, now, known)
-    optim.anneal(state.optimizer, _rates(cfg, now, memory))
-    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    terms = _descend(cfg, inputs, state, now, known)
     if now.phase != "pose":
         memory["shape_steps"] += 1
     if now.last:
         _finish_frame(cfg, inputs, state, frames, now.index)
-    return {name: value.detach() for name, value in terms.items()} | {"frame": float(now.index)}
+    return terms | {"frame": float(now.index)}
+
+
+def _n_first(cfg: Config, n: int) -> int:
+    """Number of frames, of `n`, that are known before there is a shape."""
+    return min(cfg.motion.first, n) if isinstance(cfg.motion, Motion) else 1
+
+
+def _descend(
+    cfg: Config, inputs: Inputs, state: State, now: SchedulePoint, known: list[int]
+) -> dict[str, Tensor | float]:
+    """A step of gradient descent; returns the weighted terms of the loss."""
+    assert state.optimizer is not None, "init creates the optimizer"
+    terms = _loss_terms(cfg, inputs, state, now, known)
+    optim.anneal(state.optimizer, _rates(cfg, now, state.memory))
+    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    return {name: value.detach() for name, value in terms.items()}
 
 
 def _rates(cfg: Config, now: SchedulePoint, memory: dict[str, Tensor]) -> dict[str, float]:
@@ -385,18 +398,15 @@ def _scene(cfg: Config, inputs: Inputs, state: State) -> Scene:
 def _closing_step(cfg: Config, inputs: Inputs, state: State, step: int) -> dict[str, Tensor | float]:
     """A step after all frames are known: of the shape alone, and at the ends of a round also of all poses."""
     assert isinstance(cfg.motion, Motion), "closing rounds need a registration"
-    assert state.optimizer is not None, "init creates the optimizer"
     known = tracking_order(int(state.memory["start"]), len(inputs.capture))
     now = SchedulePoint(len(known) - 1, "shape", 0.5, 1.0, first=False, last=False)
-    terms = _loss_terms(cfg, inputs, state, now, known)
-    optim.anneal(state.optimizer, _rates(cfg, now, state.memory))
-    optim.descend(torch.stack(list(terms.values())).sum(), state.optimizer, step=state.step)
+    terms = _descend(cfg, inputs, state, now, known)
     if (step + 1) % cfg.closing_steps == 0:
         with torch.no_grad():
             T_aim_obj = poses(state.params, state.memory, sorted(known))
             scene = _scene(cfg, inputs, state)
             _set_poses(state, registration.adjust_all(cfg.motion, scene, T_aim_obj, known), known)
-    return {name: value.detach() for name, value in terms.items()}
+    return terms
 
 
 def _set_poses(state: State, T_aim_obj: SE3, frames: list[int]) -> None:
@@ -415,7 +425,7 @@ def _finish_frame(cfg: Config, inputs: Inputs, state: State, frames: list[int], 
     """Record how well a frame fits, and reset the shape if the object has rotated far since the last reset."""
     memory = state.memory
     memory["frame_fit"][frames[index]] = _frame_fit(cfg, inputs, state, frames[: index + 1])
-    began = isinstance(cfg.motion, Motion) and index + 1 == min(cfg.motion.first, len(frames))
+    began = isinstance(cfg.motion, Motion) and index + 1 == _n_first(cfg, len(frames))
     pair = poses(state.params, memory, [frames[index], frames[max(0, int(memory["shape_start"]) - 1)]]).rotation
     if index + 1 == len(frames) or (float(angle_between(pair[0], pair[1])) < math.radians(cfg.reset) and not began):
         return
