@@ -88,7 +88,6 @@ class Tracking:
     matcher: str = "mixed"
     """Finds corresponding pixels in two frames.
     mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations.
-    held: mixed and aliked, for an object that a hand hides in part.
     xfeat, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install."""
 
 

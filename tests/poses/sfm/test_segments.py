@@ -11,7 +11,8 @@ from tumble.maths import SE3, SO3
 from tumble.poses.sfm import segments, stage
 from tumble.poses.sfm.adjustment import Windows
 from tumble.poses.sfm.observations import is_hidden, on_object, shown
-from tumble.poses.sfm.partial import Partial
+from tumble.poses.sfm.partial import Observed, Partial, cut
+from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match, Trajectory
 
 QUICK = stage.Config(window_scales=(3.0, 1.0, 0.5), relocalized_scales=(1.0, 0.5))
@@ -51,14 +52,19 @@ def inputs(scene: Tumble) -> stage.Inputs:
     return stage.gather(hidden(scene), matched(scene, hidden(scene), near), "mixed", hidden=True)
 
 
+def start(scene: Tumble) -> torch.Tensor:
+    """Rotations 25 degrees off."""
+    turn = SO3.exp(0.25 * torch.randn(N, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
+    return scene.T_cam_obj.rotation.matrix().double() @ turn.matrix()
+
+
 @pytest.fixture(scope="module")
 def posed(scene: Tumble, inputs: stage.Inputs) -> tuple[Partial, stage.Inputs]:
     """The poses that segments give, from rotations 25 degrees off."""
-    wide = [(i, j) for i in range(N) for j in range(i + 1, N) if j - i <= 6 or i % 2 == j % 2 == 0]
-    matches = [on_object(m, inputs.capture.masks) for m in matched(scene, inputs.capture, wide)]
-    turn = SO3.exp(0.25 * torch.randn(N, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
-    start = scene.T_cam_obj.rotation.matrix().double() @ turn.matrix()
-    part, tracks = segments.segmented_poses(QUICK, inputs, matches, start, torch.Generator().manual_seed(0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segments, "MAX_MISSING", len(REGRASP) / N)
+        patch.setattr(segments, "_matched", lambda inputs, pairs, matcher: matched(scene, inputs.capture, pairs))
+        part, tracks = segments.segmented_poses(QUICK, inputs, start(scene), torch.Generator().manual_seed(0))
     assert part is not None
     assert set(tracks.frame.tolist()) == set(part.frames)
     return part, inputs
@@ -73,29 +79,28 @@ def test_segments_before_and_after_a_change_of_grip_are_joined(scene: Tumble, po
     assert scores["rotation_below_5_percent"] == 100
 
 
-def test_features_of_the_hand_pose_only_what_features_of_the_object_left(
-    scene: Tumble, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("first", [N - 1, N - 4])
+def test_the_network_is_asked_only_where_sift_leaves_frames_out(
+    scene: Tumble, inputs: stage.Inputs, first: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two parts that nothing joins: the second pass, whose features a change of grip misleads, leaves both alone."""
-    T = scene.T_cam_obj
+    asked: list[str] = []
 
-    def part(first: int, end: int) -> Partial:
-        frames = list(range(first, end))
-        return Partial(tuple(frames), T.rotation.matrix()[frames].double(), T.xyz[frames].double())
+    def matches(inputs: stage.Inputs, pairs: list[tuple[int, int]], matcher: str) -> list[Match]:
+        asked.append(matcher)
+        return matched(scene, inputs.capture, pairs[:40])
 
-    found = [[part(0, 9), part(18, 24)], []]
-    asked: list[set[int]] = []
+    def understood(cfg: object, given: stage.Inputs, wide: list[Match], R: torch.Tensor, rng: object) -> tuple:
+        found = first if len(asked) == 1 else N
+        if len(asked) == 2:  # The network's matches are added to those of neighbouring frames and to SIFT's.
+            assert sum(map(len, given.all_matches)) > sum(map(len, inputs.all_matches))
+            assert len(wide) == len({(match.i, match.j) for match in wide})
+        return Partial(tuple(range(found)), R[:found], R[:found, 0]), inputs.tracks
 
-    def wanted_frames(observed: object, R: torch.Tensor, wanted: torch.Tensor, rng: object) -> list[Partial]:
-        asked.append(set(torch.nonzero(wanted)[:, 0].tolist()))
-        return found[len(asked) - 1]
-
-    monkeypatch.setattr(segments, "_segments", wanted_frames)
-    monkeypatch.setattr(segments, "join", lambda observed, parts, known: parts)
-    monkeypatch.setattr(segments, "grow", lambda observed, grown: grown)
-    R = T.rotation.matrix().double()
-    segments.segmented_poses(QUICK, inputs, list(inputs.matches), R, torch.Generator().manual_seed(0))
-    assert asked == [set(range(N)), set(range(9, 18)) | set(range(24, N))]
+    monkeypatch.setattr(segments, "_matched", matches)
+    monkeypatch.setattr(segments, "_understood", understood)
+    part, _ = segments.segmented_poses(QUICK, inputs, start(scene), torch.Generator().manual_seed(0))
+    assert part is not None
+    assert (len(part), asked) == ((N - 1, ["sift"]) if first == N - 1 else (N, ["sift", "aliked"]))
 
 
 def test_frames_without_a_pose_are_lost_and_stay_out_of_the_adjustment(posed: tuple) -> None:
@@ -135,6 +140,18 @@ def test_a_correspondence_needs_one_end_on_the_object(scene: Tumble) -> None:
     assert kept.uv_i.tolist() == [[1.5, 1.5]]
 
 
+def test_a_part_is_cut_where_few_points_are_seen_before_and_after(scene: Tumble, inputs: stage.Inputs) -> None:
+    """The film jumps between frames 3 and 4, across which nothing is matched."""
+    rng = torch.Generator().manual_seed(0)
+    near = [(i, j) for j in range(10) for i in range(j) if j - i <= 3 and not i <= 3 < j]
+    matches = [on_object(scene.match(i, j, rng, noise=0), inputs.capture.masks) for i, j in near]
+    observed = Observed(QUICK, inputs, gather_keypoints(matches, NO_TRACKS, inputs.capture.camera, N))
+    T = scene.T_cam_obj
+    part = Partial(tuple(range(10)), T.rotation.matrix()[:10].double(), T.xyz[:10].double())
+    assert [piece.frames for piece in cut(observed, part, 3.0, 10)] == [(0, 1, 2, 3), (4, 5, 6, 7, 8, 9)]
+    assert [piece.frames for piece in cut(observed, part, 3.0, 0)] == [part.frames]
+
+
 def windows(losses: list[tuple[float, float]], turns: list[float]) -> Windows:
     """Windows of four frames, one every two; the rotations of each deviate increasingly by an angle [degrees]."""
     frames = 2 * torch.arange(len(losses))[:, None] + torch.arange(4)
@@ -144,9 +161,7 @@ def windows(losses: list[tuple[float, float]], turns: list[float]) -> Windows:
 
 
 def test_windows_are_used_if_they_are_certain_and_agree_with_a_neighbour() -> None:
-    every = torch.ones(20, dtype=torch.bool)
     certain, doubtful = (0.1, 0.2), (0.1, 0.11)
-    assert segments._runs(windows([certain] * 4, [0.0] * 4), every) == [[0, 1, 2, 3]]
-    assert segments._runs(windows([certain, certain, doubtful, certain, certain], [0.0] * 5), every) == [[0, 1], [3, 4]]
-    assert segments._runs(windows([certain] * 4, [0.0, 0.0, 30.0, 30.0]), every) == [[0, 1], [2, 3]]
-    assert segments._runs(windows([certain] * 4, [0.0] * 4), ~every) == []
+    assert segments._runs(windows([certain] * 4, [0.0] * 4)) == [[0, 1, 2, 3]]
+    assert segments._runs(windows([certain, certain, doubtful, certain, certain], [0.0] * 5)) == [[0, 1], [3, 4]]
+    assert segments._runs(windows([certain] * 4, [0.0, 0.0, 30.0, 30.0])) == [[0, 1], [2, 3]]

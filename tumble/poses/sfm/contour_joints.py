@@ -35,7 +35,7 @@ STEPS = 16
 MAX_COST = 0.2
 """Cost of contours above which they do not confirm a joint: that of gaps of 1.4 pixels. Within a part it is 0.02 to
 0.07; wrong joints of the synthetic film of the mustard bottle have 0.3 to 0.8."""
-MIN_SEEN = 0.3
+MIN_SEEN = 0.25
 """Fraction of valid gaps below which hands hide too much of the contours. A joint of the synthetic film of the knight
 with 0.21 costs 0.12 and is 25 degrees off."""
 MIN_RATIO = 2.0

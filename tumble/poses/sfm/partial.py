@@ -1,5 +1,6 @@
 """Poses of some frames of a capture, in an object frame of their own: a part of the capture that is understood."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -131,14 +132,35 @@ def pruned(observed: Observed, part: Partial, tolerance: float) -> Partial:
     tracks, _ = joined_tracks(observed, part, tolerance)
     _, agrees = _triangulated(observed, part, tracks)
     observations = torch.bincount(tracks.frame[agrees], minlength=len(part))
-    place, matches = {frame: k for k, frame in enumerate(part.frames)}, np.zeros(len(part), np.int64)
+    matches, _ = consistent_matches(observed, part, 2.0)
+    enough = (observations.numpy() >= MIN_OBSERVATIONS) & (matches >= MIN_MATCHES)
+    return part.select(np.nonzero(enough)[0].tolist())
+
+
+def consistent_matches(
+    observed: Observed, part: Partial, tolerance: float
+) -> tuple[Int64[np.ndarray, " f"], Int64[np.ndarray, " f"]]:
+    """Per frame, the matches with other frames of the part that agree with the epipolar lines, and all matches."""
+    place = {frame: k for k, frame in enumerate(part.frames)}
+    agreeing, of = np.zeros(len(part), np.int64), np.zeros(len(part), np.int64)
     for i, j in observed.keypoints.pairs:
         if i in place and j in place:
             a, b = place[i], place[j]
             poses = (part.R[a], part.t[a]), (part.R[b], part.t[b])
-            matches[[a, b]] += observed.keypoints.consistent((i, j), *poses, 2.0).sum()
-    enough = (observations.numpy() >= MIN_OBSERVATIONS) & (matches >= MIN_MATCHES)
-    return part.select(np.nonzero(enough)[0].tolist())
+            consistent = observed.keypoints.consistent((i, j), *poses, tolerance)
+            agreeing[[a, b]] += consistent.sum()
+            of[[a, b]] += len(consistent)
+    return agreeing, of
+
+
+def cut(observed: Observed, part: Partial, tolerance: float, min_points: int) -> list[Partial]:
+    """The pieces of a part between which fewer than `min_points` surface points are seen before and after."""
+    tracks, _ = joined_tracks(observed, part, tolerance)
+    seen = tracks.select(_triangulated(observed, part, tracks)[1])
+    first = torch.full((seen.n,), len(part)).scatter_reduce_(0, seen.point, seen.frame, "amin")
+    last = torch.zeros(seen.n, dtype=torch.long).scatter_reduce_(0, seen.point, seen.frame, "amax")
+    cuts = [k for k in range(1, len(part)) if int(((first < k) & (last >= k)).sum()) < min_points]
+    return [part.select(range(a, b)) for a, b in itertools.pairwise((0, *cuts, len(part)))]
 
 
 def contour_cost(observed: Observed, part: Partial, other: Partial) -> tuple[float, int]:

@@ -50,7 +50,7 @@ MIN_UNCONFIRMED_KEYPOINTS = 100
 """Number of agreeing keypoints that two parts need to be joined where contours confirm nothing."""
 MAX_CONTOUR_COST = 1.1
 """Cost of contours (`partial.contour_cost`) above which they contradict a pose; of wrong ones it is 1.4 to 5."""
-MIN_FRAME_KEYPOINTS = 12
+MIN_FRAME_KEYPOINTS = 25
 """Number of agreeing keypoints below which a frame is not added."""
 MIN_FRAME_FRACTION = 0.35
 """Fraction of a frame's keypoints with correspondences that have to agree with its pose."""

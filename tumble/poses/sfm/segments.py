@@ -3,31 +3,46 @@
 Where a hand changes its grip, few features are seen in the frames before and after, and a window of frames there has
 wrong or mirrored poses; averaged over the capture it spoils all others. Windows are therefore only used where their
 mirror image explains the observations worse and neighbouring windows agree. Runs of such windows are segments, whose
-poses are adjusted on their own. Matches between frames far apart in time then join segments that show the same side,
-and add the frames between them. Frames that nothing confirms get no pose.
+poses are adjusted on their own: once with features of which at least one frame shows that they lie on the object, and
+once with all features of the object and the hand, which moves with it while its grip lasts. Matches between frames far
+apart in time, of the object alone, then join segments that show the same side, and add the frames between them. Frames
+that nothing confirms get no pose.
 
-This is done twice: with features of which at least one frame shows that they lie on the object, then, for frames that
-are in none of these segments, with all features of the object and the hand, which moves with it while its grip lasts.
+Where this leaves frames out, a network matches neighbouring frames and frames far apart as well, and all is done again.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from tumble import matching
+from tumble.poses.frame_pairs import neighbours
 from tumble.poses.sfm.adjustment import Settings, Windows, adjust_windows, averaged_windows, deviation
-from tumble.poses.sfm.observations import Inputs, on_object, shown, silhouette_centres, tracks_of
-from tumble.poses.sfm.partial import Observed, Partial, adjusted, joined_tracks, pruned, thinned
+from tumble.poses.sfm.observations import Inputs, gather, on_object, shown, silhouette_centres, tracks_of
+from tumble.poses.sfm.partial import (
+    Observed,
+    Partial,
+    adjusted,
+    consistent_matches,
+    cut,
+    joined_tracks,
+    pruned,
+    thinned,
+)
 from tumble.poses.sfm.registration import TOLERANCE, Hypotheses, grow, join
 from tumble.poses.sfm.tracks import Tracks, gather_keypoints
 from tumble.scene import Match
 
 FRONTIER_WEIGHT = 3.0
-"""Weight of an observation of a frontier point; the contours of a hidden object are less certain than others."""
+"""Weight of an observation of a frontier point here; the contours of a hidden object are less certain than others."""
+FINAL_FRONTIER_WEIGHT = 0.3
+"""Weight in the last adjustment of all frames with a pose. Contours tell what is right from its mirror image and join
+parts that share no texture, but masks end a little beside the object where a hand begins, which bends long motions."""
 WINDOW_SIZE = 8
 """Number of frames per window: enough for parallax, but few enough for a feature to be seen in most of them."""
 ROUGH_SIZE = 6
@@ -42,8 +57,13 @@ MIN_WINDOWS = 2
 """Number of agreeing windows below which they are no segment."""
 MIN_FRAMES = 5
 """Number of frames below which a segment is dropped."""
+MIN_CROSSING = 50
+"""Number of surface points seen before and after an instant below which a segment is cut there: at a jump of the film,
+or where a hand hides nearly all, the frames on either side agree among themselves only."""
+MIN_AGREEMENT = 0.5
+"""Fraction of the object's matches in a segment that agree with a frame's pose, below which it is left out."""
 MIN_NEW_FRAMES = 3
-"""Number of frames without a pose below which a window or a segment adds too little to be considered."""
+"""Number of frames that are in no better segment below which a segment is not used."""
 MAX_GROWN = 3
 """Number of segments, the largest first, to which single frames are added."""
 NEAR = 6
@@ -55,9 +75,11 @@ MIN_WIDE_MATCHES = 8
 WIDE_MATCHER = "sift"
 """Matcher of frames that are far apart in time; it finds what rotates by up to about 30 degrees."""
 LEARNED_MATCHER = "aliked"
-"""Second matcher of frames that are farther apart than `NEAR`; it finds what rotates by up to about 70 degrees."""
+"""Second matcher, where the first leaves frames out; it finds what rotates by up to about 70 degrees."""
+MAX_MISSING = 0.05
+"""Fraction of the frames without a pose up to which the second matcher is not needed."""
 LEARNED_STRIDE = 3
-"""Every how many-th frame the second matcher sees, as it takes ten times as long."""
+"""Of frames farther apart than `NEAR`, every how many-th the second matcher sees, as it takes ten times as long."""
 FIRST_SCALE = 3
 """Index in `global_scales` of the Cauchy loss in the first round in which a segment is adjusted."""
 FINISHING_SCALES = (1.5, 1.0, 0.7)
@@ -65,45 +87,65 @@ FINISHING_SCALES = (1.5, 1.0, 0.7)
 
 
 def segmented_poses(
-    cfg: Settings, inputs: Inputs, wide: Sequence[Match], R: Float[Tensor, "t 3 3"], rng: torch.Generator
+    cfg: Settings, inputs: Inputs, R: Float[Tensor, "t 3 3"], rng: torch.Generator
 ) -> tuple[Partial | None, Tracks]:
     """Poses of all frames that can be understood, and their tracks; None if no segment was found.
 
     Args:
         cfg: Settings of bundle adjustment.
-        wide: Matches of the object, also between frames that are far apart in time.
         R: Approximate rotations of all frames, `R_cam_obj`.
         rng: Source of random numbers.
     """
-    parts: list[Partial] = []
+    n = len(R)
+    apart = [(i, j) for i in range(n) for j in range(i + 1, n)]
+    near_or_even = [(i, j) for i, j in apart if j - i <= NEAR or not (i % FAR_STRIDE or j % FAR_STRIDE)]
+    wide = _matched(inputs, near_or_even, WIDE_MATCHER)
+    part, tracks = _understood(cfg, inputs, wide, R, rng)
+    if part is None or n - len(part) > MAX_MISSING * n:
+        near, far = neighbours(n), [(i, j) for i, j in apart if not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)]
+        learned = _matched(
+            inputs, sorted({*near, *(pair for pair in far if pair[1] - pair[0] > NEAR)}), LEARNED_MATCHER
+        )
+        of_near = [match for match in learned if (match.i, match.j) in set(near)]
+        inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), inputs.matcher, hidden=True)
+        other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng)
+        if other is not None and (part is None or len(other) >= len(part)):
+            part, tracks = other, other_tracks
+    return part, tracks
+
+
+def _understood(
+    cfg: Settings, inputs: Inputs, wide: Sequence[Match], R: Float[Tensor, "t 3 3"], rng: torch.Generator
+) -> tuple[Partial | None, Tracks]:
+    """The largest part of the capture that matches explain, and its tracks; None if there is no segment.
+
+    Args:
+        wide: Matches of all that is not background, also between frames that are far apart in time.
+    """
+    on_it = [match for each in wide if len(match := on_object(each, inputs.capture.masks)) >= MIN_WIDE_MATCHES]
+    sure = _observed(cfg, inputs, inputs.tracks, on_it)
+    tracks = tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)
     known: Hypotheses = {}
-    sure = _observed(cfg, inputs, inputs.tracks, wide)
-    for tracks in (inputs.tracks, tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)):
-        observed = sure if tracks is inputs.tracks else _observed(cfg, inputs, tracks, wide)
-        posed = torch.zeros(len(R), dtype=torch.bool)
-        posed[[frame for part in parts for frame in part.frames]] = True
-        if int((~posed).sum()) < MIN_NEW_FRAMES:
-            break
-        parts = join(sure, [*parts, *_segments(observed, R, ~posed, rng)], known)
-        parts = join(sure, [grow(sure, part) for part in parts[:MAX_GROWN]] + parts[MAX_GROWN:], known)
-        parts = [p for p in parts if p is parts[0] or len(set(p.frames) - set(parts[0].frames)) >= MIN_NEW_FRAMES]
+    found = [part for each in (sure, _observed(cfg, inputs, tracks, on_it)) for part in _segments(each, R, rng)]
+    parts = join(sure, _supported(sure, found), known)
+    parts = join(sure, [grow(sure, part) for part in parts[:MAX_GROWN]] + parts[MAX_GROWN:], known)
     if not parts:
         return None, inputs.tracks
     tracks = thinned(joined_tracks(sure, parts[0], TOLERANCE)[0])
     return parts[0], replace(tracks, frame=torch.tensor(parts[0].frames)[tracks.frame])
 
 
-def wide_matches(inputs: Inputs) -> list[Match]:
-    """Matches of pairs of frames, also far apart, with at least one end of each correspondence on the object."""
-    n, views = len(inputs.capture), matching.views_of(shown(inputs.capture))
-    apart = [(i, j) for i in range(n) for j in range(i + 1, n)]
-    pairs = [(i, j) for i, j in apart if j - i <= NEAR or not (i % FAR_STRIDE or j % FAR_STRIDE)]
-    learned = [(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)]
-    found: dict[tuple[int, int], list[Match]] = {}
-    for matcher, chosen in ((WIDE_MATCHER, pairs), (LEARNED_MATCHER, learned)):
-        for match in matching.match_pairs(views, chosen, matcher):
-            found.setdefault((match.i, match.j), []).append(on_object(match, inputs.capture.masks))
-    return [match for parts in found.values() if len(match := matching.joined(parts)) >= MIN_WIDE_MATCHES]
+def _matched(inputs: Inputs, pairs: Sequence[tuple[int, int]], matcher: str) -> list[Match]:
+    """Matches of pairs of frames, of all that is not background."""
+    return matching.match_pairs(matching.views_of(shown(inputs.capture)), pairs, matcher)
+
+
+def _merged(*parts: Sequence[Match]) -> list[Match]:
+    """All correspondences of every pair of frames."""
+    of_pair: dict[tuple[int, int], list[Match]] = {}
+    for match in (match for part in parts for match in part):
+        of_pair.setdefault((match.i, match.j), []).append(match)
+    return [matching.joined(matches) for matches in of_pair.values()]
 
 
 def _observed(cfg: Settings, inputs: Inputs, tracks: Tracks, wide: Sequence[Match]) -> Observed:
@@ -111,15 +153,34 @@ def _observed(cfg: Settings, inputs: Inputs, tracks: Tracks, wide: Sequence[Matc
     return Observed(cfg, replace(inputs, tracks=tracks), keypoints)
 
 
-def _segments(
-    observed: Observed, R: Float[Tensor, "t 3 3"], wanted: Bool[Tensor, " t"], rng: torch.Generator
-) -> list[Partial]:
-    """Poses within every run of certain windows that hold wanted frames, each in an object frame of its own."""
+def _supported(sure: Observed, parts: Sequence[Partial]) -> list[Partial]:
+    """Segments without the frames that most matches of the object contradict; of those of the same frames the best one.
+
+    Args:
+        sure: Matches and tracks of the object.
+        parts: Segments; those from features of the object and from all features hold many of the same frames.
+    """
+    rated = []
+    for part in parts:
+        agreeing, of = consistent_matches(sure, part, TOLERANCE)
+        part = part.select(np.flatnonzero(agreeing >= MIN_AGREEMENT * of).tolist())
+        if len(part) >= MIN_FRAMES:
+            rated.append((agreeing.sum() / max(1, of.sum()), part))
+    kept, covered = [], set()
+    for _, part in sorted(rated, key=lambda each: -each[0]):
+        if len(set(part.frames) - covered) >= MIN_NEW_FRAMES:
+            kept.append(part)
+            covered |= set(part.frames)
+    return kept
+
+
+def _segments(observed: Observed, R: Float[Tensor, "t 3 3"], rng: torch.Generator) -> list[Partial]:
+    """Poses within every run of certain windows, each in an object frame of its own."""
     cfg, inputs, parts = observed.cfg, observed.inputs, []
     rough = adjust_windows(cfg, inputs, R, rng, size=ROUGH_SIZE, stride=1)
     R = averaged_windows(rough.frames, rough.best, n_frames=len(R))
     windows = adjust_windows(cfg, inputs, R, rng, size=WINDOW_SIZE, stride=WINDOW_STRIDE)
-    for run in _runs(windows, wanted):
+    for run in _runs(windows):
         first = int(windows.frames[run[0], 0])
         frames = tuple(range(first, int(windows.frames[run[-1], -1]) + 1))
         rotations = averaged_windows(windows.frames[run] - first, windows.best[run], n_frames=len(frames))
@@ -127,15 +188,15 @@ def _segments(
         part = adjusted(observed, Partial(frames, rotations, t), cfg.global_scales[FIRST_SCALE:])
         part = pruned(observed, part, TOLERANCE)
         if len(part) >= MIN_FRAMES:
-            parts.append(adjusted(observed, part, FINISHING_SCALES))
+            part = adjusted(observed, part, FINISHING_SCALES)
+            parts += [piece for piece in cut(observed, part, TOLERANCE, MIN_CROSSING) if len(piece) >= MIN_FRAMES]
     return parts
 
 
-def _runs(windows: Windows, wanted: Bool[Tensor, " t"]) -> list[list[int]]:
+def _runs(windows: Windows) -> list[list[int]]:
     """Consecutive windows that are certain and agree with each other."""
     best, loss = windows.best, windows.loss
     certain = loss.max(1).values >= MIN_LOSS_RATIO * loss.min(1).values
-    certain &= wanted[windows.frames].sum(1) >= MIN_NEW_FRAMES
     runs: list[list[int]] = []
     for k in torch.nonzero(certain)[:, 0].tolist():
         if runs and runs[-1][-1] == k - 1 and _deviation(windows, best, k - 1, k) <= MAX_DEVIATION:
