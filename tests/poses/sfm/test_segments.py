@@ -152,6 +152,24 @@ def test_a_part_is_cut_where_few_points_are_seen_before_and_after(scene: Tumble,
     assert [piece.frames for piece in cut(observed, part, 3.0, 0)] == [part.frames]
 
 
+def test_of_two_segments_of_the_same_frames_the_one_that_matches_confirm_is_kept(
+    scene: Tumble, inputs: stage.Inputs
+) -> None:
+    """A frame that is turned by 60 degrees is left out of its segment; what then adds no frame is not used."""
+    rng = torch.Generator().manual_seed(0)
+    near = [(i, j) for j in range(10) for i in range(j) if j - i <= 3]
+    matches = [on_object(scene.match(i, j, rng), inputs.capture.masks) for i, j in near]
+    sure = Observed(QUICK, inputs, gather_keypoints(matches, NO_TRACKS, inputs.capture.camera, N))
+    R, t = scene.T_cam_obj.rotation.matrix()[:10].double(), scene.T_cam_obj.xyz[:10].double()
+    wrong = R.clone()
+    wrong[9] = SO3.exp(torch.tensor([0.6, 0.8, 0.3], dtype=torch.float64)).matrix() @ R[9]
+    true, spoilt = Partial(tuple(range(9)), R[:9], t[:9]), Partial(tuple(range(10)), wrong, t)
+    assert [part.frames for part in segments._supported(sure, [spoilt])] == [tuple(range(9))]
+    noisy = Partial(true.frames, SO3.exp(0.02 * torch.randn(9, 3, generator=rng).double()).matrix() @ true.R, true.t)
+    (kept,) = segments._supported(sure, [noisy, true])
+    assert torch.equal(kept.R, true.R)
+
+
 def windows(losses: list[tuple[float, float]], turns: list[float]) -> Windows:
     """Windows of four frames, one every two; the rotations of each deviate increasingly by an angle [degrees]."""
     frames = 2 * torch.arange(len(losses))[:, None] + torch.arange(4)
