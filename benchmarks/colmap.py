@@ -50,9 +50,9 @@ def poses(capture: Capture) -> tuple[Trajectory, list[int]] | None:
         )
         found = colmap.incremental_mapping(database, images, Path(folder), options)
         poses = [_poses(each) for each in found.values()]
-    if not poses:
+    frames, T = max(poses, key=lambda each: len(each[0]), default=([], np.zeros((0, 4, 4), np.float32)))
+    if len(frames) < MIN_FRAMES:
         return None
-    frames, T = max(poses, key=lambda each: len(each[0]))
     return Trajectory(SE3.from_matrix(torch.from_numpy(T)), capture.light), frames
 
 
