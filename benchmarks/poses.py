@@ -98,15 +98,10 @@ def main() -> None:
 def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     """A row: matching, stage 1, its scores, and those of stage 2 if `refined`."""
     capture, truth = load(case, root)
+    about = {"name": case.name, "route": route, **asdict(case), "frames": len(capture)}
     if route == "colmap":
         assert truth is not None, "a capture with true poses"
-        return {
-            "name": case.name,
-            "route": route,
-            **asdict(case),
-            "frames": len(capture),
-            **colmap_scores(capture, truth),
-        }
+        return about | colmap_scores(capture, truth)
     started = time.perf_counter()
     hidden = sfm.is_hidden(capture)
     views = matching.views_of(sfm.shown(capture) if hidden else capture)
@@ -121,10 +116,7 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     seconds = time.perf_counter() - started
     quality = tracked.quality
     return {
-        "name": case.name,
-        "route": route,
-        **asdict(case),
-        "frames": len(capture),
+        **about,
         **(stage_1_scores(tracked, truth) if truth is not None else {}),
         **(stage_2_scores(tracked, capture, truth) if refined and truth is not None else {}),
         "seconds": round(seconds, 1),

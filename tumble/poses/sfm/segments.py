@@ -102,11 +102,10 @@ def segmented_poses(
     wide = _matched(inputs, near_or_even, WIDE_MATCHER)
     part, tracks = _understood(cfg, inputs, wide, R, rng)
     if part is None or n - len(part) > MAX_MISSING * n:
-        near, far = neighbours(n), [(i, j) for i, j in apart if not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)]
-        learned = _matched(
-            inputs, sorted({*near, *(pair for pair in far if pair[1] - pair[0] > NEAR)}), LEARNED_MATCHER
-        )
-        of_near = [match for match in learned if (match.i, match.j) in set(near)]
+        near = set(neighbours(n))
+        far = {(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)}
+        learned = _matched(inputs, sorted(near | far), LEARNED_MATCHER)
+        of_near = [match for match in learned if (match.i, match.j) in near]
         inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), inputs.matcher, hidden=True)
         other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng)
         if other is not None and (part is None or len(other) >= len(part)):
