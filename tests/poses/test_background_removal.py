@@ -85,6 +85,28 @@ def test_the_wall_beside_the_object_becomes_background(held: tuple[Capture, Tens
     assert cut.full_images is None
 
 
+def test_a_hand_that_keeps_its_place_becomes_background_where_hardly_any_frame_shows_object() -> None:
+    """A ball beside the object that is unknown in all frames, which show it before or beside the object."""
+    capture, objects, T_cam_obj = film(PRINT)
+    rays, radius = capture.camera.directions().double(), 0.3
+    middle = T_cam_obj @ torch.tensor([0.0, float(AXES[1]) + 2 * radius, 0.0], dtype=torch.float64)
+    along = (rays * middle[:, None, None]).sum(-1) / (rays * rays).sum(-1)
+    ball = (along[..., None] * rays - middle[:, None, None]).norm(dim=-1) < radius
+    # Behind the object, the ball is hidden.
+    toward = T_cam_obj.xyz[:, 2] - middle[:, 2]
+    kept = torch.argsort(toward, descending=True)[: N // 2].sort().values
+    ball &= ~objects | (toward > 0)[:, None, None]
+    masks = torch.where(objects, OBJECT, BACKGROUND).to(torch.uint8)
+    masks[ball] = UNKNOWN
+    lost = tuple(k for k in range(N) if k not in kept.tolist())
+    poses = result(capture.camera, T_cam_obj, lost=lost)
+    cut = background_removal.remove_background(replace(capture, masks=masks), poses)
+    assert not (cut.masks[objects] == BACKGROUND).any()
+    beside = (ball & ~objects)[kept]
+    assert beside.sum() > 1000
+    assert (cut.masks[kept][beside] == BACKGROUND).float().mean() > 0.4
+
+
 @pytest.mark.parametrize("colours", [PRINT, ONE_COLOUR])
 def test_poses_with_errors_remove_nothing_of_the_object(colours: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     capture, objects, T_cam_obj = film(colours)

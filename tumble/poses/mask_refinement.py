@@ -68,11 +68,10 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
     cells = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
     masks = capture.masks.clone()
     for k in kept:
-        silhouette = _silhouette(camera, T_cam_obj[k] @ cells)
-        near = _dilated(silhouette, max(2, round(MARGIN * float(np.sqrt(silhouette.sum())))))
+        silhouette, outside = _silhouette(camera, T_cam_obj[k] @ cells), beyond(camera, T_cam_obj[k] @ cells)
         labels = masks[k].numpy()
-        trimmed = np.where(near, labels, np.uint8(BACKGROUND))
-        trimmed[(labels == OBJECT) & near & ~silhouette] = UNKNOWN
+        trimmed = np.where(outside, np.uint8(BACKGROUND), labels)
+        trimmed[(labels == OBJECT) & ~outside & ~silhouette] = UNKNOWN
         masks[k] = torch.from_numpy(trimmed)
     shown = (masks != BACKGROUND)[..., None]
     return replace(capture, masks=masks, images=torch.where(shown, capture.images, torch.zeros_like(capture.images)))
@@ -85,21 +84,33 @@ def explains_more(new: PoseResult, old: PoseResult) -> bool:
     return ranks[0] > ranks[1]
 
 
-def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[Tensor, "n 3"]:
-    """Centres of the cells at which few frames show background, object frame."""
+def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int], min_shown: float = 0.0) -> Float[Tensor, "n 3"]:
+    """Centres of the cells at which few frames show background, object frame.
+
+    Args:
+        min_shown: Fraction of the frames with a cell in the image that must show object there.
+    """
     ticks = ((torch.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1) * EXTENT
     cells = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height])
-    background, seen = torch.zeros(len(cells)), torch.zeros(len(cells))
+    background, shown, seen = torch.zeros(3, len(cells))
     for k in frames:
         uv = capture.camera.project(T_cam_obj[k] @ cells).floor().long()
         inside = ((uv >= 0) & (uv < size)).all(-1)
         column, row = uv.clamp(min=torch.zeros_like(size), max=size - 1).unbind(-1)
-        background += inside & (capture.masks[k][row, column] == BACKGROUND)
+        labels = capture.masks[k][row, column]
+        background += inside & (labels == BACKGROUND)
+        shown += inside & (labels == OBJECT)
         seen += inside
         left = background <= MAX_BACKGROUND_FRACTION * len(frames)  # the others have lost the vote already
-        cells, background, seen = cells[left], background[left], seen[left]
-    return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen)]
+        cells, background, shown, seen = cells[left], background[left], shown[left], seen[left]
+    return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen) & (shown >= min_shown * seen)]
+
+
+def beyond(camera: Camera, cells: Float[Tensor, "n 3"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that lie clearly outside of the silhouette of cells, camera frame."""
+    silhouette = _silhouette(camera, cells)
+    return ~_dilated(silhouette, max(2, round(MARGIN * float(np.sqrt(silhouette.sum())))))
 
 
 def _silhouette(camera: Camera, cells: Float[Tensor, "n 3"]) -> Bool[np.ndarray, "h w"]:
