@@ -1,4 +1,4 @@
-"""The static background of a video, and the camera's exposure and white-balance drift.
+"""The static background of a film, the border of the object before it, and drifts of the exposure and white balance.
 
 The camera is on a tripod, so a pixel that nothing covers keeps its radiance, and changes there come from the camera:
 one *gain* per frame and colour channel, in linear light, relative to the median frame.
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float32, Integer, Shaped, UInt8
 
 from tumble.maths import linear_from_srgb, to_srgb8
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
 N_SAMPLES = 41
 """Number of frames, evenly spaced, from which the background is estimated."""
@@ -57,6 +58,22 @@ SAMPLE_NOVELTY = 0.02
 """Probability that a pixel of the background has a colour of none of its samples."""
 NO_SAMPLE_LOG_LIKELIHOOD = math.log(2 * SAMPLE_NOVELTY * 256.0**-3)
 """Log likelihood of the background below which a colour is more likely to be new than one of the samples."""
+MAX_BORDER = 4.0
+"""Maximum width of a band along a silhouette [pixels]; what a hand hides is wider."""
+MIN_BORDER_CONTRAST = 24.0
+"""Minimum difference between object and background, the largest over the channels [code values]: with less, noise and
+shading decide."""
+MAX_BORDER_RESIDUAL = 0.35
+"""Maximum distance of a pixel's colour from the line between both, as a fraction of their difference: a shadow, a
+highlight, or another object has a colour of its own."""
+BORDER_SIDE = 5
+"""Side of the square whose pixels tell how much the object's colour varies [pixels]."""
+BORDER_SIGMAS = 2.0
+"""Standard deviations of the share, from that variation, by which a pixel is clear of the limits between object,
+unknown and background: before a dark wall the dark edge of a box looks like a pixel that the box covers in part."""
+MAX_BACKGROUND_SHARE = 0.25
+"""Share of the object below which a pixel becomes background; between that and one half it stays unknown, since a mask
+that is too small in one frame carves the shape of all."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +240,57 @@ def compensate(image: UInt8[np.ndarray, "h w 3"], gain: Float32[np.ndarray, "3"]
     return cv2.LUT(image, table[None])
 
 
+def settle_border(
+    image: UInt8[np.ndarray, "h w 3"],
+    labels: UInt8[np.ndarray, "h w"],
+    background: UInt8[np.ndarray, "h w 3"],
+    known: Bool[np.ndarray, "h w"],
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+    """Image and mask whose band along the silhouette is shared out to object and background.
+
+    Masks leave a band of unknown pixels there. Where the background is known, a pixel of the band is a mix of its
+    colour and that of the object just inside, in linear light, and the share of the object follows (Smith and Blinn,
+    *Blue screen matting*, 1996, with a known foreground instead of a second background). Pixels of which the object
+    covers most become object, with the background taken out of their colour; those of which it covers little become
+    background.
+
+    Args:
+        image: A frame, sRGB.
+        labels: Its mask: OBJECT, UNKNOWN or BACKGROUND.
+        background: What the frame shows without the object, sRGB.
+        known: Pixels where that is known; the others of the band stay unknown.
+    """
+    inner, outer = labels == OBJECT, labels == BACKGROUND
+    if not inner.any() or not outer.any():
+        return image, labels
+    to_object, nearest = cv2.distanceTransformWithLabels(
+        (~inner).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    to_background = cv2.distanceTransform((~outer).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    rows, columns = np.nonzero((labels == UNKNOWN) & known & (to_object + to_background < MAX_BORDER + 1.5))
+    # Pixels of the object are numbered from 1, row by row.
+    row, column = (each[nearest[rows, columns] - 1] for each in np.nonzero(inner))
+    mean, deviation = (values[row, column] for values in _inside(image, inner))
+    observed, front, behind = _linear_of(image[rows, columns]), mean, _linear_of(background[rows, columns])
+    line = front - behind
+    length = np.square(line).sum(-1).clip(1e-12)
+    share = (((observed - behind) * line).sum(-1) / length).clip(0, 1)[:, None]
+    residual = np.square(observed - behind - share * line).sum(-1)
+    # The object's colour in the pixel is that of its neighbours, but for texture and shading.
+    doubt = share[:, 0] * (deviation * np.abs(line)).sum(-1) / length
+    contrast = np.abs(_code(front).astype(int) - background[rows, columns]).max(-1)
+    certain = (
+        (contrast >= MIN_BORDER_CONTRAST)
+        & (residual <= MAX_BORDER_RESIDUAL**2 * length)
+        & ((share[:, 0] > 0.5 + BORDER_SIGMAS * doubt) | (share[:, 0] < MAX_BACKGROUND_SHARE - BORDER_SIGMAS * doubt))
+    )
+    rows, columns, share = rows[certain], columns[certain], share[certain]
+    image, labels = image.copy(), labels.copy()
+    labels[rows, columns] = np.where(share[:, 0] >= 0.5, np.uint8(OBJECT), np.uint8(BACKGROUND))
+    image[rows, columns] = _code((observed[certain] - (1 - share) * behind[certain]).clip(0, 1))
+    return image, labels
+
+
 def channel_max(values: Shaped[np.ndarray, "*b 3"]) -> Shaped[np.ndarray, "*b"]:
     """Maximum over three channels; a NumPy reduction over so short an axis is many times slower."""
     return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
@@ -261,3 +329,24 @@ def _mode(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _linear_from_code() -> Float32[np.ndarray, "256"]:
     """Linear light of all code values."""
     return linear_from_srgb(torch.arange(256, dtype=torch.float32) / 255).numpy()
+
+
+def _inside(
+    image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]:
+    """Mean and standard deviation of the colours of the pixels inside around each pixel, in linear light."""
+    weight, linear = inside.astype(np.float32), _linear_of(image)
+
+    def mean(values: np.ndarray, side: int) -> np.ndarray:
+        return cv2.blur(values * weight[..., None], (side, side)) / cv2.blur(weight, (side, side)).clip(1e-6)[..., None]
+
+    wide = mean(linear, BORDER_SIDE)
+    return mean(linear, 3), np.sqrt((mean(np.square(linear), BORDER_SIDE) - np.square(wide)).clip(0))
+
+
+def _linear_of(code: UInt8[np.ndarray, "*b 3"]) -> Float32[np.ndarray, "*b 3"]:
+    return linear_from_srgb(torch.from_numpy(code).float() / 255).numpy()
+
+
+def _code(linear: Float32[np.ndarray, "*b 3"]) -> UInt8[np.ndarray, "*b 3"]:
+    return to_srgb8(torch.from_numpy(linear)).numpy()

@@ -18,13 +18,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from tumble.datasets import capture_document, training_frame
 from tumble.io import BadFile, files, video
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.preprocess import keyframes, segmentation
-from tumble.preprocess.background import compensate
+from tumble.preprocess.background import channel_max, compensate, settle_border
 from tumble.preprocess.camera_motion import refuse_camera_motion
 from tumble.preprocess.footage import PROVENANCE, FootageFrame, read_frames
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
@@ -35,6 +35,9 @@ MIN_ROTATION = math.radians(40)
 """Minimum total rotation of the object; a smaller one cannot be reconstructed and may be noise [radians]."""
 MARGIN = 0.08
 """Margin of the crop window around the object's path, as a fraction of the path's longer side."""
+MAX_TEXTURE = 24
+"""Largest difference between neighbouring pixels of the survey's background where it tells the border of the object
+[code values]; in front of finer texture the background of a pixel of another size is not known well enough."""
 UNCERTAIN_EDGE = (220, 30, 30)
 """Border colour of frames with an uncertain mask in the preview (red)."""
 KEPT_EDGE = (40, 200, 60)
@@ -171,6 +174,7 @@ def _write(
     size = max(round(height * shrink), 1), max(round(width * shrink), 1)
     camera = survey.lens.camera.cropped(*window).resized(*size)
     indices = {int(survey.numbers[i]): i for i in kept}
+    held, behind = any(survey.hands), _output_background(survey, window, size)
     entries: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
     for frame in read_frames(survey.footage, invert_masks=options.invert_masks):
@@ -180,12 +184,14 @@ def _write(
         full = undistort_frame(frame, survey.lens)
         image = resample(full.image[top : top + height, left : left + width], survey.gains[i], size)
         mask = _output_mask(survey, i, full, window, image)
+        # A hand beside the object is no background, and masks of the user's own are better than this.
+        settled = survey.seed is not None and not held
+        shown, mask = settle_border(image, mask, *behind) if settled else (image, mask)
         if not (mask == OBJECT).any():
             continue
-        files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), image))
+        files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), shown))
         files.write_png(out / "masks" / name, mask[..., None])
         # Masks of a held object may contain background; stage 1 recognises it by what is around the object.
-        held = any(survey.hands)
         if held:
             files.write_png(out / "full_images" / name, image)
         entries.append(training_frame(name, None, full=held))
@@ -237,9 +243,33 @@ def _output_mask(
     h, w = image.shape[:2]
     if full.mask is not None:
         return downsample_mask(np.ascontiguousarray(full.mask[top : top + height, left : left + width]), h, w)
+    coarse = _at_output(survey.masks.labels[i], survey, window, (h, w), cv2.INTER_NEAREST)
+    factor = 1 / (survey.scale * max(width / w, height / h))
+    return coarse if factor < 1.3 else segmentation.refine_mask(image, coarse, max(2, math.ceil(1.5 * factor)))
+
+
+def _output_background(
+    survey: Survey, window: tuple[int, int, int, int], size: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """The static background at the output size, and where it is known and smooth enough for a single pixel."""
+    background, square = survey.background, np.ones((3, 3), np.uint8)
+    texture = channel_max(cv2.dilate(background.image, square) - cv2.erode(background.image, square))
+    known = background.known & (texture <= MAX_TEXTURE)
+    known = cv2.erode(known.astype(np.uint8), square)
+    behind = _at_output(background.image, survey, window, size, cv2.INTER_LINEAR)
+    return behind, _at_output(known, survey, window, size, cv2.INTER_NEAREST) > 0
+
+
+def _at_output(
+    values: UInt8[np.ndarray, "i j *c"],
+    survey: Survey,
+    window: tuple[int, int, int, int],
+    size: tuple[int, int],
+    interpolation: int,
+) -> UInt8[np.ndarray, "h w *c"]:
+    """An image of the survey's size, cut to the window and resampled to the output size."""
+    (top, left, height, width), (h, w) = window, size
     x, y = width / w * survey.scale, height / h * survey.scale
     affine = np.array([[x, 0, left * survey.scale + x / 2 - 0.5], [0, y, top * survey.scale + y / 2 - 0.5]])
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    coarse = cv2.warpAffine(survey.masks.labels[i], affine, (w, h), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    factor = 1 / max(x, y)
-    return coarse if factor < 1.3 else segmentation.refine_mask(image, coarse, max(2, math.ceil(1.5 * factor)))
+    flags = interpolation | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(values, affine, (w, h), flags=flags, borderMode=cv2.BORDER_REPLICATE)
