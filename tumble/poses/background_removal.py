@@ -22,7 +22,7 @@ from torch import Tensor
 
 from tumble.maths import SE3
 from tumble.poses import mask_refinement
-from tumble.poses.mask_refinement import EXTENT, RESOLUTION, beyond, hull_by_vote
+from tumble.poses.mask_refinement import EXTENT, RESOLUTION, beyond, hull_by_vote, silhouette_of
 from tumble.poses.result import PoseResult
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
 
@@ -81,7 +81,7 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
     expected = _expected_colours(photos, labels, result.camera, T_cam_obj, cells, size)
     masks, images = capture.masks.clone(), capture.images.clone()
     for i, k in enumerate(kept):
-        hand = (labels[i] == UNKNOWN) & beyond(result.camera, T_cam_obj[i] @ shown)
+        hand = (labels[i] == UNKNOWN) & beyond(silhouette_of(result.camera, T_cam_obj[i] @ shown))
         wrong = torch.from_numpy(_background(photos[i], labels[i], expected[i], size) | hand)
         masks[k][wrong], images[k][wrong] = BACKGROUND, 0
     return replace(capture, masks=masks, images=images, full_images=None)

@@ -68,8 +68,8 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
     cells = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
     masks = capture.masks.clone()
     for k in kept:
-        silhouette, outside = _silhouette(camera, T_cam_obj[k] @ cells), beyond(camera, T_cam_obj[k] @ cells)
-        labels = masks[k].numpy()
+        silhouette = silhouette_of(camera, T_cam_obj[k] @ cells)
+        outside, labels = beyond(silhouette), masks[k].numpy()
         trimmed = np.where(outside, np.uint8(BACKGROUND), labels)
         trimmed[(labels == OBJECT) & ~outside & ~silhouette] = UNKNOWN
         masks[k] = torch.from_numpy(trimmed)
@@ -107,13 +107,12 @@ def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int], min_shown:
     return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen) & (shown >= min_shown * seen)]
 
 
-def beyond(camera: Camera, cells: Float[Tensor, "n 3"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels that lie clearly outside of the silhouette of cells, camera frame."""
-    silhouette = _silhouette(camera, cells)
+def beyond(silhouette: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that lie clearly outside of a silhouette."""
     return ~_dilated(silhouette, max(2, round(MARGIN * float(np.sqrt(silhouette.sum())))))
 
 
-def _silhouette(camera: Camera, cells: Float[Tensor, "n 3"]) -> Bool[np.ndarray, "h w"]:
+def silhouette_of(camera: Camera, cells: Float[Tensor, "n 3"]) -> Bool[np.ndarray, "h w"]:
     """Pixels that show cells of the hull, camera frame."""
     mask = np.zeros((camera.height, camera.width), np.uint8)
     if not len(cells):
