@@ -107,6 +107,15 @@ def test_a_hand_that_keeps_its_place_becomes_background_where_hardly_any_frame_s
     assert (cut.masks[kept][beside] == BACKGROUND).float().mean() > 0.4
 
 
+def test_an_object_that_is_hidden_in_most_frames_is_not_taken_for_a_hand(held: tuple[Capture, Tensor, SE3]) -> None:
+    capture, objects, T_cam_obj = held
+    shown = torch.rand(objects.shape, generator=torch.Generator().manual_seed(0)) < 0.05
+    masks = torch.where(objects, UNKNOWN, BACKGROUND).to(torch.uint8)
+    masks[objects & shown] = OBJECT
+    cut = background_removal.remove_background(replace(capture, masks=masks), result(capture.camera, T_cam_obj))
+    assert not (cut.masks[objects] == BACKGROUND).any()
+
+
 @pytest.mark.parametrize("colours", [PRINT, ONE_COLOUR])
 def test_poses_with_errors_remove_nothing_of_the_object(colours: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     capture, objects, T_cam_obj = film(colours)

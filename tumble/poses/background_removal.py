@@ -33,6 +33,8 @@ MAX_DEPTH_DIFFERENCE = 2.5
 MIN_SHOWN = 0.25
 """Fraction of the frames that must show object at a cell; with less, it is a hand's. In captures with a rendered hand
 the four objects for tuning have 0.54 or more everywhere; half of that leaves room for masks that miss parts of them."""
+MIN_LEFT = 0.5
+"""Fraction of the hull that has to be left; with less, hands hide too much of the object to be told from it."""
 MIN_FRAMES = 2
 """Minimum number of frames that must show a cell; the colour of others is unknown."""
 SHADING_SIGMA = 0.15
@@ -77,6 +79,8 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
     labels, T_cam_obj = capture.masks[kept].numpy(), result.trajectory.T_cam_obj[kept]
     seen = replace(capture, camera=result.camera), result.trajectory.T_cam_obj, kept
     cells, shown = hull_by_vote(*seen), hull_by_vote(*seen, min_shown=MIN_SHOWN)
+    if len(shown) < MIN_LEFT * len(cells):
+        shown = cells
     size = float(np.sqrt(np.median((labels == OBJECT).sum((1, 2)))))
     expected = _expected_colours(photos, labels, result.camera, T_cam_obj, cells, size)
     masks, images = capture.masks.clone(), capture.images.clone()
