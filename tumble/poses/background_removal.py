@@ -77,8 +77,8 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
         return replace(capture, full_images=None)
     photos = np.stack([cv2.GaussianBlur(capture.full_images[k].numpy(), (3, 3), 0) for k in kept]).astype(np.float32)
     labels, T_cam_obj = capture.masks[kept].numpy(), result.trajectory.T_cam_obj[kept]
-    seen = replace(capture, camera=result.camera), result.trajectory.T_cam_obj, kept
-    cells, shown = hull_by_vote(*seen), hull_by_vote(*seen, min_shown=MIN_SHOWN)
+    cells, share = hull_by_vote(replace(capture, camera=result.camera), result.trajectory.T_cam_obj, kept)
+    shown = cells[share >= MIN_SHOWN]
     if len(shown) < MIN_LEFT * len(cells):
         shown = cells
     size = float(np.sqrt(np.median((labels == OBJECT).sum((1, 2)))))

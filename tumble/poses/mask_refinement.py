@@ -65,7 +65,7 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
     """
     kept = torch.nonzero(~result.quality.lost)[:, 0].tolist()
     camera, T_cam_obj = result.camera, result.trajectory.T_cam_obj
-    cells = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
+    cells, _ = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
     masks = capture.masks.clone()
     for k in kept:
         silhouette = silhouette_of(camera, T_cam_obj[k] @ cells)
@@ -84,11 +84,13 @@ def explains_more(new: PoseResult, old: PoseResult) -> bool:
     return ranks[0] > ranks[1]
 
 
-def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int], min_shown: float = 0.0) -> Float[Tensor, "n 3"]:
-    """Centres of the cells at which few frames show background, object frame.
+def hull_by_vote(
+    capture: Capture, T_cam_obj: SE3, frames: list[int]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """The cells at which few frames show background.
 
-    Args:
-        min_shown: Fraction of the frames with a cell in the image that must show object there.
+    Returns:
+        Their centres, object frame, and of the frames with each in the image the fraction that shows object there.
     """
     ticks = ((torch.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1) * EXTENT
     cells = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
@@ -104,7 +106,8 @@ def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int], min_shown:
         seen += inside
         left = background <= MAX_BACKGROUND_FRACTION * len(frames)  # the others have lost the vote already
         cells, background, shown, seen = cells[left], background[left], shown[left], seen[left]
-    return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen) & (shown >= min_shown * seen)]
+    left = (seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen)
+    return cells[left], (shown / seen)[left]
 
 
 def beyond(silhouette: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

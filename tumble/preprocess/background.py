@@ -271,7 +271,8 @@ def settle_border(
     # Pixels of the object are numbered from 1, row by row.
     row, column = (each[nearest[rows, columns] - 1] for each in np.nonzero(inner))
     mean, deviation = (values[row, column] for values in _inside(image, inner))
-    observed, front, behind = _linear_of(image[rows, columns]), mean, _linear_of(background[rows, columns])
+    curve = _linear_from_code()
+    observed, front, behind = curve[image[rows, columns]], mean, curve[background[rows, columns]]
     line = front - behind
     length = np.square(line).sum(-1).clip(1e-12)
     share = (((observed - behind) * line).sum(-1) / length).clip(0, 1)[:, None]
@@ -335,17 +336,13 @@ def _inside(
     image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]:
     """Mean and standard deviation of the colours of the pixels inside around each pixel, in linear light."""
-    weight, linear = inside.astype(np.float32), _linear_of(image)
+    weight, linear = inside.astype(np.float32), _linear_from_code()[image]
 
     def mean(values: np.ndarray, side: int) -> np.ndarray:
         return cv2.blur(values * weight[..., None], (side, side)) / cv2.blur(weight, (side, side)).clip(1e-6)[..., None]
 
     wide = mean(linear, BORDER_SIDE)
     return mean(linear, 3), np.sqrt((mean(np.square(linear), BORDER_SIDE) - np.square(wide)).clip(0))
-
-
-def _linear_of(code: UInt8[np.ndarray, "*b 3"]) -> Float32[np.ndarray, "*b 3"]:
-    return linear_from_srgb(torch.from_numpy(code).float() / 255).numpy()
 
 
 def _code(linear: Float32[np.ndarray, "*b 3"]) -> UInt8[np.ndarray, "*b 3"]:

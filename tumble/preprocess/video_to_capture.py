@@ -174,7 +174,9 @@ def _write(
     size = max(round(height * shrink), 1), max(round(width * shrink), 1)
     camera = survey.lens.camera.cropped(*window).resized(*size)
     indices = {int(survey.numbers[i]): i for i in kept}
-    held, behind = any(survey.hands), _output_background(survey, window, size)
+    held = any(survey.hands)
+    # A hand beside the object is no background, and masks of the user's own are better than this.
+    behind = None if held or survey.seed is None else _output_background(survey, window, size)
     entries: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
     for frame in read_frames(survey.footage, invert_masks=options.invert_masks):
@@ -184,9 +186,7 @@ def _write(
         full = undistort_frame(frame, survey.lens)
         image = resample(full.image[top : top + height, left : left + width], survey.gains[i], size)
         mask = _output_mask(survey, i, full, window, image)
-        # A hand beside the object is no background, and masks of the user's own are better than this.
-        settled = survey.seed is not None and not held
-        shown, mask = settle_border(image, mask, *behind) if settled else (image, mask)
+        shown, mask = (image, mask) if behind is None else settle_border(image, mask, *behind)
         if not (mask == OBJECT).any():
             continue
         files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), shown))
@@ -253,7 +253,7 @@ def _output_background(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """The static background at the output size, and where it is known and smooth enough for a single pixel."""
     background, square = survey.background, np.ones((3, 3), np.uint8)
-    texture = channel_max(cv2.dilate(background.image, square) - cv2.erode(background.image, square))
+    texture = channel_max(cv2.morphologyEx(background.image, cv2.MORPH_GRADIENT, square))
     known = background.known & (texture <= MAX_TEXTURE)
     known = cv2.erode(known.astype(np.uint8), square)
     behind = _at_output(background.image, survey, window, size, cv2.INTER_LINEAR)
