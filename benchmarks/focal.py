@@ -80,7 +80,7 @@ def measure(
 ) -> Row:
     """A row: stage 1 with the true focal length times `factor`, which it refines if `assumed` and keeps otherwise."""
     zoomed = replace(capture, camera=capture.camera.zoomed(factor), focal_assumed=assumed)
-    tracked = drive(stage, POSES, stage.gather(zoomed, matches, "mixed"), seed=0)
+    tracked = drive(stage, POSES, stage.gather(zoomed, matches), seed=0)
     scores = {} if truth is None else pose_scores(tracked.trajectory, truth)
     return {
         "capture": case.name,
@@ -97,7 +97,7 @@ def measure(
 @torch.no_grad()
 def curve(case: Case, capture: Capture, matches: Sequence[Match]) -> Row:
     """Loss per observation [pixels^2] after bundle adjustment of all frames at each focal length of `CURVE`."""
-    inputs = stage.gather(capture, matches, "mixed")
+    inputs = stage.gather(capture, matches)
     state = stage.init(POSES, inputs, torch.Generator().manual_seed(0))
     for state.step in range(stage.length(POSES, inputs)):
         stage.step(POSES, inputs, state)

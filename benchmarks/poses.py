@@ -108,10 +108,10 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     matches = matching.match_pairs(views, neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()
     if route == "graph":
-        tracked = drive(sfm, DRAFT.track, sfm.gather(capture, matches, DRAFT.matcher, hidden=hidden), seed=0)
+        tracked = drive(sfm, DRAFT.track, sfm.gather(capture, matches, hidden=hidden), seed=0)
     else:
         recipe = progressive_poses(DRAFT)
-        assess = partial(sfm.assess, sfm.gather(capture, matches, DRAFT.matcher, hidden=hidden))
+        assess = partial(sfm.assess, sfm.gather(capture, matches, hidden=hidden))
         tracked = drive(progressive, recipe.track, progressive.gather(capture, matches, assess), seed=0)
     seconds = time.perf_counter() - started
     quality = tracked.quality

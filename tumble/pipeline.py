@@ -284,7 +284,7 @@ def _track(
     route = stage_of(recipe.track)
     try:
         with progress.task("observations in all frames"):
-            inputs: Any = sfm.gather(capture, matches, recipe.matcher, hidden=hidden)
+            inputs: Any = sfm.gather(capture, matches, hidden=hidden)
             if route is progressive:
                 inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:

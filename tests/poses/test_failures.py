@@ -70,7 +70,7 @@ def rotating(n: int, rock: float) -> SE3:
 
 def estimate(capture: Capture) -> PoseResult:
     matches = matching.match_pairs(matching.views_of(capture), neighbours(len(capture), (1, 2)), "mixed")
-    return drive(stage, QUICK, stage.gather(capture, matches, "mixed"), seed=0)
+    return drive(stage, QUICK, stage.gather(capture, matches), seed=0)
 
 
 def test_an_untextured_sphere_is_bad() -> None:
@@ -110,7 +110,7 @@ def test_another_object_in_half_of_the_frames_is_bad(scene: Tumble) -> None:
         half = 14 + 2 * (k % 3)
         masks[k, 64 - half : 64 + half, 50:78] = OBJECT
     some = [m for m in matches(scene) if m.j < 12]
-    quality = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), some, "mixed"), seed=0).quality
+    quality = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), some), seed=0).quality
     assert quality.rating == "bad"
 
 
@@ -126,7 +126,7 @@ def test_single_wrong_masks_do_not_affect_other_frames(scene: Tumble) -> None:
             if k in (5, 15):
                 here &= uv[:, 0] < 62
         kept.append(m.select(here))
-    found = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), kept, "mixed"), seed=0)
+    found = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), kept), seed=0)
     others = [k for k in range(24) if k not in (5, 15)]
     scores = metrics.rotation_scores(found.trajectory.select(others), truth(scene).select(others))
     assert scores["rotation_median_degrees"] < 2

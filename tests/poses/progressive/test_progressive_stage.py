@@ -21,7 +21,7 @@ def test_true_poses_are_rated_good() -> None:
     scene = tumbling(24, points=200)
     rng = torch.Generator().manual_seed(0)
     some = [scene.match(t - k, t, rng, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
-    found = sfm.assess(sfm.gather(scene.capture, some, "mixed"), truth(scene))
+    found = sfm.assess(sfm.gather(scene.capture, some), truth(scene))
     assert found.quality.rating == "good"
     assert math.degrees(found.quality.uncertainty) < 1
     between = found.trajectory.T_cam_obj.rotation.inverse() @ truth(scene).T_cam_obj.rotation
@@ -30,7 +30,7 @@ def test_true_poses_are_rated_good() -> None:
 
 def test_the_stage_finds_the_motion_of_a_sphere() -> None:
     """Five frames, 24 degrees; as far as `test_tracker` says that these settings can."""
-    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
+    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches))
     inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
     assert isinstance(sys.modules["tumble.poses.progressive.stage"], Stage)
     found = drive(progressive, progressive.Config(**vars(ON_A_SPHERE)), inputs, seed=0)
@@ -46,7 +46,7 @@ def test_the_stage_finds_the_motion_of_a_sphere() -> None:
 
 def test_lifting_by_epnp_gives_the_poses_of_the_closed_form() -> None:
     """Projections of the shape's surface have no noise, so that RANSAC-EPnP errs by its rounding alone."""
-    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches, "mixed"))
+    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches))
     inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
     few = vars(SMOKE) | {"warmup": 1, "pose_steps": 1, "joint_steps": 1}
     exact = drive(progressive, progressive.Config(**few), inputs, seed=1).trajectory.T_cam_obj

@@ -27,7 +27,7 @@ OTHER_FRAME = (
 
 @pytest.fixture(scope="module")
 def observed() -> Observed:
-    inputs = stage.gather(SCENE.capture, (), "mixed")
+    inputs = stage.gather(SCENE.capture, ())
     return Observed(stage.Config(), inputs, gather_keypoints((), NO_TRACKS, SCENE.capture.camera, len(R)))
 
 
@@ -58,7 +58,7 @@ def test_contours_of_another_object_are_not_joined(observed: Observed) -> None:
         y, x = (mask != BACKGROUND).nonzero().double().mean(0)
         radius = math.sqrt(int((mask != BACKGROUND).sum()) / math.pi)
         mask[:] = torch.where((row - y).square() + (column - x).square() < radius**2, 255, 0).to(mask.dtype)
-    inputs = stage.gather(replace(SCENE.capture, masks=masks), (), "mixed")
+    inputs = stage.gather(replace(SCENE.capture, masks=masks), ())
     joint = contour_joint(replace(observed, inputs=inputs), in_other_frame(half(range(12, 24))), half(range(12)))
     assert joint is None or not joint.accepted
 

@@ -21,7 +21,7 @@ T = np.array([0.1, -0.05, 4.0])
 
 @pytest.fixture(scope="module")
 def observed() -> Observed:
-    inputs = stage.gather(SCENE.capture, (), "mixed")
+    inputs = stage.gather(SCENE.capture, ())
     return Observed(stage.Config(), inputs, gather_keypoints((), NO_TRACKS, CAMERA, 12))
 
 

@@ -49,7 +49,7 @@ def scene() -> Tumble:
 @pytest.fixture(scope="module")
 def inputs(scene: Tumble) -> stage.Inputs:
     near = [(t - k, t) for k in (1, 2, 4) for t in range(k, N)]
-    return stage.gather(hidden(scene), matched(scene, hidden(scene), near), "mixed", hidden=True)
+    return stage.gather(hidden(scene), matched(scene, hidden(scene), near), hidden=True)
 
 
 def start(scene: Tumble) -> torch.Tensor:

@@ -75,7 +75,7 @@ def consistent_inputs(capture: Capture, trajectory: Trajectory) -> Inputs:
         back, hit_j = intersect(T[j], target)
         seen = hit & hit_j & ((back - x).norm(dim=-1) < 0.02)
         matches.append(Match(i, j, uv[seen], target[seen], torch.ones(int(seen.sum()))))
-    return stage.gather(replace(capture, trajectory=None), matches, "mixed")
+    return stage.gather(replace(capture, trajectory=None), matches)
 
 
 def error(T: SE3, truth: Trajectory) -> float:

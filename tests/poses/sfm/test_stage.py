@@ -42,7 +42,7 @@ def scene() -> Tumble:
 
 @pytest.fixture(scope="module")
 def tracked(scene: Tumble) -> PoseResult:
-    return drive(stage, QUICK, stage.gather(scene.capture, matches(scene), "mixed"), seed=0)
+    return drive(stage, QUICK, stage.gather(scene.capture, matches(scene)), seed=0)
 
 
 def test_it_is_a_stage() -> None:
@@ -74,8 +74,8 @@ def test_an_assumed_focal_length_is_estimated_and_a_known_one_kept(scene: Tumble
     of that error are corrected, which suffices for the rotations.
     """
     short = replace(scene.capture, camera=scene.capture.camera.zoomed(0.8))
-    assumed = drive(stage, QUICK, stage.gather(replace(short, focal_assumed=True), matches(scene), "mixed"), seed=0)
-    known = drive(stage, QUICK, stage.gather(short, matches(scene), "mixed"), seed=0)
+    assumed = drive(stage, QUICK, stage.gather(replace(short, focal_assumed=True), matches(scene)), seed=0)
+    known = drive(stage, QUICK, stage.gather(short, matches(scene)), seed=0)
     focal = float(scene.capture.camera.fx_fy_cx_cy[0])
     assert float(assumed.camera.fx_fy_cx_cy[0]) == pytest.approx(focal, rel=0.07)
     assert torch.equal(assumed.camera.fx_fy_cx_cy[2:], scene.capture.camera.fx_fy_cx_cy[2:])
@@ -90,7 +90,7 @@ def test_a_frame_without_the_object_is_lost_and_the_others_are_not_affected(scen
     masks[9] = 0
     capture = replace(scene.capture, masks=masks)
     some = tuple(m for m in matches(scene) if 9 not in (m.i, m.j))
-    out = drive(stage, QUICK, stage.gather(capture, some, "mixed"), seed=0)
+    out = drive(stage, QUICK, stage.gather(capture, some), seed=0)
     assert torch.nonzero(out.quality.lost)[:, 0].tolist() == [9]
     others = [k for k in range(20) if k != 9]
     scores = metrics.rotation_scores(out.trajectory.select(others), truth(scene).select(others))
@@ -99,7 +99,7 @@ def test_a_frame_without_the_object_is_lost_and_the_others_are_not_affected(scen
 
 def test_a_capture_that_has_not_converged_is_attempted_again_and_the_best_result_is_kept(scene: Tumble) -> None:
     """The second attempt has smaller windows, and starts from more rotations."""
-    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    inputs = stage.gather(scene.capture, matches(scene))
     fallbacks = (schedule.Fallback((4,), 1.0),)
     state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))
     cfg = replace(QUICK, fallbacks=fallbacks, converged_loss=0.0)
@@ -125,7 +125,7 @@ def test_an_attempt_is_mended_before_it_is_compared_unless_it_has_converged(scen
     steps = stage.schedule(cfg)
     mending = [k for k, now in enumerate(steps) if now.mends]
     assert [type(steps[k].phase) for k in mending] == [stage.Relocalize, stage.AdjustAll, stage.KeepBest]
-    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    inputs = stage.gather(scene.capture, matches(scene))
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
     for state.step in range(mending[0] - 1):
         stage.step(cfg, inputs, state)
@@ -153,7 +153,7 @@ def test_corrections_are_repeated_until_no_rotation_changes_by_a_degree(scene: T
     cfg = replace(QUICK, max_corrections=4)
     steps = [step.phase for step in stage.schedule(cfg)]
     checks = [k for k, phase in enumerate(steps) if isinstance(phase, stage.CheckSettled)]
-    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    inputs = stage.gather(scene.capture, matches(scene))
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
     rounds = ((35.0, False), (5.0, False), (3.5, False), (2.8, True), (2.8, True))
     for state.step, (degrees, settled) in zip(checks, rounds, strict=True):
@@ -161,14 +161,14 @@ def test_corrections_are_repeated_until_no_rotation_changes_by_a_degree(scene: T
         stage.step(cfg, inputs, state)
         assert bool(state.memory["settled"]) == settled
     state.step = checks[-2] + 2
-    assert steps[state.step] == stage.CloseLoops()
+    assert steps[state.step] == stage.TrackTexture()
     assert stage.step(cfg, inputs, state) == {}
 
 
 def test_corrections_that_raise_the_loss_are_undone(scene: Tumble) -> None:
     cfg = replace(QUICK, max_corrections=2)
     checks = [k for k, step in enumerate(stage.schedule(cfg)) if isinstance(step.phase, stage.CheckSettled)]
-    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    inputs = stage.gather(scene.capture, matches(scene))
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
     for state.step, degrees in zip(checks[:2], (5.0, 20.0), strict=True):
         state.params = turned(scene, 3, degrees)
@@ -183,7 +183,7 @@ def test_two_attempts_that_agree_are_enough(scene: Tumble) -> None:
     cfg = replace(QUICK, converged_loss=0.0, fallbacks=(schedule.Fallback((6,), 1.0),) * 2)
     steps = stage.schedule(cfg)
     keep = [k for k, step in enumerate(steps) if isinstance(step.phase, stage.KeepBest)]
-    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    inputs = stage.gather(scene.capture, matches(scene))
     for degrees, agreed in ((0.5, True), (10.0, False)):
         state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
         state.params = turned(scene, 3, 0.0)
@@ -207,7 +207,7 @@ def rotated(state: State, degrees: float) -> Tensor:
 
 def test_a_part_of_the_motion_that_is_joined_wrongly_is_found_by_perturbation(scene: Tumble) -> None:
     """All frames from the eleventh on are turned by 50 degrees, from which bundle adjustment alone does not return."""
-    inputs = stage.gather(scene.capture, matches(scene), "mixed")
+    inputs = stage.gather(scene.capture, matches(scene))
     cfg = replace(QUICK, converged_loss=0.0, perturbations=5, fallbacks=QUICK.fallbacks[:1])
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(1))
     good = turned(scene, 3, 0.0)
@@ -228,7 +228,7 @@ def test_a_part_of_the_motion_that_is_joined_wrongly_is_found_by_perturbation(sc
 def test_no_object_is_an_error(scene: Tumble) -> None:
     blank = replace(scene.capture, masks=torch.zeros_like(scene.capture.masks))
     with pytest.raises(ValueError, match="no mask has an object pixel"):
-        stage.gather(blank, (), "mixed")
+        stage.gather(blank, ())
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(scene: Tumble, tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(scene: Tumble, tmp_path: Path
         masks=scene.capture.masks[:6],
         names=scene.capture.names[:6],
     )
-    inputs = stage.gather(few, tuple(m for m in matches(scene) if m.j < 6), "mixed")
+    inputs = stage.gather(few, tuple(m for m in matches(scene) if m.j < 6))
     short = replace(QUICK, global_scales=(3.0, 1.0), relocalizations=1, max_corrections=2, relocalized_scales=(1.0,))
     whole = drive(stage, short, inputs, seed=3)
 

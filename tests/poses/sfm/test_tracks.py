@@ -119,16 +119,6 @@ def test_tracks_end_where_matches_disagree() -> None:
     assert observations(tracks, 0)[1] == pytest.approx([32.0, 30.0], abs=0.31)
 
 
-def test_correspondences_become_tracks_of_two_observations() -> None:
-    uv = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    pair = tracks.two_frame_tracks(Match(3, 7, uv, uv + 10, torch.ones(2)))
-    both = tracks.concatenate(tracks.NO_TRACKS, pair, pair)
-    assert both.n == 4
-    assert both.frame.tolist() == [3, 3, 7, 7] * 2
-    assert both.point.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
-    assert torch.equal(both.uv[2:4], (uv + 10).double())
-
-
 def test_matches_join_tracks_where_they_agree_with_the_poses() -> None:
     """Two tracks of each of 20 points, in frames 0-1 and 3-4, which frame 2 does not see; a tenth of the matches of
     frames 0 and 4 is wrong, and all of those of frames 1 and 3 are.

@@ -90,7 +90,7 @@ def error(T: SE3, truth: Trajectory) -> float:
 
 
 def gathered(capture: Capture) -> Inputs:
-    return stage.gather(capture, [], "mixed")
+    return stage.gather(capture, [])
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +197,7 @@ def test_mirror_symmetry_is_computed_once(painted: tuple[Capture, Trajectory], m
 
     monkeypatch.setattr("tumble.poses.sfm.symmetry.mirror._centred", again)
     state = state_at(cfg, inputs, truth)
-    for phase in (stage.AlignTexture(), stage.CloseLoops()):
+    for phase in (stage.AlignTexture(), stage.TrackTexture()):
         state.step = [step.phase for step in stage.schedule(cfg)].index(phase)
         stage.step(cfg, inputs, state)
     stage.finish(cfg, inputs, state)

@@ -181,6 +181,7 @@ def adjust_round(
     scale: float,
     rng: torch.Generator | None = None,
     log_focal_prior: float = 0.0,
+    weight: Float[Tensor, " o"] | None = None,
 ) -> tuple[BundleState, Float[Tensor, " g"]]:
     """One round of bundle adjustment: find frontier points, triangulate all points, adjust.
 
@@ -192,6 +193,7 @@ def adjust_round(
         scale: Scale of the Cauchy loss [pixels].
         rng: Source of the random choice of frame pairs; None uses all pairs.
         log_focal_prior: Mean of the prior on the logarithm of the focal length over the camera's.
+        weight: Weights of the observations; None: 1.
 
     Returns:
         The adjusted scene, and the loss per observation of every group [pixels^2].
@@ -207,7 +209,8 @@ def adjust_round(
     flat = frames.flatten()
     frontier = frontier_points.frontier_tracks(R, t, camera, inputs.contours[flat], radius=inputs.radius, pairs=pairs)
     all_tracks = concatenate(tracks, frontier)
-    weight = torch.cat([torch.ones(len(tracks)), torch.full((len(frontier),), cfg.frontier_weight)]).double()
+    weight = torch.ones(len(tracks), dtype=torch.float64) if weight is None else weight
+    weight = torch.cat([weight, weight.new_full((len(frontier),), cfg.frontier_weight)])
     group = torch.cat([group, frontier.frame[::2] // f])
     sigma = cfg.centre_sigma * inputs.silhouettes.radius[frames] * focal_length(inputs.capture)
     centre, radius = inputs.silhouettes.centre[frames], 1.5 * inputs.radius

@@ -47,8 +47,6 @@ class Inputs:
     """Feature tracks, chained from the matches."""
     radius: float
     """Approximate radius of the object [mean distance]."""
-    matcher: str
-    """Name of the matcher for loop closure: a file of `matching`."""
     mirror_symmetry: MirrorSymmetry
     """Mirror symmetry of all silhouettes, by which a body of revolution is recognised."""
     all_matches: Sequence[Match] = field(default=(), repr=False)
@@ -60,12 +58,11 @@ class Inputs:
         return bool(self.all_matches)
 
 
-def gather(capture: Capture, matches: Sequence[Match], matcher: str, *, hidden: bool = False) -> Inputs:
+def gather(capture: Capture, matches: Sequence[Match], *, hidden: bool = False) -> Inputs:
     """Extract silhouettes, contours and tracks from a capture and the matches between its frames.
 
     Args:
         matches: Matches between the frames of the capture; of `shown(capture)` if the object is hidden in part.
-        matcher: Name of the matcher for loop closure.
         hidden: Whether something hides a part of the object (`is_hidden`).
 
     Raises:
@@ -83,7 +80,7 @@ def gather(capture: Capture, matches: Sequence[Match], matcher: str, *, hidden: 
     silhouettes = relative_pose.replace_failed(silhouettes, failed)
     radius = RADIUS_MARGIN * float(silhouettes.radius[silhouettes.visible].median())
     mirror = mirror_symmetry(capture.masks)
-    return Inputs(capture, sure, silhouettes, contours, tracks, radius, matcher, mirror, matches if hidden else ())
+    return Inputs(capture, sure, silhouettes, contours, tracks, radius, mirror, matches if hidden else ())
 
 
 def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Capture) -> Tracks:

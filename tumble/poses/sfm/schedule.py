@@ -61,6 +61,15 @@ class BaseConfig:
     """Number of relocalizations of the first and of the best attempt, each followed by rounds of adjustment."""
     max_corrections: int = 4
     """Maximum number of rounds of corrections at the end (`CheckSettled`)."""
+    texture_rounds: int = 3
+    """Number of times that points are located by their texture at the end, with the poses found before."""
+    texture_scales: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
+    """Scale of the Cauchy loss in each round of adjusting the whole capture after that [pixels]."""
+    texture_weight: float = 4.0
+    """Weight of an observation of a point by its texture, relative to one of a chained match.
+
+    Chained matches err alike, those of one surface point by its texture do not.
+    """
     frontier_weight: float = 12.0
     """Weight of an observation of a frontier point, relative to an observation of a track.
 
@@ -126,7 +135,7 @@ class AlignTexture:
 
 @dataclass(frozen=True)
 class CheckSettled:
-    """Start a round of corrections: by colours, loop closures and relocalization, then all frames are adjusted.
+    """Start a round of corrections: by colours, texture tracks and relocalization, then all frames are adjusted.
 
     If the last round has raised the loss, it is undone. In that case, and if no rotation has changed by `SETTLED_ANGLE`
     since the last check, this and all further rounds are skipped.
@@ -142,8 +151,8 @@ class AlignColours:
 
 
 @dataclass(frozen=True)
-class CloseLoops:
-    """Match frames that are far apart in time and see the same side, if the object is a body of revolution."""
+class TrackTexture:
+    """Locate points of the visual hull in all frames by their texture (`symmetry.texture_tracks`)."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +177,7 @@ Phase = (
     | AlignTexture
     | CheckSettled
     | AlignColours
-    | CloseLoops
+    | TrackTexture
     | Relocalize
     | JoinSegments
 )
@@ -192,7 +201,8 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
         hidden: Whether something hides a part of the object, which contours alone then do not relocalize.
     """
     if hidden:
-        return [*map(Step, (AverageRotations(), JoinSegments(), *map(AdjustAll, cfg.relocalized_scales)))]
+        first = [*map(Step, (AverageRotations(), JoinSegments(), *map(AdjustAll, cfg.relocalized_scales)))]
+        return [*first, *_texture_rounds(cfg)]
     keep = KeepBest(cfg.global_scales[-1])
     relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
     steps: list[Step] = []
@@ -217,6 +227,10 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
         steps += [Step(phase, len(others), mends=True) for phase in mending]
     steps.append(Step(AlignTexture()))
     for _ in range(cfg.max_corrections):
-        steps += map(Step, (CheckSettled(keep.scale), AlignColours(), CloseLoops(), *relocalization))
-    steps.append(Step(CheckSettled(keep.scale)))
-    return steps
+        steps += map(Step, (CheckSettled(keep.scale), AlignColours(), TrackTexture(), *relocalization))
+    return [*steps, Step(CheckSettled(keep.scale)), *_texture_rounds(cfg)]
+
+
+def _texture_rounds(cfg: BaseConfig) -> list[Step]:
+    """The last steps: points are located by their texture and all frames adjusted, in turn."""
+    return [*map(Step, (TrackTexture(), *map(AdjustAll, cfg.texture_scales)))] * cfg.texture_rounds

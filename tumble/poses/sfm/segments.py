@@ -106,7 +106,7 @@ def segmented_poses(
         far = {(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)}
         learned = _matched(inputs, sorted(near | far), LEARNED_MATCHER)
         of_near = [match for match in learned if (match.i, match.j) in near]
-        inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), inputs.matcher, hidden=True)
+        inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), hidden=True)
         other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng)
         if other is not None and (part is None or len(other) >= len(part)):
             part, tracks = other, other_tracks

@@ -56,18 +56,18 @@ from tumble.poses.sfm.schedule import (
     AverageRotations,
     BaseConfig,
     CheckSettled,
-    CloseLoops,
     JoinSegments,
     KeepBest,
     Perturb,
     Relocalize,
     Step,
+    TrackTexture,
     schedule,
 )
-from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate, two_frame_tracks
+from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 21
+VERSION = 22
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -80,10 +80,6 @@ DISAGREEMENT_FACTOR = 6.0
 
 It is finite, because neither tracks nor contours alone determine all poses.
 """
-MAX_LOOP_PAIRS = 60
-"""Maximum number of frame pairs for loop closure."""
-LOOP_DISTANCE = 12
-"""Pairs for loop closure are more than this far apart in time [frames]."""
 MAX_COST_RATIO = 4.0
 """Robust cost of a frame's tangency gaps above which its pose does not show a gap of the motion [median]."""
 BOUNDING_RADIUS_FACTOR = 1.3
@@ -136,9 +132,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     best |= {"checked_R": torch.full_like(R, torch.nan), "checked_t": t, "checked_log_focal": log_focal}
     best["settled"] = torch.tensor(False)
     best["steady"] = torch.ones(len(inputs.tracks), dtype=torch.bool)
-    return State(
-        0, Poses(R, t, log_focal), None, rng, best | {f"loop_{name}": x for name, x in vars(NO_TRACKS).items()}
-    )
+    return State(0, Poses(R, t, log_focal), None, rng, best)
 
 
 @torch.no_grad()
@@ -182,8 +176,8 @@ def _run_phase(now: Step, cfg: Config, inputs: Inputs, state: State) -> "PhaseRe
             return _check_settled(cfg, inputs, state, scale)
         case AlignColours():
             return _align_colours(inputs, state)
-        case CloseLoops():
-            return _close_loops(inputs, state)
+        case TrackTexture():
+            return _track_texture(inputs, state)
         case Relocalize(scale):
             return _relocalize(inputs, state, scale)
         case JoinSegments():
@@ -238,7 +232,7 @@ def _join_segments(cfg: Config, inputs: Inputs, state: State) -> PhaseResult:
     R[frames], t[frames] = part.R, part.t
     posed = torch.zeros(len(R), dtype=torch.bool)
     posed[frames] = True
-    state.memory |= {"posed": posed} | {f"loop_{name}": x for name, x in vars(tracks).items()}
+    state.memory |= {"posed": posed} | {f"joined_{name}": x for name, x in vars(tracks).items()}
     return replace(state.params, R=R, t=t), {"posed": float(len(frames))}
 
 
@@ -248,14 +242,13 @@ def adjust_all(cfg: Config, inputs: Inputs, state: State, scale: float) -> Phase
     frames = torch.nonzero(posed)[:, 0]
     log_focal = torch.zeros(1, dtype=poses.R.dtype) if inputs.capture.focal_assumed else None
     scene = BundleState(poses.R[None, posed], poses.t[None, posed], torch.zeros(0, 3, dtype=poses.R.dtype), log_focal)
-    tracks = _all_tracks(inputs, state)
-    if not bool(posed.all()):
-        tracks = tracks.select(posed[tracks.frame])
-        tracks = replace(tracks, frame=(posed.cumsum(0) - 1)[tracks.frame])
+    chained, textured = (_renumbered(tracks, posed) for tracks in (_chained(inputs, state), _textured(state)))
+    tracks = concatenate(chained, textured)
     group = torch.zeros(tracks.n, dtype=torch.long)
+    weight = torch.cat([torch.ones(len(chained)), torch.full((len(textured),), cfg.texture_weight)]).double()
     # `inputs` have the current focal length; the prior is centred on that of the capture.
-    log_focal_prior = -float(poses.log_focal)
-    scene, loss = adjust_round(cfg, inputs, scene, tracks, group, frames[None], scale, state.rng, log_focal_prior)
+    prior = -float(poses.log_focal)
+    scene, loss = adjust_round(cfg, inputs, scene, tracks, group, frames[None], scale, state.rng, prior, weight)
     R, t = poses.R.clone(), poses.t.clone()
     R[posed], t[posed] = scene.R[0], scene.t[0]
     if scene.log_focal is None:
@@ -269,13 +262,30 @@ def _posed(state: State) -> Bool[Tensor, " t"]:
     return state.memory.get("posed", torch.ones(len(state.params.R), dtype=torch.bool))
 
 
-def _all_tracks(inputs: Inputs, state: State) -> Tracks:
-    """Feature tracks and loop closures; for an object that is hidden in part the tracks that matches have joined."""
-    tracks = _steady_tracks(inputs, state)
-    if not len(state.memory.get("loop_point", ())):
+def _renumbered(tracks: Tracks, posed: Bool[Tensor, " t"]) -> Tracks:
+    """The tracks in frames with a pose, numbered without the other frames."""
+    if bool(posed.all()):
         return tracks
-    stored = Tracks(*(state.memory[f"loop_{name}"] for name in ("frame", "point", "uv")))
-    return stored if inputs.hidden else concatenate(tracks, stored)
+    tracks = tracks.select(posed[tracks.frame])
+    return replace(tracks, frame=(posed.cumsum(0) - 1)[tracks.frame])
+
+
+def _chained(inputs: Inputs, state: State) -> Tracks:
+    """Feature tracks; for an object that is hidden in part those that matches have joined."""
+    joined = _stored("joined", state)
+    return joined if len(joined) else _steady_tracks(inputs, state)
+
+
+def _textured(state: State) -> Tracks:
+    """Points located by their texture (`TrackTexture`)."""
+    return _stored("texture", state)
+
+
+def _stored(kind: str, state: State) -> Tracks:
+    """Tracks that an earlier step has put into the memory of the state; none if it has not."""
+    if f"{kind}_frame" not in state.memory:
+        return NO_TRACKS
+    return Tracks(*(state.memory[f"{kind}_{name}"] for name in ("frame", "point", "uv")))
 
 
 def _steady_tracks(inputs: Inputs, state: State) -> Tracks:
@@ -390,17 +400,14 @@ def _comparable_loss(cfg: Config, inputs: Inputs, state: State, poses: Poses, sc
     return torch.as_tensor(adjust_all(cfg, inputs, trial, scale)[1]["loss"])
 
 
-def _close_loops(inputs: Inputs, state: State) -> PhaseResult:
-    """Add loop closures of a body of revolution, whose contours do not determine the rotation about its axis."""
-    if not inputs.mirror_symmetry.is_revolution:
-        return state.params, {}
-    trajectory = _in_unit_sphere(inputs, state.params)
-    matches = symmetry.loop_closures(
-        inputs.capture, trajectory, inputs.matcher, count=MAX_LOOP_PAIRS, gap=LOOP_DISTANCE
-    )
-    for name, x in vars(concatenate(NO_TRACKS, *(two_frame_tracks(match) for match in matches))).items():
-        state.memory[f"loop_{name}"] = x
-    return state.params, {"loops": float(len(matches))}
+def _track_texture(inputs: Inputs, state: State) -> PhaseResult:
+    """Locate points of the visual hull in all frames by their texture, in place of those located before."""
+    frames = torch.nonzero(_posed(state))[:, 0]
+    capture, trajectory = inputs.capture.select(frames.tolist()), _in_unit_sphere(inputs, state.params).select(frames)
+    tracks = symmetry.texture_tracks(capture, trajectory, state.rng)
+    tracks = replace(tracks, frame=frames[tracks.frame])
+    state.memory |= {f"texture_{name}": x for name, x in vars(tracks).items()}
+    return state.params, {"texture": float(tracks.n)}
 
 
 def _relocalize(inputs: Inputs, state: State, scale: float) -> PhaseResult:

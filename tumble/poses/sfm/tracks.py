@@ -76,13 +76,6 @@ NO_TRACKS = Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.
 """No tracks at all."""
 
 
-def two_frame_tracks(match: Match) -> Tracks:
-    """Tracks of two observations, one for every correspondence of a match."""
-    point = torch.arange(len(match))
-    frame = torch.cat([torch.full_like(point, match.i), torch.full_like(point, match.j)])
-    return Tracks(frame, point.repeat(2), torch.cat([match.uv_i, match.uv_j]).double())
-
-
 def concatenate(*parts: Tracks) -> Tracks:
     """Union of tracks of distinct points, numbered in the order of the parts."""
     point, n_points = [], 0

@@ -2,13 +2,13 @@
 
 The silhouettes of a body of revolution (`mirror`) hide its rotation about the axis (`spin`), those of a box or a prism
 hide the turns that leave the visual hull as it is (`turns`). Texture and colours show both, if there is enough of them
-(`texture_information`); matches of frames that see the same side again (`loop_closure`) limit drift about the axis.
+(`texture_information`). Points of the surface that all frames locate by their texture (`texture_tracks`) limit drift.
 """
 
 from tumble.poses.sfm.symmetry import texture_information
-from tumble.poses.sfm.symmetry.loop_closure import loop_closures
 from tumble.poses.sfm.symmetry.mirror import MirrorSymmetry, mirror_symmetry
 from tumble.poses.sfm.symmetry.spin import Spin, estimate_spin, steady_observations
+from tumble.poses.sfm.symmetry.texture_tracks import texture_tracks
 from tumble.poses.sfm.symmetry.turns import Turns, estimate_turns
 
 __all__ = [
@@ -17,8 +17,8 @@ __all__ = [
     "Turns",
     "estimate_spin",
     "estimate_turns",
-    "loop_closures",
     "mirror_symmetry",
     "steady_observations",
     "texture_information",
+    "texture_tracks",
 ]
