@@ -35,6 +35,7 @@ from benchmarks.pose_captures import (
     load,
 )
 from tumble import matching
+from tumble.bench import current_code
 from tumble.engine import drive
 from tumble.evaluation import metrics
 from tumble.inverse_rendering import refine
@@ -58,6 +59,7 @@ SCORES = {
     "lost": "lost frames",
     "claimed_degrees": "estimated error [deg]",
     "verdict": "rating",
+    "code": "code",
 }
 """Column titles of stage 1, by the key of a row."""
 REFINED = {
@@ -68,6 +70,7 @@ REFINED = {
     "refined_rotation_below_10_percent": "< 10 deg [%]",
     "refined_auc_percent": "AUC_ATE [%]",
     "refined_seconds": "time [s]",
+    "code": "code",
 }
 """Column titles of the comparison with stage 2, by the key of a row."""
 
@@ -98,7 +101,8 @@ def main() -> None:
 def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     """A row: matching, stage 1, its scores, and those of stage 2 if `refined`."""
     capture, truth = load(case, root)
-    about = {"name": case.name, "route": route, **asdict(case), "frames": len(capture)}
+    code = (current_code()["commit"] or "")[:8]
+    about = {"name": case.name, "route": route, **asdict(case), "frames": len(capture), "code": code}
     if route == "colmap":
         assert truth is not None, "a capture with true poses"
         return about | colmap_scores(capture, truth)
@@ -192,8 +196,9 @@ def report(rows: Sequence[Row]) -> str:
         '"< 10 deg" are of the rotation errors. AUC_ATE: area under the recall curve of camera position errors up to '
         f"{TOLERANCE:.0%} of the mean camera distance. Lost frames have no consistent pose. Estimated error and rating "
         "are stage 1's own, without ground truth: the expected median rotation error, and good, warn or bad. Time: "
-        "matching and stage 1, on one thread of a 2-core x86_64 CPU shared with other work. All tables except the last "
-        "are of route `graph`, that is `tumble.poses.sfm`.\n",
+        "matching and stage 1, on one thread of a 2-core x86_64 CPU shared with other work. Code: the commit; rows "
+        "without it were measured before surface points were located by their texture (docs/method.md). All tables "
+        "except the last are of route `graph`, that is `tumble.poses.sfm`.\n",
         table(["model", "light", "seed", *SCORES], plain_rows, TEXTURED, OTHERS),
         "## After stage 2\n",
         "Poses of stage 1, and after stage 2 of the draft recipe. Stage 1 estimates all six degrees of freedom, so "
@@ -202,7 +207,8 @@ def report(rows: Sequence[Row]) -> str:
         *(
             [
                 "## Nine other objects\n",
-                "On these nothing was chosen; the corset and the bell pepper were seen when stage 1 was designed.\n",
+                "On these nothing was chosen, but boom box, corset, water bottle and bell pepper, the worst of them, "
+                "were seen when stage 1 was designed.\n",
                 table(["model", "light", "seed", *SCORES], other_rows, NEW),
             ]
             if other_rows
