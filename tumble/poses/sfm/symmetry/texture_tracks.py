@@ -61,6 +61,11 @@ class _Patches:
     values: Float[Tensor, "m s s"]
     """Brightness [code values]."""
 
+    def of_points(self, first: int, end: int) -> "_Patches":
+        """Those of the points from `first` on, before `end`."""
+        mine = (self.point >= first) & (self.point < end)
+        return _Patches(*(values[mine] for values in vars(self).values()))
+
 
 def texture_tracks(capture: Capture, trajectory: Trajectory, rng: torch.Generator) -> Tracks:
     """Observations of surface points by their texture, at least `MIN_OBSERVATIONS` for each.
@@ -77,12 +82,11 @@ def texture_tracks(capture: Capture, trajectory: Trajectory, rng: torch.Generato
         surface = visual_hull.sample_surface(cells, POINTS, rng)
     except ValueError:  # The poses contradict each other.
         return NO_TRACKS
-    images = torch.stack([capture.images.float().mean(-1), (capture.masks == OBJECT).float()], 1)
-    found = []
-    for x, normals in zip(surface.positions.split(POINTS_AT_ONCE), surface.normals.split(POINTS_AT_ONCE), strict=True):
-        patches = _sampled(images, capture.camera, trajectory, cells, x, normals)
-        if len(patches.frame):
-            found.append(_located(patches, capture.camera, trajectory, x, normals))
+    patches, found = _sampled(capture, trajectory, cells, surface), []
+    for first in range(0, len(surface.positions), POINTS_AT_ONCE):
+        some = patches.of_points(first, first + POINTS_AT_ONCE)
+        if len(some.frame):
+            found.append(_located(some, capture.camera, trajectory, surface))
     return concatenate(NO_TRACKS, *found)
 
 
@@ -99,36 +103,31 @@ def _pixel(camera: Camera, trajectory: Trajectory) -> float:
 
 
 def _sampled(
-    images: Float[Tensor, "t 2 h w"],
-    camera: Camera,
-    trajectory: Trajectory,
-    cells: Float[Tensor, "x y z"],
-    x: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
+    capture: Capture, trajectory: Trajectory, cells: Float[Tensor, "x y z"], surface: visual_hull.OrientedPoints
 ) -> _Patches:
     """Patches of points in all frames that show them, wholly on the object.
 
     Args:
-        images: Brightness and whether a pixel shows the object.
         cells: Occupancy of the visual hull.
-        x: Surface points.
-        normals: Outward unit normals.
+        surface: Points on its surface.
     """
+    x, normals, camera = surface.positions, surface.normals, capture.camera
     ticks = torch.arange(-HALF - REACH, HALF + REACH + 1) * _pixel(camera, trajectory)
     axes = _plane(normals)
     spread = x[:, None, None] + ticks[:, None, None] * axes[:, None, None, 0] + ticks[:, None] * axes[:, None, None, 1]
-    cosine = visual_hull.view_cosine(trajectory.camera_positions[:, None], x, normals)
     size = torch.tensor([camera.width, camera.height])
     parts = []
-    for frame in range(len(trajectory)):
-        point = torch.nonzero(cosine[frame] > MIN_COSINE)[:, 0]
-        point = point[~_occluded(cells, x[point], normals[point], trajectory.camera_positions[frame])]
+    for frame, centre in enumerate(trajectory.camera_positions):
+        cosine = visual_hull.view_cosine(centre, x, normals)
+        point = torch.nonzero(cosine > MIN_COSINE)[:, 0]
+        point = point[~_occluded(cells, x[point], normals[point], centre)]
         uv = camera.project(trajectory.T_cam_obj[frame] @ spread[point].reshape(-1, 3))
         at = (2 * uv / size - 1).reshape(1, -1, len(ticks), 2)
-        grey, covered = grid_sample(images[frame, None], at, align_corners=False)[0].reshape(2, -1, *spread.shape[1:3])
+        image = torch.stack([capture.images[frame].float().mean(-1), (capture.masks[frame] == OBJECT).float()])
+        grey, covered = grid_sample(image[None], at, align_corners=False)[0].reshape(2, -1, *spread.shape[1:3])
         whole = (covered > 1 - 1e-3).flatten(1).all(1)
         point = point[whole]
-        parts.append(_Patches(torch.full_like(point, frame), point, cosine[frame, point], grey[whole]))
+        parts.append(_Patches(torch.full_like(point, frame), point, cosine[point], grey[whole]))
     return _Patches(*(torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
@@ -142,14 +141,12 @@ def _occluded(
     return (occupancy[0, 0, 0] > 0.5).any(-1)
 
 
-def _located(
-    patches: _Patches, camera: Camera, trajectory: Trajectory, x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> Tracks:
+def _located(patches: _Patches, camera: Camera, trajectory: Trajectory, surface: visual_hull.OrientedPoints) -> Tracks:
     """Observations of the points whose patches are found in several frames."""
-    shift, sure = _shifts(patches, len(x))
+    shift, sure = _shifts(patches)
     frame, point = patches.frame[sure], patches.point[sure]
     shift = shift[sure] * _pixel(camera, trajectory)
-    shifted = x[point] + (shift[:, :, None] * _plane(normals)[point]).sum(1)
+    shifted = surface.positions[point] + (shift[:, :, None] * _plane(surface.normals[point])).sum(1)
     uv = torch.zeros(len(frame), 2)
     for k in frame.unique().tolist():
         uv[frame == k] = camera.project(trajectory.T_cam_obj[k] @ shifted[frame == k])
@@ -157,12 +154,9 @@ def _located(
     return Tracks(frame, point, uv.double()).select(every, MIN_OBSERVATIONS)
 
 
-def _shifts(patches: _Patches, n: int) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, " m"]]:
-    """By how much every patch is shifted against the mean patch of its point [pixels], and whether that is sure.
-
-    Args:
-        n: Number of points.
-    """
+def _shifts(patches: _Patches) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, " m"]]:
+    """By how much every patch is shifted against the mean patch of its point [pixels], and whether that is sure."""
+    points, point = patches.point.unique(return_inverse=True)
     width, shifts = 2 * HALF + 1, 2 * REACH + 1
     window, smooth = _window(width)
     candidates = patches.values.unfold(1, width, 1).unfold(2, width, 1).reshape(-1, shifts * shifts, width * width)
@@ -179,9 +173,9 @@ def _shifts(patches: _Patches, n: int) -> tuple[Float[Tensor, "m 2"], Bool[Tenso
     correlation = torch.zeros_like(contrast)
     for _ in range(SEARCHES):
         chosen = candidates[every, best] * weight[:, None]
-        total = torch.zeros(n, width * width).index_add_(0, patches.point, chosen)
+        total = torch.zeros(len(points), width * width).index_add_(0, point, chosen)
         # Of the other frames, as every patch agrees with itself.
-        mean, _ = normalised(total[patches.point] - chosen)
+        mean, _ = normalised(total[point] - chosen)
         correlation = torch.einsum("msp,mp->ms", candidates, mean * window)
         best = correlation.argmax(1)
         weight = own_weight * correlation.amax(1).clamp_min(0).square()
