@@ -62,9 +62,10 @@ class BaseConfig:
     max_corrections: int = 4
     """Maximum number of rounds of corrections at the end (`CheckSettled`)."""
     texture_rounds: int = 3
-    """Number of times that points are located by their texture at the end, with the poses found before."""
+    """Number of times that points are located by their texture in the last steps, which are left out if the poses have
+    settled: every round of corrections has located them already."""
     texture_scales: tuple[float, ...] = (1.0, 0.7, 0.5, 0.5)
-    """Scale of the Cauchy loss in each round of adjusting the whole capture after that [pixels]."""
+    """Scale of the Cauchy loss in each round of adjusting the whole capture in the last steps [pixels]."""
     texture_weight: float = 4.0
     """Weight of an observation of a point by its texture, relative to one of a chained match.
 
@@ -138,7 +139,7 @@ class CheckSettled:
     """Start a round of corrections: by colours, texture tracks and relocalization, then all frames are adjusted.
 
     If the last round has raised the loss, it is undone. In that case, and if no rotation has changed by `SETTLED_ANGLE`
-    since the last check, this and all further rounds are skipped.
+    since the last check, this and all further steps are skipped.
     """
 
     scale: float
@@ -232,5 +233,8 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
 
 
 def _texture_rounds(cfg: BaseConfig) -> list[Step]:
-    """The last steps: points are located by their texture and all frames adjusted, in turn."""
+    """The last steps: points are located by their texture and all frames adjusted, in turn.
+
+    They are for an object that is hidden in part, which has no rounds of corrections, and for poses that do not settle.
+    """
     return [*map(Step, (TrackTexture(), *map(AdjustAll, cfg.texture_scales)))] * cfg.texture_rounds

@@ -28,6 +28,8 @@ POINTS_AT_ONCE = 128
 """Number of points that are searched for at once, which limits memory."""
 HALF = 3
 """Half the width of a patch without its middle [pixels at the object's mean distance]."""
+WINDOW_SIGMA = 0.6
+"""Standard deviation of the Gaussian that weights the pixels of a patch [`HALF`]."""
 REACH = 3
 """Largest shift of a patch that is searched for [pixels]."""
 MIN_COSINE = 0.25
@@ -185,7 +187,7 @@ def _shifts(patches: _Patches) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, " m"]
 def _window(width: int) -> tuple[Float[Tensor, " p"], Float[Tensor, "p p"]]:
     """Weights of a patch's pixels, of sum 1, and the projection of its values onto their mean and slope."""
     at = torch.arange(width) - width // 2
-    weight = torch.exp(-0.5 * (at[:, None] ** 2 + at**2) / (0.6 * HALF) ** 2).flatten()
+    weight = torch.exp(-0.5 * (at[:, None] ** 2 + at**2) / (WINDOW_SIGMA * HALF) ** 2).flatten()
     weight = weight / weight.sum()
     row, column = torch.meshgrid(at.float(), at.float(), indexing="ij")
     basis = torch.stack([torch.ones_like(row), row, column], -1).reshape(-1, 3)
