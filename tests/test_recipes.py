@@ -212,3 +212,12 @@ def test_the_ladder_leads_from_the_paper_to_the_recipe(name: str) -> None:
 def test_a_recipe_cannot_grow(factor: float) -> None:
     with pytest.raises(ValueError, match=r"by a factor in \(0, 1\]"):
         recipes.scaled(recipes.PAPER, factor)
+
+
+def test_a_departure_is_taken_back() -> None:
+    back = recipes.TAKEN_BACK["without-mask-3"](recipes.DRAFT)
+    assert back.decompose is not None
+    assert recipes.DRAFT.decompose is not None
+    assert back.decompose.weights.mask == 0.0
+    with_mask = replace(back.decompose.weights, mask=recipes.DRAFT.decompose.weights.mask)
+    assert replace(back, decompose=replace(back.decompose, weights=with_mask)) == recipes.DRAFT

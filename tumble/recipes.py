@@ -491,11 +491,16 @@ def departed(count: int, recipe: Recipe) -> Recipe:
 
     PAPER is scaled so that stage 2 has as many steps as the recipe's. With all departures it is the recipe.
     """
-    paper = scaled(PAPER, min(1.0, recipe.refine.steps / PAPER.refine.steps))
+    paper = _paper_like(recipe)
     for names in list(DEPARTURES.values())[:count]:
         for name in names:
             paper = _with_setting(paper, name, attrgetter(name)(recipe))
     return paper
+
+
+def _paper_like(recipe: Recipe) -> Recipe:
+    """PAPER with as many steps of stage 2 as the recipe."""
+    return scaled(PAPER, min(1.0, recipe.refine.steps / PAPER.refine.steps))
 
 
 def _with_setting(settings: Any, name: str, value: Any) -> Any:
@@ -504,10 +509,29 @@ def _with_setting(settings: Any, name: str, value: Any) -> Any:
     return replace(settings, **{first: _with_setting(getattr(settings, first), rest, value) if rest else value})
 
 
+def taken_back(departure: str, recipe: Recipe) -> Recipe:
+    """The recipe with the settings of one of `DEPARTURES` taken from PAPER, scaled as by `departed`."""
+    paper = _paper_like(recipe)
+    for name in DEPARTURES[departure]:
+        recipe = _with_setting(recipe, name, attrgetter(name)(paper))
+    return recipe
+
+
 LADDER: dict[str, Callable[[Recipe], Recipe]] = {
     f"ladder-{i:02d}-{name}": partial(departed, i + 1) for i, name in enumerate(DEPARTURES)
 }
 """The rungs from the paper to our method, by name: each has the departure that it is named after, and all before."""
-METHODS: dict[str, Callable[[Recipe], Recipe]] = {"tumble": unchanged, **BASELINES, **ABLATIONS, **LADDER}
+TAKEN_BACK: dict[str, Callable[[Recipe], Recipe]] = {
+    f"without-{name}": partial(taken_back, name) for name in DEPARTURES if name not in ("paper", "poses")
+}
+"""Our method without one of its departures from the paper, by name; not that of the poses, which has no effect where
+poses are given and whose parts exclude one another."""
+METHODS: dict[str, Callable[[Recipe], Recipe]] = {
+    "tumble": unchanged,
+    **BASELINES,
+    **ABLATIONS,
+    **LADDER,
+    **TAKEN_BACK,
+}
 """What a row of a benchmark suite can run, by the value of `--method`: the method, baselines, ablations, rungs of the
-ladder. The floor is "average", the mean colour over the frames as albedo."""
+ladder, departures taken back. The floor is "average", the mean colour over the frames as albedo."""
