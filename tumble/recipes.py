@@ -88,6 +88,7 @@ PAPER = Recipe(
         sets=1,
         pixels=512,
         roughness=0.54,
+        start="grey",
         initial_albedo=0.415,
         smooth_light="radiance",
         bounce="average",
@@ -453,7 +454,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "squared-mask": ("refine.mask_loss", "refine.weights.mask"),
     "normals": ("refine.weights.normal", "refine.crease", "refine.ramp"),
     "projection": ("refine.weights.proj",),
-    "light": ("refine.colour", "refine.shadow_start", "decompose.roughness", "decompose.initial_albedo"),
+    "light": ("refine.colour", "refine.shadow_start", "decompose.roughness", "decompose.start", "decompose.initial_albedo"),
     "specular-scale": (
         *("refine.weights.specular", "refine.rates.specular_scale"),
         *("decompose.weights.specular", "decompose.rates.specular_scale"),

@@ -152,9 +152,11 @@ class Config:
     try_matte: bool = False
     """Whether the first steps are made with and without a specular lobe, of which the better ones count
     (`choose_start`)."""
+    start: Literal["stage 2", "grey"] = "stage 2"
+    """stage 2: its albedo and light. grey: the same albedo everywhere, under its light."""
     initial_albedo: float = 0.8
-    """95 % quantile of the initial albedo. The factor goes into the light, since stage 2 determines only the product of
-    albedo and light."""
+    """95 % quantile of the initial albedo, or, from grey, the albedo. The factor goes into the light, since stage 2
+    determines only the product of albedo and light."""
     visibility: bool = True
     """Whether the object casts shadows on itself."""
     shadows: Literal["cached", "traced"] = "cached"
@@ -218,9 +220,10 @@ def length(cfg: Config, inputs: Inputs) -> int:
 def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     """The first state: material and light of stage 2, with traced visibility, and what `choose_start` makes of it."""
     refined = inputs.refined
+    albedo = refined.albedo if cfg.start == "stage 2" else refined.albedo.mean().expand_as(refined.albedo)
     # One factor for all channels, since a channel of a saturated object is rightly dark.
-    factor = cfg.initial_albedo / refined.albedo.amax(-1).quantile(0.95)
-    albedo = (refined.albedo * factor).clamp(*ALBEDO_RANGE)
+    factor = cfg.initial_albedo / albedo.amax(-1).quantile(0.95)
+    albedo = (albedo * factor).clamp(*ALBEDO_RANGE)
     light = sh_lighting.environment(refined.light, cfg.rows)
     material = Material.constant(len(albedo), torch.full_like(albedo[0], 0.5), cfg.roughness)
     scale = refined.light.log_specular_scale + factor.log()
