@@ -4,8 +4,9 @@
 `pose_captures` in FOLDER (a minute each, unless they exist), runs matching and stage 1 on each as
 `tumble run --poses estimate` does, scores rotations and positions, and writes `benchmarks/poses.json` and the table
 `benchmarks/poses.md`. Existing rows are kept. `--refined` also runs stage 2 on the twenty plain captures, and measures
-again the rows without it. Route "graph" is `tumble.poses.sfm`, route "progressive" the paper's; "colmap" is the program
-of that name (`pip install pycolmap`), on the same masked frames.
+again the rows without it; with route "progressive" it runs stage 2 both after the last frame was tracked and after the
+closing rounds, in which all frames and the neural shape are refined. Route "graph" is `tumble.poses.sfm`, route
+"progressive" the paper's; "colmap" is the program of that name (`pip install pycolmap`), on the same masked frames.
 """
 
 import argparse
@@ -14,10 +15,12 @@ import math
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from benchmarks import colmap
 from benchmarks.kernels import machine
@@ -73,6 +76,14 @@ REFINED = {
     "code": "code",
 }
 """Column titles of the comparison with stage 2, by the key of a row."""
+REFINEMENTS = {
+    "rotation_median_degrees": "median [deg]",
+    "rotation_below_10_percent": "< 10 deg [%]",
+    "auc_percent": "AUC_ATE [%]",
+    "rpe_rotation_degrees": "RPE rotation [deg]",
+    "rpe_translation_percent": "RPE translation [%]",
+}
+"""Column titles of the comparison of refinements, by the key of a row without its prefix."""
 
 
 def main() -> None:
@@ -111,18 +122,25 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     views = matching.views_of(sfm.shown(capture) if hidden else capture)
     matches = matching.match_pairs(views, neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()
+    inputs = sfm.gather(capture, matches, hidden=hidden)
     if route == "graph":
-        tracked = drive(sfm, DRAFT.track, sfm.gather(capture, matches, hidden=hidden), seed=0)
+        tracked, unclosed = drive(sfm, DRAFT.track, inputs, seed=0), None
     else:
-        recipe = progressive_poses(DRAFT)
-        assess = partial(sfm.assess, sfm.gather(capture, matches, hidden=hidden))
-        tracked = drive(progressive, recipe.track, progressive.gather(capture, matches, assess), seed=0)
+        tracked, unclosed = progressive_results(progressive.gather(capture, matches, partial(sfm.assess, inputs)))
     seconds = time.perf_counter() - started
     quality = tracked.quality
+    scores = {}
+    if truth is not None:
+        scores = stage_1_scores(tracked, truth)
+        if unclosed is not None:
+            scores |= named("tracked", stage_1_scores(unclosed, truth))
+        if refined:
+            scores |= named("refined", stage_2_scores(tracked, capture, truth))
+            if unclosed is not None:
+                scores |= named("tracked_refined", stage_2_scores(unclosed, capture, truth))
     return {
         **about,
-        **(stage_1_scores(tracked, truth) if truth is not None else {}),
-        **(stage_2_scores(tracked, capture, truth) if refined and truth is not None else {}),
+        **scores,
         "seconds": round(seconds, 1),
         "matching_seconds": round(matched - started, 1),
         "lost": int(quality.lost.sum()),
@@ -130,6 +148,26 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
         "verdict": quality.rating,
         "sentence": quality.sentence,
     }
+
+
+def progressive_results(inputs: progressive.Inputs) -> tuple[PoseResult, PoseResult]:
+    """Poses of the progressive route after its closing rounds, and before them."""
+    cfg = progressive_poses(DRAFT).track
+    state = progressive.init(cfg, inputs, torch.Generator().manual_seed(0))
+    tracked_steps = progressive.length(replace(cfg, closing=0), inputs)
+    unclosed = None
+    while state.step < progressive.length(cfg, inputs):
+        if state.step == tracked_steps:
+            unclosed = progressive.finish(cfg, inputs, state)
+        progressive.step(cfg, inputs, state)
+        state.step += 1
+    assert unclosed is not None, "a recipe with closing rounds"
+    return progressive.finish(cfg, inputs, state), unclosed
+
+
+def named(prefix: str, scores: dict[str, float]) -> dict[str, float]:
+    """Scores with a prefix to their names."""
+    return {f"{prefix}_{name}": value for name, value in scores.items()}
 
 
 def colmap_scores(capture: Capture, truth: Trajectory) -> Row:
@@ -142,7 +180,7 @@ def colmap_scores(capture: Capture, truth: Trajectory) -> Row:
     estimate, frames = found
     true = truth.select(frames)
     try:
-        scores = pose_scores(estimate, true)
+        scores = pose_scores(estimate, true, frames)
     except ValueError:  # The positions of a few frames lie nearly on a line, by which nothing can be aligned.
         scores = metrics.rotation_scores(estimate, true)
     scores = {name: round(value, 3) for name, value in scores.items()}
@@ -166,15 +204,25 @@ def stage_2_scores(tracked: PoseResult, capture: Capture, truth: Trajectory) -> 
     kept = (~tracked.quality.lost).nonzero()[:, 0]
     inputs = refine.Inputs(capture.select(kept.tolist()), tracked.trajectory.select(kept))
     estimate = drive(refine, DRAFT.refine, inputs, seed=0).trajectory
-    values = pose_scores(estimate, truth.select(kept)) | {"seconds": time.perf_counter() - started}
-    return {f"refined_{name}": round(value, 3) for name, value in values.items()}
+    values = pose_scores(estimate, truth.select(kept), kept.tolist()) | {"seconds": time.perf_counter() - started}
+    return {name: round(value, 3) for name, value in values.items()}
 
 
-def pose_scores(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
-    """Rotation scores after alignment by a rotation, and position scores after alignment by a similarity."""
-    aligned = metrics.align(estimate, truth).to_truth(estimate)
-    tolerance = TOLERANCE * float(truth.camera_positions.norm(dim=-1).mean())
-    return metrics.rotation_scores(estimate, truth) | metrics.position_scores(aligned, truth, tolerance=tolerance)
+def pose_scores(estimate: Trajectory, truth: Trajectory, frames: Sequence[int] | None = None) -> dict[str, float]:
+    """Rotation scores after alignment by a rotation, position scores after alignment by a similarity, and the error of
+    the motion between consecutive frames; its translation is a percentage of the mean distance.
+
+    Args:
+        frames: Index of each pose's frame in the capture; by default 0, 1, ...
+    """
+    similarity, distance = metrics.align(estimate, truth), float(truth.camera_positions.norm(dim=-1).mean())
+    scores = metrics.rotation_scores(estimate, truth)
+    scores |= metrics.position_scores(similarity.to_truth(estimate), truth, tolerance=TOLERANCE * distance)
+    relative = metrics.relative_scores(estimate, truth, frames or range(len(truth)), scale=float(similarity.scale))
+    translation, rotation = relative["rpe_translation"], relative["rpe_rotation_degrees"]
+    assert translation is not None, "consecutive frames"
+    assert rotation is not None, "consecutive frames"
+    return scores | {"rpe_translation_percent": 100 * translation / distance, "rpe_rotation_degrees": rotation}
 
 
 # The table ------------------------------------------------------------------------------------------------------------
@@ -237,7 +285,38 @@ def report(rows: Sequence[Row]) -> str:
             "largest reconstruction only, and the others are lost.\n",
             table(["name", "route", *SCORES], both),
         ]
+    refinements = [row for row in rows if row["route"] == "progressive" and "tracked_refined_seconds" in row]
+    if refinements:
+        parts += [
+            "## Refinement of the progressive route's poses\n",
+            "The paper's Table 4 in kind, on the same captures: poses after the last frame was tracked; after rounds "
+            "in which all frames and the neural shape are refined (as in FMOV; `QUICK_TRACK.closing`); after stage 2 of "
+            "the draft recipe, which refines poses against Gaussians, in place of these rounds; after both; and route "
+            "`graph` without and with stage 2. RPE: mean error of the motion between consecutive frames, its "
+            "translation in per cent of the mean distance.\n",
+            refinement_table(refinements, [row for row in sfm_rows if "refined_seconds" in row]),
+        ]
     return "\n".join(parts) + "\n"
+
+
+def refinement_table(progressive_rows: Sequence[Row], graph_rows: Sequence[Row]) -> str:
+    """A Markdown table with a line for every capture and way of refinement."""
+    ways = [
+        ("tracked", "tracked_", progressive_rows),
+        ("tracked, neural refinement", "", progressive_rows),
+        ("tracked, Gaussian refinement", "tracked_refined_", progressive_rows),
+        ("tracked, neural and Gaussian refinement", "refined_", progressive_rows),
+        ("graph", "", graph_rows),
+        ("graph, Gaussian refinement", "refined_", graph_rows),
+    ]
+    columns = ["name", "poses", *REFINEMENTS]
+    lines = [line(columns, {"name": "name", "poses": "poses"} | REFINEMENTS), "|" + " --- |" * len(columns)]
+    for name in sorted(row["name"] for row in progressive_rows):
+        for title, prefix, rows in ways:
+            same = [row for row in rows if row["name"] == name]
+            values = {key: same[0].get(prefix + key, "") for key in REFINEMENTS} if same else {}
+            lines.append(line(columns, {"name": name, "poses": title} | values))
+    return "\n".join(lines) + "\n"
 
 
 def table(columns: Sequence[str], rows: Sequence[Row], *classes: tuple[str, ...]) -> str:
