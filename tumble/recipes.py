@@ -454,7 +454,13 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "squared-mask": ("refine.mask_loss", "refine.weights.mask"),
     "normals": ("refine.weights.normal", "refine.crease", "refine.ramp"),
     "projection": ("refine.weights.proj",),
-    "light": ("refine.colour", "refine.shadow_start", "decompose.roughness", "decompose.start", "decompose.initial_albedo"),
+    "light": (
+        "refine.colour",
+        "refine.shadow_start",
+        "decompose.roughness",
+        "decompose.start",
+        "decompose.initial_albedo",
+    ),
     "specular-scale": (
         *("refine.weights.specular", "refine.rates.specular_scale"),
         *("decompose.weights.specular", "decompose.rates.specular_scale"),
@@ -527,12 +533,18 @@ TAKEN_BACK: dict[str, Callable[[Recipe], Recipe]] = {
 }
 """Our method without one of its departures from the paper, by name; not that of the poses, which has no effect where
 poses are given and whose parts exclude one another."""
+SMALL: dict[str, Callable[[Recipe], Recipe]] = {
+    "twentieth": partial(scaled, factor=1 / 20),
+    "twentieth-grids": lambda recipe: replace(scaled(recipe, 1 / 20), track=QUICK_TRACK),
+}
+"""A recipe at a twentieth of its computation, by name; grids: with stage 1 for two CPU cores."""
 METHODS: dict[str, Callable[[Recipe], Recipe]] = {
     "tumble": unchanged,
     **BASELINES,
     **ABLATIONS,
     **LADDER,
     **TAKEN_BACK,
+    **SMALL,
 }
 """What a row of a benchmark suite can run, by the value of `--method`: the method, baselines, ablations, rungs of the
-ladder, departures taken back. The floor is "average", the mean colour over the frames as albedo."""
+ladder, departures taken back, smaller recipes. The floor is "average", the mean colour over the frames as albedo."""
