@@ -2,8 +2,9 @@
 
 `python -m benchmarks.journey FOLDER` renders captures without poses of three objects, 120 frames of 256 x 256 (kept in
 FOLDER), runs `tumble check` and `tumble run` on each `clip.mp4` with a box around the object in its first frame,
-scores the run with `tumble evaluate`, and writes `benchmarks/journey.json` and the table `benchmarks/journey.md`.
-Existing rows are kept. Time and memory are those of the processes. `--smoke` uses tiny captures, to test this program.
+exports a GLB, scores both with `tumble evaluate`, and writes `benchmarks/journey.json` and the table
+`benchmarks/journey.md`. Existing rows are kept. Time and memory are those of the processes. `--smoke` uses tiny
+captures, to test this program.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import numpy as np
 
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import DATA
+from tumble.actions import GLB_SCORES
 from tumble.datasets import folder
 from tumble.engine import run as runs
 from tumble.io import files
@@ -42,12 +44,19 @@ COMMAND = "python -m benchmarks.journey FOLDER"
 COLUMNS = {
     "albedo.psnr_fg_srgb": "albedo fg [dB]",
     "albedo.psnr_full_srgb": "albedo full [dB]",
+    "albedo.psnr_fg_srgb_unscaled": "albedo fg, unscaled [dB]",
     "relit.psnr_fg_srgb": "relit fg [dB]",
     "relit.psnr_full_srgb": "relit full [dB]",
     "normal.mean_fg_degrees": "normal [deg]",
     "silhouette.iou": "IoU",
 }
 """Titles of the score columns, by the score."""
+GLB_COLUMNS = {
+    "albedo.psnr_fg_srgb": "GLB: albedo fg [dB]",
+    "relit.psnr_fg_srgb": "GLB: relit fg [dB]",
+    "normal.mean_fg_degrees": "GLB: normal [deg]",
+}
+"""Titles of the columns of the exported GLB, by the score."""
 Row = dict[str, Any]
 
 
@@ -94,7 +103,7 @@ def hdri(name: str) -> str:
 
 
 def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
-    """A row: results, time and memory of the three commands."""
+    """A row: results, time and memory of the four commands."""
     shutil.rmtree(run, ignore_errors=True)
     clip = [str(capture / "clip.mp4"), "--fov", f"{FOV:g}", "--box", *map(str, box(capture))]
     size = folder.load(capture).images.shape
@@ -113,10 +122,18 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
     if reconstruction["exit"] != 0:
         row["said"] = reconstruction["said"].replace(str(run), "RUN")
     else:
-        evaluation = tumble("evaluate", str(run), str(capture))
-        row |= {"score_exit": evaluation["exit"], "score_seconds": evaluation["seconds"]}
-        scores = files.read_json(run / "report.json") if evaluation["exit"] == 0 else {"regions": {}, "poses": {}}
-        row |= {"kept": len(files.read_json(run / runs.POSES)), **scores["regions"], "poses": scores["poses"]}
+        export = tumble("export", str(run), "--preset", "web")
+        evaluation = tumble("evaluate", str(run), str(capture), "--glb", str(run / "export" / "web" / "asset.glb"))
+        row |= {
+            "export_seconds": export["seconds"],
+            "score_exit": evaluation["exit"],
+            "score_seconds": evaluation["seconds"],
+        }
+        row |= {"kept": len(files.read_json(run / runs.POSES)), "poses": {}}
+        if evaluation["exit"] == 0:
+            scores = files.read_json(run / "report.json")
+            row |= {**scores["regions"], "poses": scores["poses"]}
+            row["glb"] = files.read_json(run / GLB_SCORES / "report.json")["regions"]["shared"]
     return row
 
 
@@ -150,6 +167,7 @@ def report(rows: list[Row]) -> str:
         "object",
         "check",
         *COLUMNS.values(),
+        *GLB_COLUMNS.values(),
         "rotation, median [deg]",
         "position [% of distance]",
         "frames",
@@ -164,7 +182,9 @@ def report(rows: list[Row]) -> str:
         "rendered from the meshes and light maps in `../shared/data` unless FOLDER has them. The focal length is given "
         "(`--fov`). One thread per run, on a 2-core x86_64 CPU shared with other work. Scores over the evaluation "
         "views of region shared, PSNR of sRGB values ([metrics](../docs/metrics.md)). Position: root mean square error "
-        "divided by the mean camera distance. Frames: number of frames with a pose.",
+        "divided by the mean camera distance. Frames: number of frames with a pose. Unscaled: without the factor per "
+        "channel between albedo and truth. GLB: the file of `tumble export --preset web`, path traced by Mitsuba; its "
+        "normals are those of the mesh.",
         "",
         f"| {' | '.join(titles)} |",
         "|" + "---|" * len(titles),
@@ -173,6 +193,8 @@ def report(rows: list[Row]) -> str:
     complete = [row for row in rows if "shared" in row]
     if complete:
         means = [f"{statistics.fmean(row['shared'][key] for row in complete):.3g}" for key in COLUMNS]
+        exported = [row["glb"] for row in complete if "glb" in row]
+        means += [f"{statistics.fmean(glb[key] for glb in exported):.3g}" if exported else "-" for key in GLB_COLUMNS]
         lines.append(f"| mean of {len(complete)} | | {' | '.join(means)} |" + " |" * (len(titles) - 2 - len(means)))
     errors = [f"- {row['object']}: {row['said']}" for row in rows if "said" in row]
     return "\n".join([*lines, *([""] if errors else []), *errors, ""])
@@ -187,6 +209,7 @@ def cells(row: Row) -> list[str]:
     shared, poses = row.get("shared", {}), row.get("poses", {})
     digits = {"silhouette.iou": ".3f"}
     scores = [text(shared.get(key), digits.get(key, ".1f")) for key in COLUMNS]
+    scores += [text(row.get("glb", {}).get(key)) for key in GLB_COLUMNS]
     # The tolerance of the AUC is a tenth of the camera's distance.
     position = poses["poses.ate"] / poses["poses.tolerance"] if poses.get("poses.ate") is not None else None
     pose_errors = [text(poses.get("poses.rotation_median_degrees"), ".2f"), text(position, ".2f", 10)]
