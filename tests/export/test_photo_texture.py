@@ -61,7 +61,10 @@ def frame(T_cam_obj: SE3, number: int, *, height: float = 0.0, shift: tuple[floa
     inside = (np.abs(np.stack([x, y])) < 0.62).all(0).reshape(SIDE, fine, SIDE, fine).all((1, 3))
     shape = (SIDE, SIDE, 3)
     diffuse, specular = (np.broadcast_to(v, shape).astype(np.float32) for v in (light, HIGHLIGHT))
-    return LitFrame((albedo * diffuse + specular).astype(np.float32), inside, diffuse, specular, T_cam_obj, CAMERA)
+    shown = (np.abs(np.stack([x, y])) < 0.7).all(0).reshape(SIDE, fine, SIDE, fine).mean((1, 3)) > 0.5
+    mask = np.where(shown, OBJECT, BACKGROUND).astype(np.uint8)
+    photo = (albedo * diffuse + specular).astype(np.float32)
+    return LitFrame(photo, inside, diffuse, specular, mask, T_cam_obj, CAMERA)
 
 
 POSES = [pose(tilt, turn) for tilt in (-0.7, 0.05, 0.6) for turn in (-0.6, 0.0, 0.7)]

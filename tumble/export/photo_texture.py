@@ -11,6 +11,7 @@ normals by the distance at which the photographs agree best (`aligned_surface`),
 rendering much better after a smooth warp by optical flow (Zhou and Koltun 2014) is warped.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,6 +23,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch.nn.functional import max_pool2d
 
+from tumble.export import silhouettes
 from tumble.export.atlas import UnwrappedMesh
 from tumble.export.bake import Texels, locate_texels, pad
 from tumble.io import in_threads
@@ -103,6 +105,7 @@ def aligned_surface(
     """The mesh moved along its normals by the distance at which the photographs agree best on its texture.
 
     The mean depth of soft Gaussians lies behind the surface that they draw, by a quarter of a pixel of the photographs.
+    Where no offset makes a texture agree best, it is the one at which the silhouettes do.
 
     Args:
         mesh: The surface of the Gaussians.
@@ -119,16 +122,18 @@ def aligned_surface(
     for offset in OFFSETS:
         moved = replace(texels, points=texels.points + offset * pixel * texels.normals)
         losses.append(solve(baked, moved, few, iterations=OFFSET_ITERATIONS)[1])
-    offset = pixel * _lowest(losses)
-    return replace(mesh, vertices=mesh.vertices + offset * mesh.normals)
+    offset = _lowest(losses)
+    if offset is None:  # The texture is too faint to show it.
+        offset = silhouettes.best_offset(mesh, few, [offset * pixel for offset in OFFSETS]) / pixel
+    return replace(mesh, vertices=mesh.vertices + offset * pixel * mesh.normals)
 
 
-def _lowest(losses: Sequence[float]) -> float:
-    """The offset between the first and the last of `OFFSETS` at which a parabola through the losses is lowest."""
+def _lowest(losses: Sequence[float]) -> float | None:
+    """The offset between the first and the last of `OFFSETS` at which a parabola through the losses is lowest, if it is
+    lowest there."""
     a, b, _ = np.polyfit(OFFSETS, losses, 2)
-    if a <= 0:
-        return OFFSETS[int(np.argmin(losses))]
-    return float(np.clip(-b / (2 * a), OFFSETS[0], OFFSETS[-1]))
+    lowest = -b / (2 * a) if a > 0 else math.inf
+    return lowest if OFFSETS[0] < lowest < OFFSETS[-1] else None
 
 
 def solved_side(camera: Camera) -> int:

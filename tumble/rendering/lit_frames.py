@@ -43,6 +43,8 @@ class LitFrame:
     """Radiance of a white surface without highlights."""
     specular: Float[np.ndarray, "h w 3"]
     """Radiance of the highlights."""
+    mask: UInt8[np.ndarray, "h w"]
+    """Mask of the capture."""
     T_cam_obj: SE3
     camera: Camera
 
@@ -81,8 +83,8 @@ def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
     bounce = Bounce(material.albedo.mean(1), transfer([traced], gaussians.normals))
     for i, T_cam_obj in zip(frames, poses, strict=True):
         view = render_gbuffer(asset, T_cam_obj, camera)
-        code_values = capture.images[i].cpu().numpy()
-        usable = usable_pixels(code_values, capture.masks[i].cpu().numpy(), view.alpha.cpu().numpy())
+        code_values, mask = capture.images[i].cpu().numpy(), capture.masks[i].cpu().numpy()
+        usable = usable_pixels(code_values, mask, view.alpha.cpu().numpy())
         pixels = torch.where(torch.from_numpy(usable).to(view.alpha.device).flatten())[0]
         shown = surface(view, T_cam_obj, camera, pixels=pixels)
         gaussian = view.dominant.flatten()[pixels].clamp_min(0).long()
@@ -92,4 +94,4 @@ def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
         photo = linear_from_srgb(capture.images[i].float() / 255).cpu().numpy()
         pose = SE3(T_cam_obj.wxyz.cpu(), T_cam_obj.xyz.cpu())
         lens = Camera(camera.fx_fy_cx_cy.cpu(), camera.height, camera.width)
-        yield LitFrame(photo, usable, diffuse, float(material.f0) * specular, pose, lens)
+        yield LitFrame(photo, usable, diffuse, float(material.f0) * specular, mask, pose, lens)
