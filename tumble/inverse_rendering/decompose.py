@@ -58,7 +58,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 20
+VERSION = 21
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -75,6 +75,8 @@ TRIAL_STEPS = 200
 """Number of first steps that are made with and without a specular lobe; at most a third of the run."""
 MIN_EXPLAINED = 0.07
 """Smallest part of the photometric error without a specular lobe that a lobe must explain, or the object has none."""
+MAX_HALVINGS = 3
+"""Maximum number of times that the contrast of the first albedo is halved."""
 BLOCKERS = f"{CACHE}blocker"
 """Name of the blockers of all sets in the state's memory: gigabytes at 100,000 Gaussians, so that no checkpoint has
 them."""
@@ -150,8 +152,8 @@ class Config:
     roughness: float = 0.5
     """Initial roughness: that of the lobe in stage 2 (`sh_lighting.GLOSSY_FALLOFF`), for which its light is made."""
     try_matte: bool = False
-    """Whether the first steps are made with and without a specular lobe, of which the better ones count
-    (`choose_start`)."""
+    """Whether the first steps are made with and without a specular lobe, and with less contrast of the albedo, of which
+    the best ones count (`choose_start`)."""
     start: Literal["stage 2", "grey"] = "stage 2"
     """stage 2: its albedo and light. grey: the same albedo everywhere, under its light."""
     initial_albedo: float = 0.8
@@ -245,11 +247,13 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 
 def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
-    """The state after the first steps with or without a specular lobe, whichever explains the frames better by then.
+    """The state after the first steps with or without a specular lobe, and with a contrast of the albedo, whichever
+    explains the frames better by then.
 
     Albedos make up for a change of the lobe, so that neither is ahead, and both take the same steps with their own
     light. A lobe that explains less than `MIN_EXPLAINED` of the error compensates for errors of light and shape. One
-    that is brighter than that of a dielectric and than in stage 2 would compensate for them, too.
+    that is brighter than that of a dielectric and than in stage 2 would compensate for them, too. So does the albedo of
+    stage 2 where an object has little texture: its contrast is halved for as long as that explains the frames better.
     """
     params = state.params
     before = params.log_specular_scale.detach().exp()
@@ -257,8 +261,27 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
     glossy = _start(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
     matte = _start(params, before * fitted.albedo_per_scale, NO_LOBE)
-    (with_lobe, error), (without, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
-    return with_lobe if error < (1 - MIN_EXPLAINED) * error_without else without
+    (with_lobe, error), (best, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
+    start = matte
+    if error < (1 - MIN_EXPLAINED) * error_without:
+        start, best = glossy, with_lobe
+    else:
+        error = error_without
+    for _ in range(MAX_HALVINGS):
+        start = _with_half_the_contrast(start)
+        flatter, error_of_flatter = _trial(cfg, inputs, state, start)
+        if error_of_flatter >= error:
+            break
+        best, error = flatter, error_of_flatter
+    return best
+
+
+@torch.no_grad()
+def _with_half_the_contrast(params: Params) -> Params:
+    """The parameters with half the contrast of the albedo about its geometric mean."""
+    log_albedo = params.material.albedo.log()
+    albedo = (0.5 * (log_albedo + log_albedo.mean((0, 1)))).exp().clamp(*ALBEDO_RANGE)
+    return replace(params, material=replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo)))
 
 
 @torch.no_grad()
