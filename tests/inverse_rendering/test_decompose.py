@@ -9,14 +9,18 @@ import torch
 from torch import Tensor
 
 from tests.inverse_rendering.test_refine import textured_sphere
+from tests.learning.scene import CAPTURE
+from tests.learning.true_asset import true_asset
 from tests.surfaces import GAMMA, MAJOR, MINOR, sphere, torus
 from tumble import recipes
+from tumble.datasets import folder
 from tumble.engine import loop
 from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose, refine
+from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.rendering.shading import Surface
 from tumble.scene.environment import Environment
-from tumble.scene.material import DIELECTRIC, Material
+from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
 from tumble.scene.trajectory import Trajectory
 
 
@@ -100,3 +104,24 @@ def test_checkpoints_have_no_blockers_which_are_computed_again_from_the_traced_g
     assert found is not None
     assert torch.equal(found, blocked[0])
     assert (blocked >= 0).any()
+
+
+@pytest.mark.parametrize("exaggerated", [False, True])
+def test_an_exaggerated_contrast_of_the_first_albedo_is_halved(exaggerated: bool) -> None:
+    """The figure of `tests.learning` with its true shape, light and albedo, or twice the albedo's contrast."""
+    asset, capture = true_asset(2500), folder.load(CAPTURE)
+    assert capture.trajectory is not None
+    true = asset.material.albedo.mean(1)
+    mean = true.log().mean(0).exp()
+    light = SHLight.constant(0.4, asset.gamma)
+    refined = refine.Refined(asset.gaussians, asset.gamma, true, light, capture.trajectory)
+    cfg = replace(recipes.DRAFT.decompose, try_matte=False, steps=120, pixels=512, sets=2)
+    inputs = decompose.Inputs(capture, refined)
+    state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    albedo = (true.square() / mean if exaggerated else true).clamp(1e-3, 0.99)
+    logits = (TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)
+    material = replace(state.params.material, albedo_logits=logits)
+    state.params = replace(state.params, material=material, environment=asset.environment)
+    chosen = decompose.choose_start(cfg, inputs, state).params.material.albedo.mean(1).detach()
+    contrast = [float(x.log().std(0).mean()) for x in (true, chosen)]
+    assert contrast[1] == pytest.approx(contrast[0], rel=0.25)
