@@ -17,6 +17,16 @@ from torch.nn.functional import interpolate, max_pool2d
 
 from tumble.engine import CACHE, State, optim
 from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
+from tumble.inverse_rendering.material_params import (
+    ALBEDO_RANGE,
+    NO_LOBE,
+    Params,
+    absorbed,
+    shifted_material,
+    with_half_the_contrast,
+    with_lobe,
+    without_corners,
+)
 from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_at, sample_pixels
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
@@ -63,14 +73,10 @@ DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
 """Specular scale at which the penalty on the specular lobe reaches 63 % of its maximum."""
-ALBEDO_RANGE = (0.003, 0.98)
-"""Range of the initial albedo. The lower limit is that of saturated colours: logits would need long to reach it."""
 FIT_FRAMES = 64
 """Maximum number of frames by which albedos are fitted before the first step (`specular_fit`)."""
 FIT_PIXELS = 2
 """Pixels per frame in this fit, as a multiple of the pixels of a step."""
-NO_LOBE = -200.0
-"""Logarithmic specular scale of an object without a specular lobe: its exponential is 0, as are all gradients."""
 TRIAL_STEPS = 200
 """Number of first steps that are made with and without a specular lobe; at most a third of the run."""
 MIN_EXPLAINED = 0.07
@@ -184,28 +190,6 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Params:
-    """Parameters of stage 3."""
-
-    gaussians: Gaussians
-    gamma: Float[Tensor, ""]
-    """Sharpness of the opacity [1 / object radius]."""
-    material: Material
-    environment: Environment
-    poses: Float[Tensor, "t 6"]
-    """Tangents of the pose corrections: `T_cam_obj = exp(poses) @ base`."""
-    log_specular_scale: Float[Tensor, "3"]
-    """Natural logarithm of the specular lobe's scale per channel. The diffuse lobe determines only the product of
-    albedo and light; the specular lobe depends on the light alone and so resolves the ambiguity. As one parameter per
-    channel it converges faster than the texels of the light would."""
-    roughness_shift: Float[Tensor, ""]
-    """Added to all roughness logits: the roughness of the object. Every pixel contributes to its gradient, so it moves
-    at once, while the logits of a corner, which few pixels show, hardly leave their start."""
-    pose_network: dict[str, Tensor] = field(default_factory=dict)
-    """Network that predicts the tangents of the poses (`pose_network`); empty if there is none."""
-
-
-@dataclass(frozen=True)
 class Inputs:
     """Inputs of stage 3: a capture and the result of stage 2."""
 
@@ -259,37 +243,19 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     before = params.log_specular_scale.detach().exp()
     fitted = specular_fit.fit(_samples(cfg, inputs, state), len(params.gaussians.means))
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
-    glossy = _start(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
-    matte = _start(params, before * fitted.albedo_per_scale, NO_LOBE)
-    (with_lobe, error), (best, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
-    start = matte
-    if error < (1 - MIN_EXPLAINED) * error_without:
-        start, best = glossy, with_lobe
-    else:
-        error = error_without
+    glossy = with_lobe(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
+    matte = with_lobe(params, before * fitted.albedo_per_scale, NO_LOBE)
+    (best, error), (without, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
+    start = glossy
+    if error >= (1 - MIN_EXPLAINED) * error_without:
+        best, error, start = without, error_without, matte
     for _ in range(MAX_HALVINGS):
-        start = _with_half_the_contrast(start)
+        start = with_half_the_contrast(start)
         flatter, error_of_flatter = _trial(cfg, inputs, state, start)
         if error_of_flatter >= error:
             break
         best, error = flatter, error_of_flatter
     return best
-
-
-@torch.no_grad()
-def _with_half_the_contrast(params: Params) -> Params:
-    """The parameters with half the contrast of the albedo about its geometric mean."""
-    log_albedo = params.material.albedo.log()
-    albedo = (0.5 * (log_albedo + log_albedo.mean((0, 1)))).exp().clamp(*ALBEDO_RANGE)
-    return replace(params, material=replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo)))
-
-
-@torch.no_grad()
-def _start(params: Params, brighter: Float[Tensor, "n 3"], log_scale: float) -> Params:
-    """The parameters with brighter albedos and another scale of the specular lobe."""
-    albedo = (params.material.albedo + brighter[:, None]).clamp(*ALBEDO_RANGE)
-    material = replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo))
-    return replace(params, material=material, log_specular_scale=torch.full_like(params.log_specular_scale, log_scale))
 
 
 def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[State, float]:
@@ -416,23 +382,6 @@ def pose(params: Params, inputs: Inputs, frame: Index) -> SE3:
     if not params.poses.requires_grad and not params.pose_network:
         return base
     return _correction(params, inputs, frame) @ base
-
-
-def without_corners(params: Params) -> Params:
-    """The parameters with one material per Gaussian: the mean of its corners."""
-
-    def mean(x: Tensor) -> Tensor:
-        return x.mean(1, keepdim=True).expand_as(x)
-
-    m = params.material
-    material = Material(mean(m.albedo_logits), mean(m.roughness_logits), mean(m.normal_offset), m.f0_logit)
-    return replace(params, material=material)
-
-
-def shifted_material(params: Params) -> Material:
-    """The material with the common shift of its roughness, which an object without a specular lobe does not have."""
-    material, has_lobe = params.material, (params.log_specular_scale.detach() > NO_LOBE).any()
-    return replace(material, roughness_logits=material.roughness_logits + has_lobe * params.roughness_shift)
 
 
 @threads_for_kernels()
@@ -594,17 +543,6 @@ def _upsample_light(cfg: Config, state: State) -> None:
         moments=doubled,
     )
     state.params = replace(state.params, environment=environment)
-
-
-def absorbed(params: Params) -> Params:
-    """Equivalent parameters without shift of the roughness and with a specular scale of 1.
-
-    See `specular_fit.absorb_specular_scale`.
-    """
-    material, log_gain = specular_fit.absorb_specular_scale(shifted_material(params), params.log_specular_scale)
-    environment = Environment(params.environment.log_radiance + log_gain)
-    none = {"log_specular_scale": torch.zeros_like(log_gain), "roughness_shift": torch.zeros_like(params.gamma)}
-    return replace(params, material=material, environment=environment, **none)
 
 
 @torch.no_grad()

@@ -1,0 +1,81 @@
+"""The parameters of stage 3, and equal or simpler ones."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tumble.inverse_rendering import specular_fit
+from tumble.scene import TEMPERATURE, Environment, Gaussians, Material
+
+ALBEDO_RANGE = (0.003, 0.98)
+"""Range of the initial albedo. The lower limit is that of saturated colours: logits would need long to reach it."""
+NO_LOBE = -200.0
+"""Logarithmic specular scale of an object without a specular lobe: its exponential is 0, as are all gradients."""
+
+
+@dataclass(frozen=True)
+class Params:
+    """Parameters of stage 3."""
+
+    gaussians: Gaussians
+    gamma: Float[Tensor, ""]
+    """Sharpness of the opacity [1 / object radius]."""
+    material: Material
+    environment: Environment
+    poses: Float[Tensor, "t 6"]
+    """Tangents of the pose corrections: `T_cam_obj = exp(poses) @ base`."""
+    log_specular_scale: Float[Tensor, "3"]
+    """Natural logarithm of the specular lobe's scale per channel. The diffuse lobe determines only the product of
+    albedo and light; the specular lobe depends on the light alone and so resolves the ambiguity. As one parameter per
+    channel it converges faster than the texels of the light would."""
+    roughness_shift: Float[Tensor, ""]
+    """Added to all roughness logits: the roughness of the object. Every pixel contributes to its gradient, so it moves
+    at once, while the logits of a corner, which few pixels show, hardly leave their start."""
+    pose_network: dict[str, Tensor] = field(default_factory=dict)
+    """Network that predicts the tangents of the poses (`pose_network`); empty if there is none."""
+
+
+@torch.no_grad()
+def with_lobe(params: Params, brighter: Float[Tensor, "n 3"], log_scale: float) -> Params:
+    """The parameters with brighter albedos and another scale of the specular lobe."""
+    albedo = (params.material.albedo + brighter[:, None]).clamp(*ALBEDO_RANGE)
+    material = replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo))
+    return replace(params, material=material, log_specular_scale=torch.full_like(params.log_specular_scale, log_scale))
+
+
+@torch.no_grad()
+def with_half_the_contrast(params: Params) -> Params:
+    """The parameters with half the contrast of the albedo about its geometric mean."""
+    log_albedo = params.material.albedo.log()
+    albedo = (0.5 * (log_albedo + log_albedo.mean((0, 1)))).exp().clamp(*ALBEDO_RANGE)
+    return replace(params, material=replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo)))
+
+
+def without_corners(params: Params) -> Params:
+    """The parameters with one material per Gaussian: the mean of its corners."""
+
+    def mean(x: Tensor) -> Tensor:
+        return x.mean(1, keepdim=True).expand_as(x)
+
+    m = params.material
+    material = Material(mean(m.albedo_logits), mean(m.roughness_logits), mean(m.normal_offset), m.f0_logit)
+    return replace(params, material=material)
+
+
+def shifted_material(params: Params) -> Material:
+    """The material with the common shift of its roughness, which an object without a specular lobe does not have."""
+    material, has_lobe = params.material, (params.log_specular_scale.detach() > NO_LOBE).any()
+    return replace(material, roughness_logits=material.roughness_logits + has_lobe * params.roughness_shift)
+
+
+def absorbed(params: Params) -> Params:
+    """Equivalent parameters without shift of the roughness and with a specular scale of 1.
+
+    See `specular_fit.absorb_specular_scale`.
+    """
+    material, log_gain = specular_fit.absorb_specular_scale(shifted_material(params), params.log_specular_scale)
+    environment = Environment(params.environment.log_radiance + log_gain)
+    none = {"log_specular_scale": torch.zeros_like(log_gain), "roughness_shift": torch.zeros_like(params.gamma)}
+    return replace(params, material=material, environment=environment, **none)
