@@ -354,7 +354,7 @@ def scaled(recipe: Recipe, factor: float) -> Recipe:
     Numbers of steps are multiplied by the factor. Rays, pixels, directions, Gaussians and the widths of networks are
     multiplied by its square root, as is the final resolution of the environment map, but none falls below a minimum
     with which a stage still trains. Stage 1 is scaled if it is the progressive one. With unchanged learning rates a
-    tenth of the steps moves Gaussians a tenth as far: PAPER's sphere reaches the object at 1/20, not at 1/50.
+    tenth of the steps moves Gaussians a tenth as far: at 1/20, parts of PAPER's sphere have not reached the object.
 
     Args:
         factor: In (0, 1].
