@@ -495,7 +495,7 @@ def test_a_specular_lobe_must_explain_a_part_of_the_error(
 ) -> None:
     """Without one the albedos are brighter, F0 stays 0, and the roughness does not drift."""
     refined = tree.load(refine.Refined, finished[0] / "2-refine" / "out.safetensors")
-    errors, trial = iter([with_lobe, 1.0]), decompose._trial
+    errors, trial = iter([with_lobe, 1.0, 2.0]), decompose._trial  # the last with half the contrast
     monkeypatch.setattr(decompose, "_trial", lambda *inputs: (trial(*inputs)[0], next(errors)))
     inputs, cfg = decompose.Inputs(folder.load(capture), refined), dataclasses.replace(RECIPE.decompose, steps=5)
     before = decompose.init(dataclasses.replace(cfg, try_matte=False), inputs, torch.Generator().manual_seed(0)).params
