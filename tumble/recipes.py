@@ -6,7 +6,7 @@ The ablations and baselines of the paper are functions from a recipe to a recipe
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
@@ -500,14 +500,20 @@ def departed(count: int, recipe: Recipe) -> Recipe:
     """
     paper = _paper_like(recipe)
     for names in list(DEPARTURES.values())[:count]:
-        for name in names:
-            paper = _with_setting(paper, name, attrgetter(name)(recipe))
+        paper = _with_settings_of(recipe, names, paper)
     return paper
 
 
 def _paper_like(recipe: Recipe) -> Recipe:
     """PAPER with as many steps of stage 2 as the recipe."""
     return scaled(PAPER, min(1.0, recipe.refine.steps / PAPER.refine.steps))
+
+
+def _with_settings_of(other: Recipe, names: Sequence[str], recipe: Recipe) -> Recipe:
+    """The recipe with the values that another one has at some paths of attributes."""
+    for name in names:
+        recipe = _with_setting(recipe, name, attrgetter(name)(other))
+    return recipe
 
 
 def _with_setting(settings: Any, name: str, value: Any) -> Any:
@@ -518,10 +524,7 @@ def _with_setting(settings: Any, name: str, value: Any) -> Any:
 
 def taken_back(departure: str, recipe: Recipe) -> Recipe:
     """The recipe with the settings of one of `DEPARTURES` taken from PAPER, scaled as by `departed`."""
-    paper = _paper_like(recipe)
-    for name in DEPARTURES[departure]:
-        recipe = _with_setting(recipe, name, attrgetter(name)(paper))
-    return recipe
+    return _with_settings_of(_paper_like(recipe), DEPARTURES[departure], recipe)
 
 
 LADDER: dict[str, Callable[[Recipe], Recipe]] = {

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from tumble.maths import fibonacci_sphere, linear_from_srgb, texel_directions, texel_solid_angles
 from tumble.rendering import prefilter, render_gbuffer, shade_split, surface, unoccluded
-from tumble.scene import DIELECTRIC, OBJECT, TEMPERATURE, Asset, Capture, Environment, env_from_obj
+from tumble.scene import DIELECTRIC, OBJECT, Asset, Capture, Environment, env_from_obj
 
 FRAMES = 16
 """Maximum number of frames whose pixels are shaded."""
@@ -203,7 +203,5 @@ def apply(asset: Asset, log_factor: Float[Tensor, "3"]) -> Asset:
     material, environment = asset.material, asset.environment
     albedo = (material.albedo * log_factor.exp()).clamp(1e-5, 0.999)
     f0 = (material.f0 * log_factor.mean().exp()).clamp(max=0.999 * 2 * DIELECTRIC)
-    material = replace(
-        material, albedo_logits=TEMPERATURE * torch.logit(albedo), f0_logit=torch.logit(f0 / (2 * DIELECTRIC))
-    )
+    material = replace(material.with_albedo(albedo), f0_logit=torch.logit(f0 / (2 * DIELECTRIC)))
     return replace(asset, material=material, environment=Environment(environment.log_radiance - log_factor))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tumble.io import tree
 from tumble.rendering import lit_frames, rasterize, surface, threads_for_kernels
-from tumble.scene import TEMPERATURE, Asset, Capture
+from tumble.scene import Asset, Capture
 
 HUBER = 0.01
 """Residual from which its weight falls off: highlights and shadows that the light does not explain [linear]."""
@@ -42,8 +42,8 @@ def solved(asset: Asset, capture: Capture) -> Asset:
     for frame in lit_frames.lit_frames(asset, capture):
         residuals, weights = _projected_back(asset, albedo, frame)
         missing, weight = missing + residuals, weight + weights
-    logits = TEMPERATURE * torch.logit((albedo + missing / weight).clamp(*RANGE))
-    return replace(asset, material=replace(asset.material, albedo_logits=logits))
+    solved = (albedo + missing / weight).clamp(*RANGE)
+    return replace(asset, material=asset.material.with_albedo(solved))
 
 
 def _projected_back(

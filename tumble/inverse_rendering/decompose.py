@@ -58,7 +58,6 @@ from tumble.rendering import (
 from tumble.scene import (
     DIELECTRIC,
     OBJECT,
-    TEMPERATURE,
     Asset,
     Camera,
     Capture,
@@ -216,7 +215,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     params = Params(
         gaussians=refined.gaussians,
         gamma=refined.gamma,
-        material=replace(material, albedo_logits=(TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)),
+        material=material.with_albedo(albedo[:, None].repeat(1, 4, 1)),
         environment=Environment.from_radiance(light.radiance / factor),
         poses=albedo.new_zeros(len(refined.trajectory), 6),
         log_specular_scale=(scale if cfg.rates.specular_scale else torch.zeros_like(scale)).repeat(3),

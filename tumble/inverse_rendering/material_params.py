@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.inverse_rendering import specular_fit
-from tumble.scene import TEMPERATURE, Environment, Gaussians, Material
+from tumble.scene import Environment, Gaussians, Material
 
 ALBEDO_RANGE = (0.003, 0.98)
 """Range of the initial albedo. The lower limit is that of saturated colours: logits would need long to reach it."""
@@ -41,7 +41,7 @@ class Params:
 def with_lobe(params: Params, brighter: Float[Tensor, "n 3"], log_scale: float) -> Params:
     """The parameters with brighter albedos and another scale of the specular lobe."""
     albedo = (params.material.albedo + brighter[:, None]).clamp(*ALBEDO_RANGE)
-    material = replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo))
+    material = params.material.with_albedo(albedo)
     return replace(params, material=material, log_specular_scale=torch.full_like(params.log_specular_scale, log_scale))
 
 
@@ -50,7 +50,7 @@ def with_half_the_contrast(params: Params) -> Params:
     """The parameters with half the contrast of the albedo about its geometric mean."""
     log_albedo = params.material.albedo.log()
     albedo = (0.5 * (log_albedo + log_albedo.mean((0, 1)))).exp().clamp(*ALBEDO_RANGE)
-    return replace(params, material=replace(params.material, albedo_logits=TEMPERATURE * torch.logit(albedo)))
+    return replace(params, material=params.material.with_albedo(albedo))
 
 
 def without_corners(params: Params) -> Params:

@@ -14,7 +14,7 @@ from tumble.engine import State
 from tumble.inverse_rendering.decompose import Inputs
 from tumble.maths import linear_from_srgb
 from tumble.rendering import rasterize
-from tumble.scene import TEMPERATURE, Asset, Environment, Material, target_view
+from tumble.scene import Asset, Environment, Material, target_view
 
 VERSION = 1
 
@@ -70,11 +70,10 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     refined, sums = inputs.refined, state.params
     mean = torch.where(sums.weight > 1e-4, sums.colour / sums.weight.clamp_min(1e-4), 0.5)
     material = Material.constant(len(mean), mean.new_full((3,), 0.5), cfg.roughness)
-    logits = TEMPERATURE * torch.logit(mean.clamp(0.003, 0.98))
     return Asset(
         gaussians=refined.gaussians,
         gamma=refined.gamma,
-        material=Material(logits, material.roughness_logits, material.normal_offset, material.f0_logit),
+        material=material.with_albedo(mean.clamp(0.003, 0.98)),
         environment=Environment.from_radiance(mean.new_ones(16, 32, 3)),
         trajectory=refined.trajectory,
         camera=inputs.capture.camera,

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble.scene import DIELECTRIC, TEMPERATURE, Material
+from tumble.scene import DIELECTRIC, Material
 
 MAX_ALBEDO = 0.9
 """Upper limit of the 95 % quantile of an object's albedo."""
@@ -96,5 +96,4 @@ def absorb_specular_scale(
     gain = gain + (min_gain - gain).max().clamp(min=0)
     f0 = (material.f0 * (log_specular_scale - gain).exp()).mean().clamp(MIN_F0, DIELECTRIC)
     scaled_albedo = (albedo / gain.exp()).clamp(max=0.98)
-    albedo_logits = TEMPERATURE * torch.logit(scaled_albedo)
-    return replace(material, albedo_logits=albedo_logits, f0_logit=torch.logit(f0 / (2 * DIELECTRIC))), gain
+    return replace(material.with_albedo(scaled_albedo), f0_logit=torch.logit(f0 / (2 * DIELECTRIC))), gain

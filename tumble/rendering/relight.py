@@ -18,7 +18,7 @@ from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.shading import Bounce, Surface, shade_split, surface
 from tumble.rendering.trace import Tracer, build_tracer, surface_points, transfer, unoccluded, visibility
-from tumble.scene import TEMPERATURE, Asset, Camera, Environment, Trajectory, opengl_from_opencv
+from tumble.scene import Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
 SURFACE_VIEWS = 64
 """Maximum number of frames that are rendered to find the Gaussians' surface points."""
@@ -171,14 +171,14 @@ def scale_albedo(
 ) -> tuple[Asset, list[Buffers]]:
     """The asset, and its buffers, with their albedo multiplied by a factor per channel, limited to `MAX_ALBEDO`."""
     material = asset.material
-    logits = TEMPERATURE * torch.logit((material.albedo * albedo_scale).clamp(1e-4, MAX_ALBEDO))
+    scaled_material = material.with_albedo((material.albedo * albedo_scale).clamp(1e-4, MAX_ALBEDO))
     scaled = [
         replace(
             view, features=view.features | {"albedo": (view.features["albedo"] * albedo_scale).clamp(max=MAX_ALBEDO)}
         )
         for view in buffers
     ]
-    return replace(asset, material=replace(material, albedo_logits=logits)), scaled
+    return replace(asset, material=scaled_material), scaled
 
 
 def _transfer(asset: Asset, tracer: Tracer) -> Float[Tensor, "n 9"]:

@@ -3,7 +3,7 @@
 Corner order: (-,-), (+,-), (-,+), (+,+) along the first and second local axis of the Gaussian.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -35,6 +35,10 @@ class Material:
         rough = TEMPERATURE * torch.logit(albedo.new_tensor(roughness))
         f0_logit = albedo.new_zeros(())
         return Material(albedo_logits, rough.expand(n, 4).clone(), torch.zeros_like(albedo_logits), f0_logit)
+
+    def with_albedo(self, albedo: Float[Tensor, "n 4 3"]) -> "Material":
+        """The material with another linear base colour in (0, 1)."""
+        return replace(self, albedo_logits=TEMPERATURE * torch.logit(albedo))
 
     @property
     def albedo(self) -> Float[Tensor, "n 4 3"]:
