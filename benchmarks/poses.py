@@ -46,7 +46,7 @@ from tumble.io import files
 from tumble.poses import PoseResult, neighbours
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
-from tumble.recipes import DRAFT, progressive_poses
+from tumble.recipes import DRAFT, Recipe, progressive_poses
 from tumble.scene import Capture, Trajectory
 
 COMMAND = "python -m benchmarks.poses FOLDER [--only WORD..., --route ROUTE, --refined]"
@@ -135,9 +135,10 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
         if unclosed is not None:
             scores |= named("tracked", stage_1_scores(unclosed, truth))
         if refined:
-            scores |= named("refined", stage_2_scores(tracked, capture, truth))
+            recipe = DRAFT if route == "graph" else progressive_poses(DRAFT)
+            scores |= named("refined", stage_2_scores(recipe, tracked, capture, truth))
             if unclosed is not None:
-                scores |= named("tracked_refined", stage_2_scores(unclosed, capture, truth))
+                scores |= named("tracked_refined", stage_2_scores(recipe, unclosed, capture, truth))
     return {
         **about,
         **scores,
@@ -198,12 +199,12 @@ def stage_1_scores(tracked: PoseResult, truth: Trajectory) -> dict[str, float]:
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def stage_2_scores(tracked: PoseResult, capture: Capture, truth: Trajectory) -> dict[str, float]:
-    """Scores of the poses after stage 2 of the draft recipe, for the frames that are not lost."""
+def stage_2_scores(recipe: Recipe, tracked: PoseResult, capture: Capture, truth: Trajectory) -> dict[str, float]:
+    """Scores of the poses after stage 2 of a recipe, for the frames that are not lost."""
     started = time.perf_counter()
     kept = (~tracked.quality.lost).nonzero()[:, 0]
     inputs = refine.Inputs(capture.select(kept.tolist()), tracked.trajectory.select(kept))
-    estimate = drive(refine, DRAFT.refine, inputs, seed=0).trajectory
+    estimate = drive(refine, recipe.refine, inputs, seed=0).trajectory
     values = pose_scores(estimate, truth.select(kept), kept.tolist()) | {"seconds": time.perf_counter() - started}
     return {name: round(value, 3) for name, value in values.items()}
 

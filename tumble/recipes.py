@@ -45,8 +45,12 @@ MASK = 3.0
 """Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
 DIAMETER = 107.0
-"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians were chosen
-[pixels]."""
+"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians and pixels
+were chosen [pixels]."""
+
+REALIGNMENTS = 9
+"""Number of photometric alignments after the progressive stage 1 for CPUs. Gaussians learn errors that neighbouring
+frames share, of which each alignment corrects a small part; poses of the graph stage gain nothing from more than 4."""
 
 OURS = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
 """What our recipes share: the default configuration of every stage, and realigned poses."""
@@ -159,12 +163,13 @@ DRAFT = replace(
         steps=1_000,
         warmup=100,
         directions=256,
+        diameter=DIAMETER,
         doublings=1,
         try_matte=True,
         solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK, specular=0.0),
         rates=inverse_rendering.decompose.Rates(
-            albedo=0.02, roughness=0.05, roughness_shift=0.05, light=0.05, specular_scale=0.1
+            albedo=0.02, roughness=0.05, roughness_shift=0.2, light=0.05, specular_scale=0.1
         ),
     ),
     relight=replace(OURS.relight, brdf_samples=128, light_samples=128),
@@ -343,9 +348,12 @@ def progressive_poses(recipe: Recipe) -> Recipe:
     """Stage 1 as in the paper: a neural SDF that grows frame by frame.
 
     PAPER has it, with the paper's numbers, which take days on a CPU; other recipes get voxel grids and initial poses
-    from matches, which take minutes.
+    from matches, which take minutes, and more photometric alignments in stage 2, since these poses are rougher.
     """
-    return recipe if isinstance(recipe.track, progressive.Config) else replace(recipe, track=QUICK_TRACK)
+    if isinstance(recipe.track, progressive.Config):
+        return recipe
+    refine = replace(recipe.refine, realignments=REALIGNMENTS)
+    return replace(recipe, track=QUICK_TRACK, refine=refine)
 
 
 def scaled(recipe: Recipe, factor: float) -> Recipe:
@@ -470,7 +478,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
         *("decompose.pose_model", "decompose.rates.poses"),
     ),
     "rates-3": (
-        *(f"decompose.{name}" for name in ("steps", "warmup", "doublings", "rows", "pixels")),
+        *(f"decompose.{name}" for name in ("steps", "warmup", "doublings", "rows", "pixels", "diameter")),
         *(f"decompose.rates.{name}" for name in ("albedo", "roughness", "normal", "light", "decay")),
         *(f"decompose.rates.{name}" for name in ("means", "quats", "log_scales", "sdf")),
     ),

@@ -106,6 +106,17 @@ def test_checkpoints_have_no_blockers_which_are_computed_again_from_the_traced_g
     assert (blocked >= 0).any()
 
 
+@pytest.mark.parametrize(("diameter", "factor"), [(0.0, 1.0), (25.0, 2.0), (100.0, 1.0)])
+def test_an_object_that_more_pixels_show_has_more_of_them_in_a_step(diameter: float, factor: float) -> None:
+    asset, capture = true_asset(20), folder.load(CAPTURE)
+    assert capture.trajectory is not None
+    albedo, light = asset.material.albedo.mean(1), SHLight.constant(1, asset.gamma)
+    refined = refine.Refined(asset.gaussians, asset.gamma, albedo, light, capture.trajectory)
+    shown = decompose.Inputs(capture, refined)
+    cfg = decompose.Config(pixels=100, diameter=diameter / 50 * shown.diameter)
+    assert decompose.pixels_per_step(cfg, shown) == 100 * factor
+
+
 @pytest.mark.parametrize("exaggerated", [False, True])
 def test_an_exaggerated_contrast_of_the_first_albedo_is_halved(exaggerated: bool) -> None:
     """The figure of `tests.learning` with its true shape, light and albedo, or twice the albedo's contrast."""

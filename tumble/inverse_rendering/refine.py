@@ -7,7 +7,7 @@ colour is shaded by one spherical-harmonic light (`sh_lighting`), or static per 
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Literal
 
 import torch
@@ -36,7 +36,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 14
+VERSION = 15
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3
@@ -113,7 +113,7 @@ class Config:
     """Cells per side of the visual hull's grid."""
     diameter: float = 0.0
     """Diameter of the object's sphere in the images up to which the numbers of Gaussians hold [pixels]. Where it is
-    larger, both numbers grow in proportion to it, and `hull` to its square root (`for_resolution`). 0: they never
+    larger, both numbers grow by its power of 3/2, and `hull` by that of 3/4 (`for_resolution`). 0: they never
     grow."""
     opacity: float = 0.9
     """Initial opacity."""
@@ -193,6 +193,12 @@ class Inputs:
     capture: Capture
     trajectory: Trajectory
 
+    @cached_property
+    def diameter(self) -> float:
+        """Median diameter of the object's sphere in the images [pixels]."""
+        focal, distances = self.capture.camera.fx_fy_cx_cy[0], self.trajectory.T_cam_obj.xyz.norm(dim=-1)
+        return float(2 * focal / distances.median())
+
 
 def length(cfg: Config, inputs: Inputs) -> int:
     """Number of steps."""
@@ -231,8 +237,7 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 def for_resolution(cfg: Config, inputs: Inputs) -> Config:
     """The settings with as many Gaussians as the images resolve, by the diameter of the object's sphere in them."""
-    focal, distances = inputs.capture.camera.fx_fy_cx_cy[0], inputs.trajectory.T_cam_obj.xyz.norm(dim=-1)
-    factor = max(1.0, float(2 * focal / distances.median()) / cfg.diameter) if cfg.diameter else 1.0
+    factor = max(1.0, inputs.diameter / cfg.diameter) ** 1.5 if cfg.diameter else 1.0
     most = round(cfg.densification.max_gaussians * factor)
     return replace(
         cfg,
