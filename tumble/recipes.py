@@ -169,7 +169,7 @@ DRAFT = replace(
         solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK, specular=0.0),
         rates=inverse_rendering.decompose.Rates(
-            albedo=0.02, roughness=0.05, roughness_shift=0.2, light=0.05, specular_scale=0.1
+            albedo=0.02, roughness=0.05, roughness_shift=0.05, light=0.05, specular_scale=0.1
         ),
     ),
     relight=replace(OURS.relight, brdf_samples=128, light_samples=128),
