@@ -293,7 +293,8 @@ def report(rows: Sequence[Row]) -> str:
             "The paper's Table 4 in kind, on the same captures: poses after the last frame was tracked; after rounds "
             "in which all frames and the neural shape are refined (as in FMOV; `QUICK_TRACK.closing`); after stage 2 "
             "of the draft recipe, which refines poses against Gaussians, in place of these rounds; after both; and "
-            "route `graph` without and with stage 2. RPE: mean error of the motion between consecutive frames, its "
+            "route `graph` without and with stage 2. Nine alignments (`recipes.REALIGNMENTS`) in rows of code 80c668b, "
+            "four in the others and after route `graph`. RPE: mean error of the motion between consecutive frames, its "
             "translation in per cent of the mean distance.\n",
             refinement_table(refinements, [row for row in sfm_rows if "refined_seconds" in row]),
         ]
