@@ -45,8 +45,8 @@ MASK = 3.0
 """Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
 DIAMETER = 107.0
-"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians and pixels
-were chosen [pixels]."""
+"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians were
+chosen [pixels]."""
 
 REALIGNMENTS = 9
 """Number of photometric alignments after the progressive stage 1 for CPUs. Gaussians learn errors that neighbouring
@@ -163,7 +163,7 @@ DRAFT = replace(
         steps=1_000,
         warmup=100,
         directions=256,
-        diameter=DIAMETER,
+        side=128,
         doublings=1,
         try_matte=True,
         solve_albedo=True,
@@ -478,7 +478,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
         *("decompose.pose_model", "decompose.rates.poses"),
     ),
     "rates-3": (
-        *(f"decompose.{name}" for name in ("steps", "warmup", "doublings", "rows", "pixels", "diameter")),
+        *(f"decompose.{name}" for name in ("steps", "warmup", "doublings", "rows", "pixels", "side")),
         *(f"decompose.rates.{name}" for name in ("albedo", "roughness", "normal", "light", "decay")),
         *(f"decompose.rates.{name}" for name in ("means", "quats", "log_scales", "sdf")),
     ),

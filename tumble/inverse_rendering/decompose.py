@@ -8,7 +8,6 @@ several rotated sets of directions that all Gaussians share, or traced from the 
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from tumble.engine import CACHE, State, optim
-from tumble.inverse_rendering import losses, pose_network, refine, sh_lighting, specular_fit
+from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
 from tumble.inverse_rendering.material_params import (
     ALBEDO_RANGE,
     NO_LOBE,
@@ -151,9 +150,9 @@ class Config:
     """Number of rotated sets of directions, used alternately, which reduces banding in the albedo."""
     pixels: int = 1024
     """Pixels shaded per step."""
-    diameter: float = 0.0
-    """Diameter of the object's sphere in the images up to which this number holds [pixels]; where it is larger, the
-    number grows in proportion. 0: it never grows."""
+    side: int = 0
+    """Smaller side of the images up to which this number holds [pixels]; where it is larger, the number grows in
+    proportion. 0: it never grows."""
     rows: int = 16
     """Initial number of rows of the environment map (appendix A)."""
     doublings: int = 6
@@ -199,15 +198,11 @@ class Inputs:
     capture: Capture
     refined: Refined
 
-    @cached_property
-    def diameter(self) -> float:
-        """Median diameter of the object's sphere in the images [pixels]."""
-        return refine.Inputs(self.capture, self.refined.trajectory).diameter
 
-
-def pixels_per_step(cfg: Config, inputs: Inputs) -> int:
-    """Number of pixels shaded per step: more where the object has more of them."""
-    return round(cfg.pixels * max(1.0, inputs.diameter / cfg.diameter)) if cfg.diameter else cfg.pixels
+def pixels_per_step(cfg: Config, capture: Capture) -> int:
+    """Number of pixels shaded per step: more in larger images. Asks no device."""
+    side = min(capture.camera.height, capture.camera.width)
+    return round(cfg.pixels * max(1.0, side / cfg.side)) if cfg.side else cfg.pixels
 
 
 def length(cfg: Config, inputs: Inputs) -> int:
@@ -298,7 +293,7 @@ def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
         view = render_gbuffer(params, T_cam_obj, capture.camera)
         truth = target_view(capture, frame, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
-        pixels = sample_pixels(FIT_PIXELS * pixels_per_step(cfg, inputs), view.alpha, inner > 0.5, state.rng)
+        pixels = sample_pixels(FIT_PIXELS * pixels_per_step(cfg, capture), view.alpha, inner > 0.5, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels[pixels >= 0])
         R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
         gaussian, rough = _dominant_gaussian(view, points), torch.full_like(points.normals[:, :1], cfg.roughness)
@@ -433,7 +428,7 @@ def advance(cfg: Config, inputs: Inputs, state: State, numbers: PixelNumbers) ->
     corners, mean_albedo = corner_features(shifted_material(params if cfg.corners else without_corners(params)))
     view = rasterize_material(params, corners, T_cam_obj, capture.camera)
     photo, mask = (entry(x, frame).to(view.alpha.device) for x in (capture.images, capture.masks))
-    pixels = pixels_at(numbers.place, pixels_per_step(cfg, inputs), view.alpha, mask == OBJECT)
+    pixels = pixels_at(numbers.place, pixels_per_step(cfg, capture), view.alpha, mask == OBJECT)
     R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
     shown = _Shown(view, pixels, photo, T_cam_obj, R_env_obj, numbers.current)
     of_view = losses.material_terms(view, photo, mask)

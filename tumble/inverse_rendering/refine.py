@@ -7,7 +7,7 @@ colour is shaded by one spherical-harmonic light (`sh_lighting`), or static per 
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Literal
 
 import torch
@@ -193,7 +193,7 @@ class Inputs:
     capture: Capture
     trajectory: Trajectory
 
-    @cached_property
+    @property
     def diameter(self) -> float:
         """Median diameter of the object's sphere in the images [pixels]."""
         focal, distances = self.capture.camera.fx_fy_cx_cy[0], self.trajectory.T_cam_obj.xyz.norm(dim=-1)
