@@ -193,12 +193,6 @@ class Inputs:
     capture: Capture
     trajectory: Trajectory
 
-    @property
-    def diameter(self) -> float:
-        """Median diameter of the object's sphere in the images [pixels]."""
-        focal, distances = self.capture.camera.fx_fy_cx_cy[0], self.trajectory.T_cam_obj.xyz.norm(dim=-1)
-        return float(2 * focal / distances.median())
-
 
 def length(cfg: Config, inputs: Inputs) -> int:
     """Number of steps."""
@@ -237,7 +231,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
 
 def for_resolution(cfg: Config, inputs: Inputs) -> Config:
     """The settings with as many Gaussians as the images resolve, by the diameter of the object's sphere in them."""
-    factor = max(1.0, inputs.diameter / cfg.diameter) ** 1.5 if cfg.diameter else 1.0
+    focal, distances = inputs.capture.camera.fx_fy_cx_cy[0], inputs.trajectory.T_cam_obj.xyz.norm(dim=-1)
+    factor = max(1.0, float(2 * focal / distances.median()) / cfg.diameter) ** 1.5 if cfg.diameter else 1.0
     most = round(cfg.densification.max_gaussians * factor)
     return replace(
         cfg,
