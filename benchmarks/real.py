@@ -5,7 +5,8 @@
 
 With a scan, true poses are found without anything of ours: the scan's albedo and depth are rendered from 42 directions
 by `tumble synth`; SIFT features of a film's frame are matched to those views, and the pose is that of RANSAC PnP on
-the points of the scan behind them. The rotation from the asset to the scan is the mean over frames.
+the points of the scan behind them, where these determine it well. The rotation from the asset to the scan is the mean
+over frames.
 Surfaces are compared after ICP with a similarity: from the vertices of the asset to the scan, and back.
 """
 
@@ -88,6 +89,9 @@ CONTRAST = 0.02
 """Contrast threshold of SIFT: half of OpenCV's, because films are dark."""
 MIN_INLIERS = 25
 """Matches that agree with a pose, for it to count as true."""
+MAX_SIGMA = 0.75
+"""Largest standard deviation of a rotation by the scan, a quarter of the error that is asked for [degrees]. A flat
+label that faces the camera determines its tilt badly: of `SM2` such frames were 16 degrees off."""
 MIN_FRAMES = 8
 """Frames with a true pose below which nothing is compared."""
 
@@ -277,6 +281,10 @@ def true_pose(frame: np.ndarray, focal: float, views: list[Features]) -> tuple[n
         return None
     agreeing = np.asarray(inliers, int).ravel()
     rvec, t = cv2.solvePnPRefineLM(world[agreeing], image[agreeing], K, None, rvec, t)
+    projected, jacobian = cv2.projectPoints(world[agreeing], rvec, t, K, None)
+    variance = (projected[:, 0] - image[agreeing]).var() * np.linalg.inv(jacobian[:, :6].T @ jacobian[:, :6])
+    if np.degrees(np.sqrt(variance.diagonal()[:3].max())) > MAX_SIGMA:
+        return None
     return cv2.Rodrigues(rvec)[0], t[:, 0]
 
 

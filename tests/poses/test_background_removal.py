@@ -85,26 +85,31 @@ def test_the_wall_beside_the_object_becomes_background(held: tuple[Capture, Tens
     assert cut.full_images is None
 
 
-def test_a_hand_that_keeps_its_place_becomes_background_where_hardly_any_frame_shows_object() -> None:
-    """A ball beside the object that is unknown in all frames, which show it before or beside the object."""
+MISTAKEN = (2, 9, 17)
+"""Frames whose masks take the hand for the object."""
+
+
+def test_a_hand_that_keeps_its_place_becomes_background() -> None:
+    """A ball on the object that is unknown in most frames, although many show the object before it."""
     capture, objects, T_cam_obj = film(PRINT)
     rays, radius = capture.camera.directions().double(), 0.3
     middle = T_cam_obj @ torch.tensor([0.0, float(AXES[1]) + 2 * radius, 0.0], dtype=torch.float64)
     along = (rays * middle[:, None, None]).sum(-1) / (rays * rays).sum(-1)
     ball = (along[..., None] * rays - middle[:, None, None]).norm(dim=-1) < radius
     # Behind the object, the ball is hidden.
-    toward = T_cam_obj.xyz[:, 2] - middle[:, 2]
-    kept = torch.argsort(toward, descending=True)[: N // 2].sort().values
-    ball &= ~objects | (toward > 0)[:, None, None]
+    ball &= ~objects | (T_cam_obj.xyz[:, 2] > middle[:, 2])[:, None, None]
     masks = torch.where(objects, OBJECT, BACKGROUND).to(torch.uint8)
     masks[ball] = UNKNOWN
-    lost = tuple(k for k in range(N) if k not in kept.tolist())
-    poses = result(capture.camera, T_cam_obj, lost=lost)
-    cut = background_removal.remove_background(replace(capture, masks=masks), poses)
+    for i in MISTAKEN:
+        masks[i][ball[i]] = OBJECT
+    cut = background_removal.remove_background(replace(capture, masks=masks), result(capture.camera, T_cam_obj))
     assert not (cut.masks[objects] == BACKGROUND).any()
-    beside = (ball & ~objects)[kept]
+    beside = ball & ~objects
+    mistaken = beside[list(MISTAKEN)]
     assert beside.sum() > 1000
-    assert (cut.masks[kept][beside] == BACKGROUND).float().mean() > 0.4
+    assert mistaken.sum() > 100
+    assert (cut.masks[beside] == BACKGROUND).float().mean() > 0.6
+    assert (cut.masks[list(MISTAKEN)][mistaken] == BACKGROUND).float().mean() > 0.6
 
 
 def test_an_object_that_is_hidden_in_most_frames_is_not_taken_for_a_hand(held: tuple[Capture, Tensor, SE3]) -> None:

@@ -7,8 +7,8 @@ there or nearby, and is that of the background close by in the same frame. Both 
 the object's own colours are unexpected, too, and a wall may have the object's colours.
 
 A hand is unknown in the masks, since it may hide the object, so that a hull keeps a hand that stays at its place: a mug
-has a fist on its rim. But an object behind a hand is seen from other sides. Where hardly any frame shows object, there
-is none, and the hand's pixels become background.
+has a fist on its rim. But the surface of the object is object in the frames that it faces, and that of the hand is not.
+What lies outside of the convex hull of the confirmed surface is no object, and its pixels become background.
 """
 
 from dataclasses import dataclass, replace
@@ -31,9 +31,12 @@ SPACING = 2 * EXTENT / RESOLUTION
 MAX_DEPTH_DIFFERENCE = 2.5
 """Distance behind the nearest cell of a pixel up to which a cell of the hull's surface is visible [cells]."""
 MIN_SHOWN = 0.25
-"""Fraction of the frames that must show object at a cell; with less, it is a hand's. In captures with a rendered hand
-the four objects for tuning have 0.54 or more everywhere; half of that leaves room for masks that miss parts of them."""
-MIN_LEFT = 0.5
+"""Of the frames in which a cell of the hull's surface is in front, the fraction that must show object there."""
+NEIGHBOURHOOD = 5.0
+"""Distance up to which most other cells of the surface must be confirmed as well, since masks have errors [cells]."""
+MIN_FACED = 0.1
+"""Fraction of the frames in which a cell has to be in front; of others too little is known."""
+MIN_LEFT = 1 / 3
 """Fraction of the hull that has to be left; with less, hands hide too much of the object to be told from it."""
 MIN_FRAMES = 2
 """Minimum number of frames that must show a cell; the colour of others is unknown."""
@@ -77,16 +80,14 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
         return replace(capture, full_images=None)
     photos = np.stack([cv2.GaussianBlur(capture.full_images[k].numpy(), (3, 3), 0) for k in kept]).astype(np.float32)
     labels, T_cam_obj = capture.masks[kept].numpy(), result.trajectory.T_cam_obj[kept]
-    cells, share = hull_by_vote(replace(capture, camera=result.camera), result.trajectory.T_cam_obj, kept)
-    shown = cells[share >= MIN_SHOWN]
-    if len(shown) < MIN_LEFT * len(cells):
-        shown = cells
+    cells = hull_by_vote(replace(capture, camera=result.camera), result.trajectory.T_cam_obj, kept)
+    own = _own_cells(labels, result.camera, T_cam_obj, cells)
     size = float(np.sqrt(np.median((labels == OBJECT).sum((1, 2)))))
     expected = _expected_colours(photos, labels, result.camera, T_cam_obj, cells, size)
     masks, images = capture.masks.clone(), capture.images.clone()
     for i, k in enumerate(kept):
-        hand = (labels[i] == UNKNOWN) & beyond(silhouette_of(result.camera, T_cam_obj[i] @ shown))
-        wrong = torch.from_numpy(_background(photos[i], labels[i], expected[i], size) | hand)
+        outside = beyond(silhouette_of(result.camera, T_cam_obj[i] @ own))
+        wrong = torch.from_numpy(_background(photos[i], labels[i], expected[i], size) | outside)
         masks[k][wrong], images[k][wrong] = BACKGROUND, 0
     return replace(capture, masks=masks, images=images, full_images=None)
 
@@ -95,6 +96,31 @@ def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Captu
     """The poses of a run, None if there are none, and its capture with the masks that stages 2 and 3 have seen."""
     tracked, trimmed = mask_refinement.stored_result(out, capture)
     return tracked, remove_background(trimmed, tracked) if tracked else trimmed
+
+
+def _own_cells(
+    labels: UInt8[np.ndarray, "t h w"], camera: Camera, T_cam_obj: SE3, cells: Float[Tensor, "n 3"]
+) -> Float[Tensor, "m 3"]:
+    """The cells of a hull in the convex hull of the surface that masks confirm; all if that leaves too few."""
+    from scipy.spatial import ConvexHull, KDTree, QhullError
+
+    faces = _surface_cells(cells)
+    shown, hidden = np.zeros((2, len(faces)))
+    for i, mask in enumerate(labels):
+        surface = _surface(camera, T_cam_obj[i] @ faces)
+        column, row = surface.column_row[surface.visible].T
+        shown[surface.visible] += mask[row, column] == OBJECT
+        hidden[surface.visible] += mask[row, column] == UNKNOWN
+    known = shown + hidden >= MIN_FACED * len(labels)
+    faces, confirmed = faces.numpy()[known], (shown >= MIN_SHOWN * (shown + hidden))[known]
+    near = KDTree(faces).query_ball_point(faces[confirmed], NEIGHBOURHOOD * SPACING)
+    agreeing = np.array([confirmed[each].mean() > 0.5 for each in near], bool)
+    try:
+        planes = ConvexHull(faces[confirmed][agreeing]).equations
+    except (QhullError, ValueError):  # Nothing is confirmed, or only points in a plane.
+        return cells
+    own = np.asarray((cells.double().numpy() @ planes[:, :3].T + planes[:, 3] <= SPACING).all(1))
+    return cells[own] if own.mean() >= MIN_LEFT else cells
 
 
 def _expected_colours(

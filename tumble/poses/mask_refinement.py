@@ -65,7 +65,7 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
     """
     kept = torch.nonzero(~result.quality.lost)[:, 0].tolist()
     camera, T_cam_obj = result.camera, result.trajectory.T_cam_obj
-    cells, _ = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
+    cells = hull_by_vote(replace(capture, camera=camera), T_cam_obj, kept)
     masks = capture.masks.clone()
     for k in kept:
         silhouette = silhouette_of(camera, T_cam_obj[k] @ cells)
@@ -84,30 +84,21 @@ def explains_more(new: PoseResult, old: PoseResult) -> bool:
     return ranks[0] > ranks[1]
 
 
-def hull_by_vote(
-    capture: Capture, T_cam_obj: SE3, frames: list[int]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """The cells at which few frames show background.
-
-    Returns:
-        Their centres, object frame, and of the frames with each in the image the fraction that shows object there.
-    """
+def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[Tensor, "n 3"]:
+    """Centres of the cells at which few frames show background, object frame."""
     ticks = ((torch.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1) * EXTENT
     cells = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height])
-    background, shown, seen = torch.zeros(3, len(cells))
+    background, seen = torch.zeros(2, len(cells))
     for k in frames:
         uv = capture.camera.project(T_cam_obj[k] @ cells).floor().long()
         inside = ((uv >= 0) & (uv < size)).all(-1)
         column, row = uv.clamp(min=torch.zeros_like(size), max=size - 1).unbind(-1)
-        labels = capture.masks[k][row, column]
-        background += inside & (labels == BACKGROUND)
-        shown += inside & (labels == OBJECT)
+        background += inside & (capture.masks[k][row, column] == BACKGROUND)
         seen += inside
         left = background <= MAX_BACKGROUND_FRACTION * len(frames)  # the others have lost the vote already
-        cells, background, shown, seen = cells[left], background[left], shown[left], seen[left]
-    left = (seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen)
-    return cells[left], (shown / seen)[left]
+        cells, background, seen = cells[left], background[left], seen[left]
+    return cells[(seen > 0) & (background <= MAX_BACKGROUND_FRACTION * seen)]
 
 
 def beyond(silhouette: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
