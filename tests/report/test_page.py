@@ -254,7 +254,7 @@ def test_renders_equal_photos_that_are_renders(asset: Asset, capture: Capture) -
     assert all(frame.iou == 1 for frame in frames)
     assert max(abs(frame.exposure_stops) for frame in frames) < 0.02
     rows = health_card.card(frames, None, confidence.confidence_of(asset, asset.camera))
-    assert [row.rating for row in rows[:5]] == ["good", "good", "good", "none", "none"]
+    assert [row.rating for row in rows[:6]] == ["good", "good", "good", "none", "none", "none"]
 
 
 def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: Capture) -> None:
@@ -270,7 +270,7 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
     quality = PoseQuality(4 * ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), observability)
     frames = list(training_views.frames(training_views.prepare(asset), damaged))
-    photo, silhouette, exposure, lost_frames, match, _, colour = health_card.card(
+    photo, silhouette, exposure, turn, lost_frames, match, _, colour = health_card.card(
         frames, quality, confidence.confidence_of(asset, asset.camera), [0.2, 0.6, 0.1]
     )
     assert photo.marks[0] == "bad" or photo.rating != "good"
@@ -281,10 +281,20 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     # Half of the frames are one stop darker.
     assert exposure.rating == "bad"
     assert float(exposure.value.split()[0]) == pytest.approx(1.0, abs=0.05)
+    assert (turn.value, turn.rating) == ("172 degrees", "good")
     assert (lost_frames.value, lost_frames.rating) == ("1 of 10", "warn")
     assert (match.value, match.rating) == ("4.00 px", "bad")
     assert (colour.value, colour.rating) == ("± 60%", "warn")
     assert health_card.overall([photo, silhouette, exposure, lost_frames, match])[0] == "bad"
+
+
+@pytest.mark.parametrize(("degrees", "rating"), [(22, "bad"), (60, "warn"), (120, "good")])
+def test_an_object_that_was_hardly_turned_is_named(asset: Asset, degrees: float, rating: str) -> None:
+    ones, observability = torch.ones(N), Observability(torch.tensor([0.0, 1.0, 0.0]), torch.full((3,), 0.01))
+    lost, turn = torch.zeros(N, dtype=torch.bool), torch.tensor(degrees).deg2rad()
+    quality = PoseQuality(ones, 50 * ones, ones, ones, 0.01 * ones, lost, turn, observability)
+    rows = health_card.card([], quality, confidence.confidence_of(asset, asset.camera))
+    assert [row.rating for row in rows if row.name == "Turn of the object"] == [rating]
 
 
 def test_the_spoilt_frames_are_shown(asset: Asset, capture: Capture) -> None:

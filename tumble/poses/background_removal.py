@@ -116,11 +116,11 @@ def _own_cells(
     near = KDTree(faces).query_ball_point(faces[confirmed], NEIGHBOURHOOD * SPACING)
     agreeing = np.array([confirmed[each].mean() > 0.5 for each in near], bool)
     try:
-        planes = ConvexHull(faces[confirmed][agreeing]).equations
+        planes = torch.from_numpy(ConvexHull(faces[confirmed][agreeing]).equations)
     except (QhullError, ValueError):  # Nothing is confirmed, or only points in a plane.
         return cells
-    own = np.asarray((cells.double().numpy() @ planes[:, :3].T + planes[:, 3] <= SPACING).all(1))
-    return cells[own] if own.mean() >= MIN_LEFT else cells
+    own = (cells.double() @ planes[:, :3].T + planes[:, 3] <= SPACING).all(1)
+    return cells[own] if own.double().mean() >= MIN_LEFT else cells
 
 
 def _expected_colours(

@@ -24,14 +24,15 @@ LIMITS = {
     "psnr": (26.0, 21.0),
     "iou": (0.95, 0.90),
     "exposure": (0.2, 0.5),
+    "turn": (90.0, 40.0),
     "lost": (0.0, 0.1),
     "residual": (1.5, 3.0),
     "few_lights": (0.2, 0.6),
     "colour": (0.3, 1.0),
 }
 """Limits beyond which a row is rated "warn" and "bad", rules of thumb: median PSNR [dB], median IoU, range of exposure
-[stops], fraction of lost frames, median match residual [pixels], fraction of the surface lit from few directions,
-relative error of the albedo's scale."""
+[stops], largest rotation between two frames [degrees], fraction of lost frames, median match residual [pixels],
+fraction of the surface lit from few directions, relative error of the albedo's scale."""
 MIN_LIGHT_DIRECTIONS = N_LIGHTS + 1
 """Number of light directions below which a point counts as lit from few directions: light that is fixed to the object
 gives at most one per bright light, `N_LIGHTS` in all."""
@@ -71,6 +72,7 @@ def card(
         _photo_row(frames),
         _silhouette_row(frames),
         _exposure_row(frames),
+        _turn_row(quality),
         _lost_row(quality),
         _match_row(quality),
         _light_row(confidence),
@@ -144,6 +146,22 @@ def _exposure_row(frames: Sequence[RenderedFrame]) -> Row:
         _lower_is_better(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars
     )
     return Row("Exposure drift", f"{drift:.2f} stops", rating, sentence, bars, marks)
+
+
+def _turn_row(quality: PoseQuality | None) -> Row:
+    if quality is None:
+        return Row("Turn of the object", "-", "none", "The poses came with the capture and were not rated.")
+    turn = math.degrees(float(quality.rotation_range))
+    rating = _higher_is_better(turn, LIMITS["turn"])
+    sentence = {
+        "good": "The object was turned far enough for its shape to follow from its silhouettes.",
+        "warn": "The object was turned by less than a quarter of a revolution: its depth is uncertain, and its other "
+        "sides are unknown.",
+        "bad": "The object was hardly turned: neither its depth nor the light can be told from such frames. Turn it "
+        "all around when you record.",
+        "none": "There are no poses.",
+    }[rating]
+    return Row("Turn of the object", f"{turn:.0f} degrees", rating, sentence)
 
 
 def _lost_row(quality: PoseQuality | None) -> Row:
