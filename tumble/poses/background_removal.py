@@ -11,6 +11,7 @@ has a fist on its rim. But the surface of the object is object in the frames tha
 What lies outside of the convex hull of the confirmed surface is no object, and its pixels become background.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +21,6 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from torch import Tensor
 
-from tumble.maths import SE3
 from tumble.poses import mask_refinement
 from tumble.poses.mask_refinement import EXTENT, RESOLUTION, beyond, hull_by_vote, silhouette_of
 from tumble.poses.result import PoseResult
@@ -81,9 +81,11 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
     photos = np.stack([cv2.GaussianBlur(capture.full_images[k].numpy(), (3, 3), 0) for k in kept]).astype(np.float32)
     labels, T_cam_obj = capture.masks[kept].numpy(), result.trajectory.T_cam_obj[kept]
     cells = hull_by_vote(replace(capture, camera=result.camera), result.trajectory.T_cam_obj, kept)
-    own = _own_cells(labels, result.camera, T_cam_obj, cells)
+    faces = _surface_cells(cells)
+    surfaces = [_surface(result.camera, T_cam_obj[i] @ faces) for i in range(len(kept))]
+    own = _own_cells(labels, surfaces, faces, cells)
     size = float(np.sqrt(np.median((labels == OBJECT).sum((1, 2)))))
-    expected = _expected_colours(photos, labels, result.camera, T_cam_obj, cells, size)
+    expected = _expected_colours(photos, labels, surfaces, size)
     masks, images = capture.masks.clone(), capture.images.clone()
     for i, k in enumerate(kept):
         outside = beyond(silhouette_of(result.camera, T_cam_obj[i] @ own))
@@ -99,24 +101,30 @@ def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Captu
 
 
 def _own_cells(
-    labels: UInt8[np.ndarray, "t h w"], camera: Camera, T_cam_obj: SE3, cells: Float[Tensor, "n 3"]
+    labels: UInt8[np.ndarray, "t h w"],
+    surfaces: Sequence[_Surface],
+    faces: Float[Tensor, "f 3"],
+    cells: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "m 3"]:
-    """The cells of a hull in the convex hull of the surface that masks confirm; all if that leaves too few."""
+    """The cells of a hull in the convex hull of the surface that masks confirm; all if that leaves too few.
+
+    Args:
+        surfaces: What every frame shows of the hull's surface.
+        faces: The cells of that surface.
+    """
     from scipy.spatial import ConvexHull, KDTree, QhullError
 
-    faces = _surface_cells(cells)
     shown, hidden = np.zeros((2, len(faces)))
-    for i, mask in enumerate(labels):
-        surface = _surface(camera, T_cam_obj[i] @ faces)
+    for mask, surface in zip(labels, surfaces, strict=True):
         column, row = surface.column_row[surface.visible].T
         shown[surface.visible] += mask[row, column] == OBJECT
         hidden[surface.visible] += mask[row, column] == UNKNOWN
     known = shown + hidden >= MIN_FACED * len(labels)
-    faces, confirmed = faces.numpy()[known], (shown >= MIN_SHOWN * (shown + hidden))[known]
-    near = KDTree(faces).query_ball_point(faces[confirmed], NEIGHBOURHOOD * SPACING)
+    points, confirmed = faces.numpy()[known], (shown >= MIN_SHOWN * (shown + hidden))[known]
+    near = KDTree(points).query_ball_point(points[confirmed], NEIGHBOURHOOD * SPACING)
     agreeing = np.array([confirmed[each].mean() > 0.5 for each in near], bool)
     try:
-        planes = torch.from_numpy(ConvexHull(faces[confirmed][agreeing]).equations)
+        planes = torch.from_numpy(ConvexHull(points[confirmed][agreeing]).equations)
     except (QhullError, ValueError):  # Nothing is confirmed, or only points in a plane.
         return cells
     own = (cells.double() @ planes[:, :3].T + planes[:, 3] <= SPACING).all(1)
@@ -126,9 +134,7 @@ def _own_cells(
 def _expected_colours(
     photos: Float32[np.ndarray, "t h w 3"],
     labels: UInt8[np.ndarray, "t h w"],
-    camera: Camera,
-    T_cam_obj: SE3,
-    cells: Float[Tensor, "n 3"],
+    surfaces: Sequence[_Surface],
     size: float,
 ) -> Float32[np.ndarray, "t h w 3"]:
     """Colours of the object in every frame, sRGB code values; not a number where they are unknown.
@@ -136,16 +142,15 @@ def _expected_colours(
     The colour of a cell is the median over the frames that show it. Its shading is that of each frame: expected colours
     are multiplied by the smooth gain that fits them to the photo.
     """
-    cells = _surface_cells(cells)
-    colours = np.full((len(photos), len(cells), 3), np.nan, np.float32)
-    surfaces = [_surface(camera, T_cam_obj[i] @ cells) for i in range(len(photos))]
+    n = len(surfaces[0].visible)
+    colours = np.full((len(photos), n, 3), np.nan, np.float32)
     for i, surface in enumerate(surfaces):
         column, row = surface.column_row[surface.visible].T
         sampled = photos[i][row, column]
         sampled[labels[i][row, column] != OBJECT] = np.nan
         colours[i, surface.visible] = sampled
     shown = (~np.isnan(colours[..., 0])).sum(0) >= MIN_FRAMES
-    median = np.full((len(cells), 3), np.nan, np.float32)
+    median = np.full((n, 3), np.nan, np.float32)
     median[shown] = np.nanmedian(colours[:, shown], 0)
     expected = []
     for photo, mask, surface in zip(photos, labels, surfaces, strict=True):
