@@ -59,6 +59,7 @@ def score_glb(glb: Path, asset: Asset, known: CaptureWithTruth, aligned: tuple[A
         albedo=albedo,
         normals=R_true_pred @ torch.from_numpy(maps.normal),
         roughness=torch.from_numpy(maps.roughness[..., 0]),
+        metalness=None if truth.metalness is None else torch.from_numpy(maps.metalness[..., 0]),
         masks=torch.from_numpy(maps.mask),
         relit=relit,
     )

@@ -233,7 +233,8 @@ def _in_absolute_colour(opened: run.Run, asset: Asset, capture: Capture, white: 
             raise ValueError(f"the pose of frame {name} was not found; choose another frame for --white")
         target = absolute_colour.known_white(asset, capture, capture.names.index(name), column, row)
     pixels = absolute_colour.shaded_pixels(asset, capture)
-    found = absolute_colour.estimate(pixels, float(asset.material.f0), target)
+    metalness = 0.0 if asset.material.metalness is None else float(asset.material.metalness.mean())
+    found = absolute_colour.estimate(pixels, float(asset.material.f0), target, metalness=metalness)
     values = {"factor": found.log_factor.exp().tolist(), "deviation": found.deviation.tolist()}
     run.log(opened, {"name": "decompose", "event": "colour", **values, "white": white is not None})
     return absolute_colour.apply(asset, found.log_factor)

@@ -132,7 +132,7 @@ STANDARD = replace(
         solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=0.005, material=0.02, mask=MASK, specular=0.0),
         rates=inverse_rendering.decompose.Rates(
-            albedo=0.02, roughness=0.03, roughness_shift=0.03, light=0.03, specular_scale=0.03
+            albedo=0.02, roughness=0.03, roughness_shift=0.03, metalness=0.03, light=0.03, specular_scale=0.03
         ),
     ),
 )
@@ -169,7 +169,7 @@ DRAFT = replace(
         solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK, specular=0.0),
         rates=inverse_rendering.decompose.Rates(
-            albedo=0.02, roughness=0.05, roughness_shift=0.05, light=0.05, specular_scale=0.1
+            albedo=0.02, roughness=0.05, roughness_shift=0.05, metalness=0.05, light=0.05, specular_scale=0.1
         ),
     ),
     relight=replace(OURS.relight, brdf_samples=128, light_samples=128),
@@ -495,7 +495,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "cached-visibility": ("decompose.shadows",),
     "split-sum": ("decompose.lobes",),
     "frame-bounce": ("decompose.bounce",),
-    "specular-fit": ("decompose.try_matte", "decompose.rates.roughness_shift"),
+    "specular-fit": ("decompose.try_matte", "decompose.rates.roughness_shift", "decompose.rates.metalness"),
     "albedo-solve": ("decompose.solve_albedo",),
 }
 """Our departures from the paper, in the order of the ladder: by name, the settings that are ours from there on."""

@@ -128,9 +128,10 @@ def _read_checkpoint(path: Path) -> Snapshot:
 
 
 def _maps(gaussians: Gaussians, material: Material) -> dict[str, Float[Tensor, "n 3"]]:
-    """Colours that display albedo and roughness, as means over the corners of each Gaussian, and normals."""
+    """Colours that display albedo and roughness, as means over the corners of each Gaussian, metalness and normals."""
     albedo, rough = srgb_from_linear(material.albedo.mean(1)), material.roughness.mean(1, keepdim=True)
-    return {"albedo": albedo, "roughness": rough.expand(-1, 3)} | _normals(gaussians)
+    metalness = {} if material.metalness is None else {"metalness": material.metalness[:, None].expand(-1, 3)}
+    return {"albedo": albedo, "roughness": rough.expand(-1, 3)} | metalness | _normals(gaussians)
 
 
 def _normals(gaussians: Gaussians) -> dict[str, Float[Tensor, "n 3"]]:

@@ -56,6 +56,7 @@ def sphere(path: Trajectory) -> dict[str, Tensor]:
         "normals": n_obj,
         "albedo": albedo,
         "roughness": (0.5 + 0.3 * n_obj[..., 0]) * mask,
+        "metalness": (0.5 - 0.4 * n_obj[..., 1]) * mask,
         "masks": torch.where(mask, OBJECT, BACKGROUND).to(torch.uint8).expand(len(path), -1, -1).contiguous(),
         "shading": (0.6 - 0.4 * n_cam[..., 1:2]).expand(len(path), -1, -1, -1),
     }
@@ -78,6 +79,7 @@ def synthetic() -> tuple[Capture, Truth]:
         trajectory=views,
         albedo=maps["albedo"],
         roughness=maps["roughness"],
+        metalness=maps["metalness"],
         normals=maps["normals"],
         relit={light: code_values(k * maps["albedo"]) for light, k in (("sun", 0.9), ("shade", 0.4))},
         light=Environment.from_radiance(0.2 + torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(2))),
@@ -117,6 +119,7 @@ def perfect_prediction(path: Path) -> Prediction:
         albedo=truth.albedo,
         normals=truth.normals,
         roughness=truth.roughness,
+        metalness=truth.metalness,
         masks=truth.foreground,
         images=truth.images,
         relit=truth.relit,
@@ -197,15 +200,20 @@ def test_normals_turned_by_two_degrees_score_two_degrees(capture_path: Path) -> 
 def test_damage_in_one_region_leaves_the_other_perfect(capture_path: Path) -> None:
     truth = perfect_prediction(capture_path)
     assert truth.roughness is not None
+    assert truth.metalness is not None
     assert truth.images is not None
     roughness, images = truth.roughness.clone(), truth.images.clone()
+    metalness = truth.metalness * torch.tensor([1, 1, 1, 1, 0])[:, None, None]
     roughness[1] = (roughness[1] + 0.1) * (roughness[1] > 0)
     images[4] //= 2
-    report = score(capture_path, roughness=roughness, images=images)
-    assert report["regions"]["shared"]["roughness.rmse_fg"] == 0
+    report = score(capture_path, roughness=roughness, metalness=metalness, images=images)
+    assert report["regions"]["shared"]["metalness.mae_fg"] == 0
+    assert report["regions"]["sphere"]["metalness.mae_fg"] > 0.1
+    assert report["regions"]["shared"]["roughness.rmse_fg"] == report["regions"]["shared"]["roughness.mae_fg"] == 0
     assert report["regions"]["shared"]["image.psnr_full_srgb"] == 100
     # The mean over two views, one of which is perfect.
-    assert report["regions"]["sphere"]["roughness.rmse_fg"] == pytest.approx(0.05, abs=1e-6)
+    for name in ("rmse_fg", "mae_fg"):
+        assert report["regions"]["sphere"][f"roughness.{name}"] == pytest.approx(0.05, abs=1e-6)
     assert report["regions"]["sphere"]["image.psnr_full_srgb"] < 70
 
 
@@ -337,7 +345,7 @@ def test_unknown_pixels_change_no_score(tmp_path: Path) -> None:
 # Absent and broken parts ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("part", ["albedo", "normals", "roughness", "images", "relit", "light", "poses"])
+@pytest.mark.parametrize("part", ["albedo", "normals", "roughness", "metalness", "images", "relit", "light", "poses"])
 def test_an_absent_part_is_noted_and_the_rest_is_scored(capture_path: Path, part: str) -> None:
     changes: dict[str, Any] = {part: {} if part == "relit" else None}
     if part == "poses":

@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,28 @@ def test_the_glb_follows_the_gltf_layout(folder: Path) -> None:
     # The header of the compressed data (RFC 1950) tells the effort: 0 for runs only, 2 for level 6.
     assert all(binary[binary.index(b"IDAT", start) + 5] >> 6 == 0 for start in starts)
     assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
+
+
+def test_metalness_is_in_the_blue_channel_and_in_the_columns(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The half of the sphere towards +x is metal."""
+    trimesh = pytest.importorskip("trimesh")
+    logits = torch.where(asset.gaussians.means[:, 0] > 0, 20.0, -20.0)
+    half = replace(asset, material=replace(asset.material, metal_logits=logits))
+    monkeypatch.setitem(export.PRESETS, "web", SMALL)
+    export.write_asset(half, NAMES, tmp_path, "web", SCALE_MM)
+    document, _ = chunks(tmp_path / "asset.glb")
+    assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 1
+    (shape,) = trimesh.load_scene(tmp_path / "asset.glb", process=False).geometry.values()
+    packed = np.asarray(shape.visual.material.metallicRoughnessTexture.convert("RGB"))
+    x = shape.triangles_center[:, 0] / (SCALE_MM / 2000)
+    uv = shape.visual.uv[shape.faces].mean(1)
+    row, column = ((1 - uv[:, 1]) * len(packed)).astype(int), (uv[:, 0] * len(packed)).astype(int)
+    clear = (np.abs(x) > 0.15) & (shape.area_faces > 1e-8)
+    assert ((packed[row, column, 2] > 127) == (x > 0))[clear].mean() > 0.99
+    columns = table(tmp_path / "asset_material.ply")
+    assert np.array_equal(columns["metalness"] > 0.5, columns["x"] > 0)
 
 
 def test_an_independent_reader_finds_each_colour_in_its_place(folder: Path) -> None:

@@ -56,6 +56,20 @@ def random_samples(scale: float, dark: float = 0.0, n: int = 200, per: int = 20)
     return Samples(gaussian, diffuse, specular, albedo[gaussian] * diffuse + scale * specular), ratio
 
 
+@pytest.mark.parametrize("part", [0.0, 0.4, 1.0])
+def test_regions_of_metal_are_found(part: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Metal mirrors light in its own colour and has no diffuse lobe. Of 200 Gaussians in a row, the first are metal."""
+    samples, _ = random_samples(1.0)
+    colour = samples.photo.new_tensor([0.9, 0.6, 0.2]) / 0.3
+    is_metal = torch.arange(200) < 200 * part
+    photo = torch.where(is_metal[samples.gaussian, None], colour * samples.specular, samples.photo)
+    noise = 1 + 0.05 * torch.randn(photo.shape, generator=torch.Generator().manual_seed(2))
+    fitted = specular_fit.fit(replace(samples, photo=photo * noise), 200)
+    monkeypatch.setattr(specular_fit, "NEIGHBOURS", 9)
+    row = torch.arange(200)[:, None] * torch.tensor([1.0, 0.5, -0.2])
+    assert (specular_fit.metal_regions(fitted, row) == is_metal).float().mean() > 0.95
+
+
 @pytest.mark.parametrize("scale", [0.3, 1.7])
 def test_the_scale_is_found_in_spite_of_a_tenth_of_outliers(scale: float) -> None:
     samples, _ = random_samples(scale)

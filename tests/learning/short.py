@@ -75,9 +75,9 @@ def scene() -> tuple[Capture, Truth]:
     return folder.load(CAPTURE), truth
 
 
-def run(recipe: Recipe, seed: int) -> tuple[Asset, refine.Refined]:
-    """Stages 2 and 3 with given poses."""
-    capture, known = scene()[0], recipes.known_poses(recipe)
+def run(recipe: Recipe, seed: int, capture: Capture | None = None) -> tuple[Asset, refine.Refined]:
+    """Stages 2 and 3 with given poses, on the committed capture or another one."""
+    capture, known = capture or scene()[0], recipes.known_poses(recipe)
     assert capture.trajectory is not None
     refined = drive(refine, known.refine, refine.Inputs(capture, capture.trajectory), seed=seed)
     return drive(decompose, known.decompose, decompose.Inputs(capture, refined), seed=seed), refined

@@ -274,6 +274,22 @@ def test_split_sum_interpolates_entries_and_clamps_at_the_borders(table: Tensor)
     assert brdf.split_sum(table, nov.reshape(2, 2, 1), 0.5).shape == (2, 2, 1)
 
 
+@pytest.mark.parametrize("roughness", [0.2, 0.6])
+def test_a_white_metal_sends_back_at_most_what_it_gets_and_its_tables_agree(roughness: float) -> None:
+    """Schlick's term of a white metal is 1 everywhere; single scattering loses light on a rough one."""
+    n, wi = UP, directions.fibonacci_sphere(200_000)
+    tables, colour = brdf.metal_split_sum_tables(), torch.tensor([1.0, 0.6, 0.1])
+    for theta in (0.2, 1.0, 1.4):
+        wo = torch.tensor([math.sin(theta), 0.0, math.cos(theta)])
+        value = brdf.metal(wi, wo, n, albedo=colour, roughness=roughness) * brdf.cosine(n, wi).clamp_min(0)
+        reflected = value.mean(0) * 4 * math.pi
+        rough, nov = torch.full((1, 1), roughness), wo[None, 2:]
+        of_colour, of_all = (brdf.split_sum(table, nov, rough)[0, 0] for table in tables)
+        torch.testing.assert_close(reflected, colour * of_colour + of_all, rtol=0.01, atol=2e-3)
+        assert 0.5 < reflected[0] <= 1.001
+        assert reflected[0] > reflected[1] > reflected[2] > 0.08
+
+
 def test_split_sum_tables_are_deterministic_and_conserve_energy(table: Tensor) -> None:
     assert torch.equal(table, brdf.split_sum_table())
     assert brdf.split_sum_table(16).shape == (16, 16)

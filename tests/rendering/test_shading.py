@@ -335,7 +335,7 @@ def compare(shape: str, environment: Environment, albedo: float = 0.6, depth: in
     scene = mitsuba_brdf.scene(mesh, environment, **material, depth=depth)
     truth, coverage = pathtracer.radiance(scene, T_cam_obj, camera, R_env_obj, samples=1024, seed=0)
     model = pathtracer.ObjectModel((mesh,), T_cam_obj.matrix().double().numpy())
-    maps = pathtracer.maps(pathtracer.unlit_scenes(model, None), T_cam_obj, camera, samples=64)
+    maps = pathtracer.maps(pathtracer.unlit_scenes(model, "original", None), T_cam_obj, camera, samples=64)
     normals = torch.nn.functional.normalize(view.normal, dim=-1)
     agree = (torch.from_numpy(coverage) > 0.999) & (view.alpha > 0.95)
     agree &= (normals - torch.from_numpy(maps.normal)).norm(dim=-1) < math.radians(1.5)
@@ -393,3 +393,35 @@ def test_a_wide_lobe_matches_the_path_tracer(theta: float) -> None:
     black, rough, prefiltered = torch.zeros(1, 3), torch.full((1, 1), 0.5), prefilter(environment)
     ours = shading.shade_split(point, black, rough, prefiltered, torch.eye(3), unoccluded(w.float(), 1), f0=F0)
     assert ours[0, 0].item() == pytest.approx(truth, rel=0.02)
+
+
+@pytest.mark.parametrize(("roughness", "theta", "metalness"), [(0.25, 0.1, 1.0), (0.25, 1.0, 1.0), (0.5, 0.3, 0.5)])
+def test_a_metal_matches_the_path_tracer(roughness: float, theta: float, metalness: float) -> None:
+    """A coloured metal, and a surface that is half of one, under a light with a gradient, against Mitsuba's BRDF."""
+    pytest.importorskip("mitsuba")
+    from tumble.synthetic import pathtracer
+
+    mi = pathtracer.mitsuba()
+    base, up, eye = (
+        torch.tensor([0.9, 0.5, 0.1]),
+        torch.tensor([[0.0, 0.0, 1.0]]),
+        [math.sin(theta), 0, math.cos(theta)],
+    )
+    colour, wo = {"type": "rgb", "value": base.tolist()}, torch.tensor([eye])
+    material = {"base_color": colour, "roughness": roughness, "metallic": metalness, "specular": 0.5}
+    bsdf, si = mi.load_dict({"type": "principled"} | material), mi.SurfaceInteraction3f()
+    si.wi = mi.Vector3f(*eye)
+    u = torch.quasirandom.SobolEngine(3).draw(256)
+    wi = brdf.sample(u, wo, up, roughness=roughness)
+    wi = wi[wi[:, 2] > 0]
+    values = [np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*d))).ravel()[:3] for d in wi.tolist()]
+    # The light is brightest at -x, where the reflection of the camera is.
+    light = (1 - 0.9 * wi[:, :1]) / brdf.pdf(wi, wo, up, roughness=roughness)
+    truth = (torch.from_numpy(np.stack(values)) * light).sum(0) / len(u)
+
+    environment = Environment.from_radiance((1 - 0.9 * texel_directions(32, 64)[..., :1]).expand(32, 64, 3))
+    point = Surface(torch.zeros(1, dtype=torch.long), torch.zeros(1, 3), up, wo)
+    lit = (prefilter(environment), torch.eye(3), unoccluded(fibonacci_sphere(2000), 1))
+    rough, metal = torch.full((1, 1), roughness), torch.full((1, 1), metalness)
+    ours = shading.shade_split(point, base[None], rough, *lit, f0=F0, metalness=metal)
+    torch.testing.assert_close(ours[0], truth, rtol=0.03, atol=0)

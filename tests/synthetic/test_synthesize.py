@@ -104,7 +104,7 @@ def test_a_handheld_frame_is_a_dome_frame_under_the_counter_rotated_light(pebble
 
 
 def test_depth_reprojects_from_one_view_to_another(pebble: Path) -> None:
-    unlit = pathtracer.unlit_scenes(pathtracer.read_model(pebble), None)
+    unlit = pathtracer.unlit_scenes(pathtracer.read_model(pebble), "original", None)
     T_a_obj, T_b_obj = a_pose(0.3, 0.2, 0.1), a_pose(0.5, 0.5, -0.3)
     a, b = (pathtracer.maps(unlit, T, CAMERA, samples=64) for T in (T_a_obj, T_b_obj))
     depth = torch.from_numpy(a.depth[..., 0])
@@ -164,7 +164,9 @@ def test_the_highlight_of_a_bright_texel_is_at_the_computed_pixel(sphere: Path, 
 
 def test_normals_and_albedo_are_in_the_object_frame(sphere: Path, pebble: Path) -> None:
     T_cam_obj = a_pose(0.4, 0.9, -0.5)
-    view = pathtracer.maps(pathtracer.unlit_scenes(pathtracer.read_model(sphere), None), T_cam_obj, CAMERA, samples=16)
+    view = pathtracer.maps(
+        pathtracer.unlit_scenes(pathtracer.read_model(sphere), "original", None), T_cam_obj, CAMERA, samples=16
+    )
     x_obj = T_cam_obj.inverse() @ CAMERA.unproject(CAMERA.pixel_centers(), torch.from_numpy(view.depth[..., 0]))
     solid = view.coverage == 1
     # On the unit sphere the normal equals the position; a pixel at the contour spans several degrees.
@@ -173,7 +175,9 @@ def test_normals_and_albedo_are_in_the_object_frame(sphere: Path, pebble: Path) 
     assert cosine.min() > math.cos(math.radians(6))
     assert np.median(cosine) > math.cos(math.radians(0.5))
     assert np.allclose(view.roughness[solid], 0.25, atol=1e-3)
-    view = pathtracer.maps(pathtracer.unlit_scenes(pathtracer.read_model(pebble), None), T_cam_obj, CAMERA, samples=64)
+    view = pathtracer.maps(
+        pathtracer.unlit_scenes(pathtracer.read_model(pebble), "original", None), T_cam_obj, CAMERA, samples=64
+    )
     x_obj = T_cam_obj.inverse() @ CAMERA.unproject(CAMERA.pixel_centers(), torch.from_numpy(view.depth[..., 0]))
     for axis, channel, half in ((0, 0, 1.0), (1, 1, 0.7)):
         code = 130 + 90 * (x_obj[..., axis].numpy() / half * 0.98)
@@ -191,7 +195,7 @@ def test_a_texture_is_neither_mirrored_nor_upside_down(tmp_path: Path) -> None:
     path = export(tmp_path / "x.glb", mesh, texture, 0.5, np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))
     T_cam_obj = trajectories.look_at_object(torch.tensor([[0.0, 0.0, DISTANCE]]))
     view = pathtracer.maps(
-        pathtracer.unlit_scenes(pathtracer.read_model(path), None),
+        pathtracer.unlit_scenes(pathtracer.read_model(path), "original", None),
         SE3(T_cam_obj.wxyz[0], T_cam_obj.xyz[0]),
         CAMERA,
         samples=16,
@@ -201,6 +205,34 @@ def test_a_texture_is_neither_mirrored_nor_upside_down(tmp_path: Path) -> None:
     assert view.albedo[top, left].argmax() == 0
     assert view.albedo[top, right].argmax() == 1
     assert view.albedo[bottom, left].argmax() == 2
+
+
+def test_a_file_is_rendered_with_its_metalness_if_that_is_asked_for(tmp_path: Path) -> None:
+    """A square that faces +z, the left half of it metal, under a dome that is bright behind the camera alone."""
+    corners = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    mesh = trimesh.Trimesh(corners, [[0, 2, 1], [0, 3, 2]], process=False)
+    packed = np.zeros((16, 16, 3), np.uint8)
+    packed[..., 1], packed[:, :8, 2] = 51, 255  # roughness 0.2
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[0.5, 0.5, 0.5, 1.0], metallicRoughnessTexture=Image.fromarray(packed)
+    )
+    uv = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
+    mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    (tmp_path / "x.glb").write_bytes(trimesh.Scene(mesh).export(file_type="glb"))
+    model = pathtracer.read_model(tmp_path / "x.glb")
+    pose = trajectories.look_at_object(torch.tensor([[0.0, 0.0, DISTANCE]]))
+    T_cam_obj = SE3(pose.wxyz[0], pose.xyz[0])
+    behind = Environment.from_radiance((texel_directions(32, 64)[..., 2:] > 0.9).float().expand(32, 64, 3))
+    left, right = (slice(18, 30), slice(12, 20)), (slice(18, 30), slice(28, 36))
+    for shading, metal, ratio in (("gltf", (1, 0), 3.0), ("original", (0, 0), 1.0), ("metal", (1, 1), 1.0)):
+        view = pathtracer.maps(pathtracer.unlit_scenes(model, shading, None), T_cam_obj, CAMERA, samples=16)
+        found = tuple(float(view.metalness[x].mean()) for x in (left, right))
+        assert found == pytest.approx(metal, abs=1e-3)
+        assert view.roughness[left].mean() == pytest.approx(0.2, abs=1e-3)
+        scene = pathtracer.lit_scene(pathtracer.mitsuba_shapes(model, shading, None), behind, 2)
+        image = pathtracer.radiance(scene, T_cam_obj, CAMERA, torch.eye(3), samples=64, seed=0)[0]
+        assert image[left].mean() / image[right].mean() >= 0.9 * ratio
+        assert ratio > 1 or image[left].mean() / image[right].mean() == pytest.approx(1, abs=0.1)
 
 
 def test_a_z_up_file_stands_upright_in_the_object_frame(tmp_path: Path) -> None:

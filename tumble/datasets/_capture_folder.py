@@ -15,7 +15,7 @@ from torch import Tensor
 from tumble.io import BadFile, files
 from tumble.scene import Camera, Capture, Truth
 
-MAPS = ("albedo", "roughness", "normal", "depth")
+MAPS = ("albedo", "roughness", "metalness", "normal", "depth")
 """Ground-truth maps of an evaluation view; a map is a folder of truth/ and the key `<map>_path` of a frame."""
 
 
@@ -104,7 +104,8 @@ def _save_truth(path: Path, capture: Capture, truth: Truth) -> list[dict[str, An
         files.write_json(path / "truth" / "poses.json", poses)
     if truth.trajectory is None:
         return []
-    values = {"albedo": truth.albedo, "roughness": truth.roughness, "normal": truth.normals, "depth": truth.depth}
+    materials = {"albedo": truth.albedo, "roughness": truth.roughness, "metalness": truth.metalness}
+    values = materials | {"normal": truth.normals, "depth": truth.depth}
     maps = {kind: images.cpu().numpy() for kind, images in values.items() if images is not None}
     frames = []
     for i, (name, matrix) in enumerate(zip(truth.names, truth.trajectory.camera_to_object().tolist(), strict=True)):

@@ -53,6 +53,7 @@ class FrameRecord(Intrinsics, frozen=True, kw_only=True):
     region: Literal["shared", "sphere"] = "sphere"
     albedo_path: Name = ""
     roughness_path: Name = ""
+    metalness_path: Name = ""
     normal_path: Name = ""
     depth_path: Name = ""
     relit: dict[str, Name] = {}

@@ -353,6 +353,7 @@ def _evaluation_views(folder: _Folder, frames: Sequence[FrameRecord], lenses: _L
         trajectory=trajectory,
         albedo=linear("albedo_path", 3),
         roughness=linear("roughness_path", 1),
+        metalness=linear("metalness_path", 1),
         # Half precision changes lengths by 1e-3, which an arccos turns into an angle of 0.4 degrees.
         normals=None if normals is None else torch.nn.functional.normalize(normals, dim=-1),
         depth=linear("depth_path", 1),

@@ -52,6 +52,7 @@ PROTOCOLS = {
     "median_fg_degrees": f"median angular error [degrees], foreground pixels only, {_VIEWS}",
     "mean_all_degrees": f"mean angular error [degrees], all pixels, background counted as 0, {_VIEWS}",
     "rmse_fg": f"root mean square error of perceptual roughness, foreground pixels only, {_VIEWS}",
+    "mae_fg": f"mean absolute error of perceptual roughness or of metalness, foreground pixels only, {_VIEWS}",
     "iou": f"intersection over union of silhouettes, without unknown pixels, {_VIEWS}",
     "rmse_clip10": "root mean square error of radiance on a 32 x 64 grid, weighted by solid angle, the prediction "
     "divided by the albedo scale, then both clipped at 10",
@@ -237,6 +238,7 @@ def _missing_parts(predicted: Prediction, truth: Truth) -> list[str]:
         "albedo": (predicted.albedo, truth.albedo),
         "normal": (predicted.normals, truth.normals),
         "roughness": (predicted.roughness, truth.roughness),
+        "metalness": (predicted.metalness, truth.metalness),
         "image": (predicted.images, truth.images if len(truth) else None),
         "light": (predicted.light, truth.light),
         "poses": (predicted.poses, truth.poses),
@@ -290,7 +292,10 @@ def _view_scores(
     if predicted.normals is not None and truth.normals is not None:
         add("normal", metrics.normal_scores(predicted.normals[i], truth.normals[i], foreground, valid))
     if predicted.roughness is not None and truth.roughness is not None:
-        add("roughness", {"rmse_fg": metrics.rmse(predicted.roughness[i], truth.roughness[i], foreground)})
+        of_roughness = (predicted.roughness[i], truth.roughness[i], foreground)
+        add("roughness", {"rmse_fg": metrics.rmse(*of_roughness), "mae_fg": metrics.mae(*of_roughness)})
+    if predicted.metalness is not None and truth.metalness is not None:
+        add("metalness", {"mae_fg": metrics.mae(predicted.metalness[i], truth.metalness[i], foreground)})
     if predicted.silhouettes is not None:
         add("silhouette", {"iou": metrics.iou(predicted.silhouettes[i], foreground, valid)})
     if predicted.images is not None:

@@ -74,6 +74,11 @@ def rmse(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], mask: Bool[Tensor, "h
     return float((x - y)[mask].square().mean().sqrt())
 
 
+def mae(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]) -> float:
+    """Mean absolute error over the pixels of a mask."""
+    return float((x - y)[mask].abs().mean())
+
+
 def iou(x: Bool[Tensor, "h w"], y: Bool[Tensor, "h w"], valid: Bool[Tensor, "h w"]) -> float:
     """Intersection over union of two silhouettes over the valid pixels; 1 if both are empty."""
     return float(mask_iou(x, y, valid)) if bool(((x | y) & valid).any()) else 1.0

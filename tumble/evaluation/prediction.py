@@ -20,7 +20,7 @@ from tumble.datasets import read_poses
 from tumble.io import BadFile, files
 from tumble.scene import Capture, Environment, RelitViews, Trajectory, Truth
 
-PARTS = ("albedo", "normal", "roughness", "mask", "image", "relit", "elsewhere", "light.exr", "poses.json")
+PARTS = ("albedo", "normal", "roughness", "metalness", "mask", "image", "relit", "elsewhere", "light.exr", "poses.json")
 """Files and folders of a prediction; any others in the folder are ignored."""
 
 
@@ -34,6 +34,8 @@ class Prediction:
     """Shading normals, true object frame."""
     roughness: Float[Tensor, "v h w"] | None = None
     """Perceptual roughness."""
+    metalness: Float[Tensor, "v h w"] | None = None
+    """Metalness."""
     masks: Bool[Tensor, "v h w"] | None = None
     """Silhouettes; if None, the pixels whose albedo is not black."""
     images: UInt8[Tensor, "v h w 3"] | None = None
@@ -51,7 +53,8 @@ class Prediction:
     """Views in other places (`RelitViews`), linear radiance over black, rendered with the albedo as estimated."""
 
     def __post_init__(self) -> None:
-        views = [self.albedo, self.normals, self.roughness, self.masks, self.images, *self.relit.values()]
+        maps = [self.albedo, self.normals, self.roughness, self.metalness, self.masks]
+        views = [*maps, self.images, *self.relit.values()]
         shapes = {tuple(view.shape[:3]) for view in views if view is not None}
         assert len(shapes) <= 1, f"all parts need the same number and size of views, not {shapes}"
         assert len(self.pose_names) == (0 if self.poses is None else len(self.poses)), "one name per pose"
@@ -89,7 +92,7 @@ class Prediction:
         if not any((path / part).exists() for part in PARTS):
             raise BadFile(path, f"holds no part of a prediction, none of: {', '.join(PARTS)}")
         views = _ViewReader(len(truth), capture.camera.height, capture.camera.width)
-        roughness = views.read(path / "roughness", ".exr", _read_roughness)
+        roughness, metalness = (views.read(path / x, ".exr", _read_fraction) for x in ("roughness", "metalness"))
         masks = views.read(path / "mask", ".png", _read_mask)
         names, poses = _read_poses(path / "poses.json", capture)
         relit = sorted(p for p in (path / "relit").iterdir() if p.is_dir()) if (path / "relit").is_dir() else []
@@ -97,6 +100,7 @@ class Prediction:
             albedo=views.read(path / "albedo", ".exr", _read_positive),
             normals=views.read(path / "normal", ".exr", _read_normal),
             roughness=None if roughness is None else roughness[..., 0],
+            metalness=None if metalness is None else metalness[..., 0],
             masks=None if masks is None else masks[..., 0] >= 128,
             images=views.read(path / "image", ".png", _read_image),
             relit={
@@ -125,11 +129,12 @@ def _write_parts(prediction: Prediction, root: Path) -> None:
 
 def _view_files(prediction: Prediction) -> Iterator[tuple[Path, np.ndarray]]:
     """Relative path and pixels of every view of every part."""
-    masks, roughness = prediction.masks, prediction.roughness
+    masks, roughness, metalness = prediction.masks, prediction.roughness, prediction.metalness
     parts = {
         ("albedo", "exr"): prediction.albedo,
         ("normal", "exr"): prediction.normals,
         ("roughness", "exr"): None if roughness is None else roughness[..., None],
+        ("metalness", "exr"): None if metalness is None else metalness[..., None],
         ("mask", "png"): None if masks is None else 255 * masks[..., None].to(torch.uint8),
         ("image", "png"): prediction.images,
         ("elsewhere", "exr"): prediction.elsewhere,
@@ -196,11 +201,13 @@ def _read_normal(path: Path) -> np.ndarray:
     return _check_channels(path, files.read_radiance(path), 3)
 
 
-def _read_roughness(path: Path) -> np.ndarray:
+def _read_fraction(path: Path) -> np.ndarray:
+    """A map of roughness or metalness."""
     pixels = _check_channels(path, files.read_radiance(path), 1)
-    # Rounding in the blending of roughness may exceed 1 by a few units in the last place.
+    # Rounding in the blending may exceed 1 by a few units in the last place.
     if pixels.min() < 0 or pixels.max() > 1.001:
-        raise BadFile(path, f"holds roughness from {pixels.min():.3g} to {pixels.max():.3g}", "it must lie in [0, 1]")
+        found = f"holds {path.parent.name} from {pixels.min():.3g} to {pixels.max():.3g}"
+        raise BadFile(path, found, "it must lie in [0, 1]")
     return pixels
 
 

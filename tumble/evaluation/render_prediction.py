@@ -63,6 +63,7 @@ def predict_views(
         albedo=albedo,
         normals=alignment.R_true_pred @ normals,
         roughness=torch.stack([view.features["roughness"][..., 0] for view in buffers]) * known,
+        metalness=_metalness(buffers, truth),
         masks=coverage >= MIN_OBJECT_COVERAGE,
         images=_rendered_views(cfg, asset, geometry, buffers, estimated_light, views, capture, "the estimated light"),
         relit=_relit_views(cfg, asset, geometry, buffers, albedo, alignment, capture, truth),
@@ -70,6 +71,13 @@ def predict_views(
         if truth.elsewhere is None
         else _views_elsewhere(cfg, asset, geometry, alignment, truth.elsewhere),
     )
+
+
+def _metalness(buffers: list[Buffers], truth: Truth) -> Float[Tensor, "v h w"] | None:
+    """Metalness of the views if there is metal; where only the truth has metal, it is 0."""
+    if "metalness" in buffers[0].features:
+        return torch.stack([view.features["metalness"][..., 0] for view in buffers])
+    return None if truth.metalness is None else torch.stack([torch.zeros_like(view.alpha) for view in buffers])
 
 
 def align_views(

@@ -45,14 +45,18 @@ class Textures:
     """Linear, perceptual."""
     normal: UInt8[np.ndarray, "r r 3"]
     """Tangent space: x along the tangent, y along the bitangent, z outwards."""
+    metalness: UInt8[np.ndarray, "r r"] | None = None
+    """Linear; None for an object without metal."""
 
     def enlarged(self, resolution: int) -> "Textures":
         """The textures at another resolution, interpolated bilinearly."""
-        size = (resolution, resolution)
-        maps = (self.base_color, self.roughness, self.normal)
-        return Textures(
-            *(x if len(x) == resolution else cv2.resize(x, size, interpolation=cv2.INTER_LINEAR) for x in maps)
-        )
+
+        def scaled(x: np.ndarray) -> np.ndarray:
+            size = (resolution, resolution)
+            return x if len(x) == resolution else cv2.resize(x, size, interpolation=cv2.INTER_LINEAR)
+
+        metalness = None if self.metalness is None else scaled(self.metalness)
+        return Textures(scaled(self.base_color), scaled(self.roughness), scaled(self.normal), metalness)
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,9 @@ def bake(asset: Asset, mesh: UnwrappedMesh, *, resolution: int, views: int, pixe
     # A normal map cannot hold normals that point into the mesh.
     local = normalize(torch.cat([local[:, :2], local[:, 2:].clamp(min=0.05)], -1), dim=-1)
     encoded = torch.cat([srgb_from_linear(albedo), roughness, 0.5 + 0.5 * local], -1)
-    image = _texture_image(texels, encoded, resolution)
-    return Textures(image[..., :3], image[..., 3], image[..., 4:])
+    image, metalness = _texture_image(texels, encoded, resolution), asset.material.metalness
+    metal = None if metalness is None else nearest_gaussian_texture(metalness, asset, mesh, resolution=resolution)
+    return Textures(image[..., :3], image[..., 3], image[..., 4:], metal)
 
 
 @torch.no_grad()

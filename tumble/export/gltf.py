@@ -61,7 +61,7 @@ class _Buffer:
 
 
 def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float, metres: float) -> None:
-    """Write a GLB with one mesh and one dielectric metallic-roughness material.
+    """Write a GLB with one mesh and one metallic-roughness material, a dielectric unless the textures have metalness.
 
     The tangents are those that the normal map was baked with.
 
@@ -72,8 +72,8 @@ def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float,
     """
     buffer = _Buffer()
     rough = textures.roughness
-    red, blue = np.full_like(rough, 255), np.zeros_like(rough)
-    maps = (textures.base_color, np.stack([red, rough, blue], -1), textures.normal)
+    metal = np.zeros_like(rough) if textures.metalness is None else textures.metalness
+    maps = (textures.base_color, np.stack([np.full_like(rough, 255), rough, metal], -1), textures.normal)
     images = [buffer.png(encoded) for encoded in in_threads(_png, maps)]
     vertices = (flat.vertices * metres).astype(np.float32)
     short_indices = len(vertices) < 65535
@@ -89,7 +89,7 @@ def write_glb(path: Path, flat: UnwrappedMesh, textures: Textures, *, f0: float,
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": 0},
             "metallicRoughnessTexture": {"index": 1},
-            "metallicFactor": 0.0,
+            "metallicFactor": 0.0 if textures.metalness is None else 1.0,
         },
         "normalTexture": {"index": 2},
     }

@@ -53,10 +53,12 @@ def splat_columns(asset: Asset, metres: float) -> dict[str, Float[np.ndarray, " 
 
 @torch.no_grad()
 def material_columns(asset: Asset) -> dict[str, Float[np.ndarray, " n"]]:
-    """Columns of the material: linear albedo, perceptual roughness and F0, mean over a Gaussian's corners."""
+    """Columns of the material: linear albedo, perceptual roughness and F0, means over a Gaussian's corners; metalness
+    if there is metal."""
     material = asset.material
     assert material is not None, "the asset has no material"
     albedo = material.albedo.mean(1)
     columns = {f"albedo_{i}": albedo[:, i] for i in range(3)}
     columns |= {"roughness": material.roughness.mean(1), "f0": material.f0.expand(len(albedo))}
+    columns |= {} if material.metalness is None else {"metalness": material.metalness}
     return {name: values.cpu().numpy() for name, values in columns.items()}

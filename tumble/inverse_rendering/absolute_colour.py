@@ -48,6 +48,8 @@ WHITE_CUTOFF = 0.6
 """Length of the deviation from which the brightest paint rather counts as coloured (Geman-McClure) [log albedo]."""
 MEAN_ALBEDO = 0.25
 """Typical mean albedo of an object."""
+MEAN_METAL = 0.6
+"""Typical reflectance of a metal at normal incidence: about 0.5 (iron, titanium) to 0.9 (aluminium)."""
 MEAN_ALBEDO_SD = 0.4
 """Standard deviation of the logarithm of the mean albedo."""
 MAX_ALBEDO = 0.9
@@ -114,13 +116,17 @@ def shaded_pixels(asset: Asset, capture: Capture) -> ShadedPixels:
 
 
 @torch.no_grad()
-def estimate(pixels: ShadedPixels, f0: float, known_white: Float[Tensor, "3"] | None = None) -> Estimate:
+def estimate(
+    pixels: ShadedPixels, f0: float, known_white: Float[Tensor, "3"] | None = None, *, metalness: float = 0.0
+) -> Estimate:
     """The most likely factor per channel, and its uncertainty.
 
     Args:
         pixels: From `shaded_pixels`.
         f0: Reflectance at normal incidence of the asset.
         known_white: From `known_white`, if the user has named a pixel; its mean does not count.
+        metalness: Mean metalness of the asset. Metal has no highlight beside its own colour that would tell its
+            brightness from that of the light.
     """
     if not len(pixels.albedo):
         return Estimate(torch.zeros(3).to(pixels.albedo), torch.full((3,), MEAN_ALBEDO_SD).to(pixels.albedo))
@@ -129,15 +135,17 @@ def estimate(pixels: ShadedPixels, f0: float, known_white: Float[Tensor, "3"] | 
     colour = eye - ones / 3
     paint = albedo.quantile(WHITE_QUANTILE, dim=0).clamp_min(1e-3).log()
     lightness = (albedo @ albedo.new_tensor(LUMINANCE)).mean().log()
-    highlights = f0 / DIELECTRIC * pixels.specular.double().mean(0)
+    dielectric = max(1 - metalness, 1e-3)
+    highlights = f0 / DIELECTRIC * dielectric * pixels.specular.double().mean(0)
     ratio = (albedo * pixels.diffuse).mean(0) / highlights.clamp_min(1e-6)
     contrast = pixels.diffuse.mean(-1).std() / pixels.diffuse.mean()
-    grey = HIGHLIGHT_SD / contrast.clamp_min(0.01)
+    grey = HIGHLIGHT_SD / contrast.clamp_min(0.01) / dielectric
+    mean_albedo = MEAN_ALBEDO ** (1 - metalness) * MEAN_METAL**metalness
     hue = colour @ (SHADING_ERROR * ratio).square().reciprocal().diag() @ colour
     fixed = [
         (colour / NEUTRAL_SD**2, light),
         (hue + ones / (3 * grey) ** 2, torch.zeros_like(light)),
-        (ones / (3 * MEAN_ALBEDO_SD) ** 2, (math.log(MEAN_ALBEDO) - lightness).expand(3)),
+        (ones / (3 * MEAN_ALBEDO_SD) ** 2, (math.log(mean_albedo) - lightness).expand(3)),
     ]
     if known_white is not None:
         fixed.append((colour / KNOWN_WHITE_SD**2, known_white.to(albedo)))

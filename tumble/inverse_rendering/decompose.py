@@ -25,6 +25,7 @@ from tumble.inverse_rendering.material_params import (
     shifted_material,
     with_half_the_contrast,
     with_lobe,
+    with_metal,
     without_corners,
 )
 from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_at, sample_pixels
@@ -67,7 +68,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 22
+VERSION = 23
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -80,6 +81,8 @@ TRIAL_STEPS = 200
 """Number of first steps that are made with and without a specular lobe; at most a third of the run."""
 MIN_EXPLAINED = 0.07
 """Smallest part of the photometric error without a specular lobe that a lobe must explain, or the object has none."""
+MIN_METAL = 0.1
+"""Fraction of the object's pixels that must show regions which may be metal for metal to be tried."""
 MAX_HALVINGS = 3
 """Maximum number of times that the contrast of the first albedo is halved."""
 BLOCKERS = f"{CACHE}blocker"
@@ -115,6 +118,8 @@ class Rates:
     """Learning rate of the roughness logits."""
     roughness_shift: float = 0.0
     """Learning rate of the common shift of all roughness logits; the paper has none."""
+    metalness: float = 0.0
+    """Learning rate of the metalness logits. If it is 0, no object has metal, as in the paper."""
     normal: float = 1e-3
     """Learning rate of the normal offsets."""
     specular_scale: float = 0.0
@@ -233,14 +238,15 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     )
     params = optim.leaves(params)
     sets = [fibonacci_sphere(cfg.directions).to(albedo) @ random_rotation(rng).to(albedo).T for _ in range(cfg.sets)]
-    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, {"directions": torch.stack(sets)})
+    rates = learning_rates(cfg, params.material)
+    state = State(0, params, optim.adam(params, rates), rng, {"directions": torch.stack(sets)})
     _trace_visibility(cfg, inputs, state)
     return choose_start(cfg, inputs, state) if cfg.try_matte else state
 
 
 def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
-    """The state after the first steps with or without a specular lobe, and with a contrast of the albedo, whichever
-    explains the frames better by then.
+    """The state after the first steps with or without a specular lobe, as metal where it may be, and with a contrast of
+    the albedo, whichever explains the frames better by then.
 
     Albedos make up for a change of the lobe, so that neither is ahead, and both take the same steps with their own
     light. A lobe that explains less than `MIN_EXPLAINED` of the error compensates for errors of light and shape. One
@@ -249,7 +255,8 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     """
     params = state.params
     before = params.log_specular_scale.detach().exp()
-    fitted = specular_fit.fit(_samples(cfg, inputs, state), len(params.gaussians.means))
+    samples = _samples(cfg, inputs, state)
+    fitted = specular_fit.fit(samples, len(params.gaussians.means))
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
     glossy = with_lobe(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
     matte = with_lobe(params, before * fitted.albedo_per_scale, NO_LOBE)
@@ -257,6 +264,12 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     start = glossy
     if error >= (1 - MIN_EXPLAINED) * error_without:
         best, error, start = without, error_without, matte
+    regions = specular_fit.metal_regions(fitted, params.gaussians.means)
+    if cfg.rates.metalness and float(regions[samples.gaussian].float().mean()) > MIN_METAL:
+        metal = with_metal(glossy, regions)
+        metallic, error_of_metal = _trial(cfg, inputs, state, metal)
+        if error_of_metal < error:
+            best, error, start = metallic, error_of_metal, metal
     for _ in range(MAX_HALVINGS):
         start = with_half_the_contrast(start)
         flatter, error_of_flatter = _trial(cfg, inputs, state, start)
@@ -275,7 +288,7 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
     cfg = replace(cfg, warmup=steps, doublings=0)
     params, rng = optim.leaves(start), torch.Generator()
     rng.set_state(before.rng.get_state())
-    state = State(0, params, optim.adam(params, learning_rates(cfg)), rng, dict(before.memory))
+    state = State(0, params, optim.adam(params, learning_rates(cfg, params.material)), rng, dict(before.memory))
     errors = []
     for state.step in range(steps):
         errors.append(step(cfg, inputs, state)["render"])
@@ -322,9 +335,11 @@ def _correction(params: Params, inputs: Inputs, frame: Index | slice) -> SE3:
     return correction @ pose_network.correction(params.poses, before, frame).inverse() if now and before else correction
 
 
-def learning_rates(cfg: Config) -> dict[str, float]:
+def learning_rates(cfg: Config, material: Material) -> dict[str, float]:
     """Learning rates by name prefix of the parameters."""
     rates, learned = cfg.rates, _learns_network(cfg)
+    of_metal = {} if material.metal_logits is None else {"material.metal_logits": rates.metalness}
+    of_network = {"pose_network": rates.poses} if learned else {}
     return {
         "material.albedo_logits": rates.albedo,
         "material.roughness_logits": rates.roughness,
@@ -340,7 +355,9 @@ def learning_rates(cfg: Config) -> dict[str, float]:
         "gamma": 0.0,
         "poses": 0.0 if learned else rates.poses,
         "log_specular_scale": rates.specular_scale,
-    } | ({"pose_network": rates.poses} if learned else {})
+        **of_metal,
+        **of_network,
+    }
 
 
 def _caches_visibility(cfg: Config) -> bool:
@@ -474,20 +491,21 @@ def _render_term(
     f0 = params.material.f0 * params.log_specular_scale.exp()
     bounce = _bounce(cfg, state, params, mean_albedo)
     light = prefilter(params.environment) if cfg.lobes == "split" else None
-    cached = cfg.visibility and cfg.shadows == "cached"
-    if cached and light is not None and not light.is_finer and not isinstance(bounce, AveragedBounce):
+    has_kernel = cfg.visibility and cfg.shadows == "cached" and params.material.metal_logits is None
+    if has_kernel and light is not None and not light.is_finer and not isinstance(bounce, AveragedBounce):
         shading = shading_light(light, _cached_visibility(cfg, state, shown.current), bounce)
         pose = (shown.T_cam_obj, shown.R_env_obj)
         return losses.shading_term(shown.view, shown.pixels, shown.photo, camera, *pose, shading, f0)
     view, pixels = with_offset(shown.view), shown.pixels.clamp_min(0)
     points = surface(view, shown.T_cam_obj, camera, pixels=pixels)
     albedo, rough, _ = points.sample(view.features["material"]).split([3, 1, 3], -1)
+    metalness = points.sample(view.features["metalness"]) if "metalness" in view.features else None
     visible = _pixel_visibility(cfg, state, params, points, _dominant_gaussian(view, points), shown.current)
     material, lit = (points, albedo, rough), (shown.R_env_obj, visible)
     if light is None:
         shaded = shade(*material, params.environment, *lit, f0=f0, bounce=bounce)
     else:
-        shaded = shade_split(*material, light, *lit, f0=f0, bounce=bounce)
+        shaded = shade_split(*material, light, *lit, f0=f0, bounce=bounce, metalness=metalness)
     rendered, wanted = (shaded * points.sample(view.alpha[..., None])), points.sample(shown.photo).to(albedo) / 255
     error = (losses.srgb_as_captured(rendered[None], wanted[None]) - wanted).abs()[0]
     return (error * (shown.pixels >= 0)[:, None]).mean()
@@ -504,7 +522,8 @@ def _bounce(cfg: Config, state: State, params: Params, albedo: Float[Tensor, "n 
         return None
     if cfg.bounce == "average":
         return AveragedBounce(params.gaussians.sh[:, 0] / math.sqrt(4 * math.pi))
-    return Bounce(albedo, state.memory["transfer"])
+    metalness = params.material.metalness
+    return Bounce(albedo if metalness is None else albedo * (1 - metalness[:, None]), state.memory["transfer"])
 
 
 def _pixel_visibility(

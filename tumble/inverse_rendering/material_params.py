@@ -1,16 +1,19 @@
 """The parameters of stage 3, and equal or simpler ones."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.inverse_rendering import specular_fit
-from tumble.scene import Environment, Gaussians, Material
+from tumble.scene import TEMPERATURE, Environment, Gaussians, Material
 
 ALBEDO_RANGE = (0.003, 0.98)
 """Range of the initial albedo. The lower limit is that of saturated colours: logits would need long to reach it."""
+LIKELY_METAL = 0.9
+"""First metalness of what may be metal; that of the rest is 1 minus this."""
 NO_LOBE = -200.0
 """Logarithmic specular scale of an object without a specular lobe: its exponential is 0, as are all gradients."""
 
@@ -46,6 +49,14 @@ def with_lobe(params: Params, brighter: Float[Tensor, "n 3"], log_scale: float) 
 
 
 @torch.no_grad()
+def with_metal(params: Params, regions: Bool[Tensor, " n"]) -> Params:
+    """The parameters of an object some of whose Gaussians are rather metal; the others are rather not."""
+    logit = TEMPERATURE * math.log(LIKELY_METAL / (1 - LIKELY_METAL))
+    logits = logit * (2 * regions.to(params.gamma) - 1)
+    return replace(params, material=replace(params.material, metal_logits=logits))
+
+
+@torch.no_grad()
 def with_half_the_contrast(params: Params) -> Params:
     """The parameters with half the contrast of the albedo about its geometric mean."""
     log_albedo = params.material.albedo.log()
@@ -60,8 +71,8 @@ def without_corners(params: Params) -> Params:
         return x.mean(1, keepdim=True).expand_as(x)
 
     m = params.material
-    material = Material(mean(m.albedo_logits), mean(m.roughness_logits), mean(m.normal_offset), m.f0_logit)
-    return replace(params, material=material)
+    means = {name: mean(getattr(m, name)) for name in ("albedo_logits", "roughness_logits", "normal_offset")}
+    return replace(params, material=replace(m, **means))
 
 
 def shifted_material(params: Params) -> Material:

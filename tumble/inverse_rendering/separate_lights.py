@@ -48,7 +48,8 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     state = decompose.init(cfg.base, _in_object_frame(inputs), rng)
     others = {str(block): state.params.environment for block in range(1, len(_blocks(cfg, inputs)))}
     state.params = optim.leaves(Params(**vars(state.params), others=others))
-    rates = decompose.learning_rates(cfg.base) | ({"others": cfg.base.rates.light} if others else {})
+    rates = decompose.learning_rates(cfg.base, state.params.material)
+    rates |= {"others": cfg.base.rates.light} if others else {}
     state.optimizer = optim.adam(state.params, rates)
     return state
 

@@ -7,12 +7,14 @@ scale are strongly correlated, so that gradient descent from a wrong scale has t
 starts from the best albedos for its lobe (variable projection, Golub and Pereyra 1973).
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from tumble.maths import neighbours
 from tumble.scene import DIELECTRIC, Material
 
 MAX_ALBEDO = 0.9
@@ -25,6 +27,11 @@ CLIPPED = 0.95
 """Linear radiance from which a pixel counts as clipped and is ignored."""
 REWEIGHTINGS = 6
 """Iterations of reweighted least squares, which converge to least absolute errors."""
+NEIGHBOURS = 256
+"""Number of neighbouring Gaussians that are judged together: about a fiftieth of the surface."""
+MAX_ERROR_RATIO = math.sqrt(2)
+"""Largest error as metal, relative to that as a dielectric, of a region that may be metal. Under the blurred light of
+stage 2 the ratio is about 1 where there is metal, and 2 where there is none."""
 ERROR_FLOOR = 0.005
 """Absolute error below which all residuals have the same weight [sRGB]."""
 
@@ -51,6 +58,10 @@ class SpecularFit:
     """Strength of the specular lobe relative to F0 = 0.04."""
     albedo_per_scale: Float[Tensor, "n 3"]
     """Decrease of each Gaussian's best albedo per unit of specular scale; 0 where no usable pixel shows it."""
+    error: Float[Tensor, " n"]
+    """Absolute error of each Gaussian's pixels as a dielectric [sRGB, sum]."""
+    error_as_metal: Float[Tensor, " n"]
+    """Likewise as a metal: with a specular lobe in its best colour, and no diffuse one."""
 
 
 @torch.no_grad()
@@ -63,7 +74,7 @@ def fit(samples: Samples, n: int) -> SpecularFit:
     x, s, y = samples.diffuse, samples.specular, samples.photo
     # The derivative of sRGB's curve, finite at black.
     sensitivity = 1.055 / 2.4 * y.clamp(0.004, 1) ** (1 / 2.4 - 1) * (y < CLIPPED)
-    scale, of_lobe, weight = y.new_zeros(()), y.new_zeros(n, 3), sensitivity.square()
+    scale, of_lobe, weight, rest, lobe = y.new_zeros(()), y.new_zeros(n, 3), sensitivity.square(), y, s
 
     def sum_by_gaussian(values: Tensor) -> Tensor:
         return values.new_zeros(n, 3).index_add_(0, samples.gaussian, values)
@@ -75,7 +86,28 @@ def fit(samples: Samples, n: int) -> SpecularFit:
         rest, lobe = (z - albedo[samples.gaussian] * x for z, albedo in ((y, of_photo), (s, of_lobe)))
         scale = (weight * lobe * rest).sum() / (weight * lobe.square()).sum().clamp_min(1e-12)
         weight = sensitivity.square() / ((rest - scale * lobe).mul(sensitivity).abs() + ERROR_FLOOR)
-    return SpecularFit(max(float(scale), MIN_SCALE), of_lobe)
+    as_dielectric = ((rest - scale * lobe) * sensitivity).abs()
+    as_metal, weight = as_dielectric, sensitivity.square()
+    for _ in range(REWEIGHTINGS):
+        colour = sum_by_gaussian(weight * s * y) / sum_by_gaussian(weight * s.square()).clamp_min(1e-9)
+        as_metal = ((y - colour[samples.gaussian] * s) * sensitivity).abs()
+        weight = sensitivity.square() / (as_metal + ERROR_FLOOR)
+    errors = (sum_by_gaussian(x).sum(-1) for x in (as_dielectric, as_metal))
+    return SpecularFit(max(float(scale), MIN_SCALE), of_lobe, *errors)
+
+
+@torch.no_grad()
+def metal_regions(fitted: SpecularFit, means: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Gaussians in whose neighbourhood metal explains the pixels about as well as a dielectric (`MAX_ERROR_RATIO`).
+
+    Args:
+        fitted: Result of `fit`.
+        means: Centres of the Gaussians.
+    """
+    errors = torch.stack([fitted.error, fitted.error_as_metal], -1)
+    parts = [errors[near].sum(1) for near in neighbours(means, min(NEIGHBOURS, len(means)))]
+    as_dielectric, as_metal = torch.cat(parts).unbind(-1)
+    return as_metal < MAX_ERROR_RATIO * as_dielectric
 
 
 @torch.no_grad()

@@ -28,7 +28,7 @@ from tumble.maths.images import (
     to_srgb8,
 )
 from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, select_rows
-from tumble.maths.points import nearest, smallest_enclosing_sphere
+from tumble.maths.points import nearest, neighbours, smallest_enclosing_sphere
 from tumble.maths.se3 import SE3, SO3, angle_between, interpolate, mean_rotation, umeyama
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "mean_rotation",
     "minimise",
     "nearest",
+    "neighbours",
     "to_srgb8",
     "random_rotation",
     "reflect",

@@ -1,13 +1,14 @@
 """Point sets: nearest neighbours and smallest enclosing spheres."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 CHUNK_ROWS = 1024
-"""Rows of the distance matrix that a GPU computes at once; limits memory and does not affect results."""
+"""Rows of the distance matrix that are computed at once; limits memory and does not affect results."""
 
 
 def nearest(x: Float[Tensor, "a 3"], y: Float[Tensor, "b 3"]) -> Int64[Tensor, " a"]:
@@ -18,6 +19,21 @@ def nearest(x: Float[Tensor, "a 3"], y: Float[Tensor, "b 3"]) -> Int64[Tensor, "
         return torch.from_numpy(KDTree(y.detach().numpy()).query(x.detach().numpy())[1]).long()
     indices = [torch.cdist(rows, y).argmin(1) for rows in x.split(CHUNK_ROWS)]
     return torch.cat([*indices, torch.zeros(0, dtype=torch.long, device=x.device)])
+
+
+def neighbours(x: Float[Tensor, "n 3"], k: int) -> Iterator[Int64[Tensor, "rows {k}"]]:
+    """Indices of the `k` points nearest to each point, itself among them, some rows at a time."""
+    if x.device.type == "cpu":
+        from scipy.spatial import KDTree
+
+        points = x.detach().numpy()
+        tree = KDTree(points)
+        for start in range(0, len(points), CHUNK_ROWS):
+            found = tree.query(points[start : start + CHUNK_ROWS], k=k)[1]
+            yield torch.from_numpy(np.reshape(found, (-1, k))).long()
+        return
+    for rows in x.split(CHUNK_ROWS):
+        yield torch.cdist(rows, x).topk(k, largest=False).indices
 
 
 def smallest_enclosing_sphere(

@@ -4,10 +4,11 @@ Directions are unit vectors that point away from the surface, `wi` to the light 
 normal. `h` is the half vector between both, `nol`, `nov`, `noh`, `voh` are cosines between n, wi (l), wo (v) and h.
 `roughness` is perceptual, r; GGX's alpha is a = r^2. `f0` is the reflectance at normal incidence. BRDF values are per
 steradian and do not include the cosine of the rendering equation. The Fresnel term is that of a dielectric of index 1.5
-(f0 0.04), scaled to f0.
+(f0 0.04), scaled to f0. Metals (`metal`) have Schlick's instead, as in glTF, with their base colour as f0.
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
@@ -42,12 +43,36 @@ def ggx(
     k = (r + 1)^2 / 8, which is made for point lights: under an environment map it halves the reflected radiance at
     grazing angles.
     """
+    without_fresnel, voh = _without_fresnel(wi, wo, n, roughness)
+    return without_fresnel * f0 * fresnel(voh)
+
+
+def metal(
+    wi: Float[Tensor, "*#b 3"],
+    wo: Float[Tensor, "*#b 3"],
+    n: Float[Tensor, "*#b 3"],
+    *,
+    albedo: Float[Tensor, "*#b 3"],
+    roughness: float | Float[Tensor, "*#b 1"],
+) -> Float[Tensor, "*#b 3"]:
+    """Specular lobe of a metal, like `ggx`, with the base colour `albedo` at normal incidence and 1 at grazing angles
+    (Schlick 1994)."""
+    without_fresnel, voh = _without_fresnel(wi, wo, n, roughness)
+    return without_fresnel * torch.lerp(albedo, torch.ones_like(albedo), schlick(voh))
+
+
+def _without_fresnel(wi: Tensor, wo: Tensor, n: Tensor, roughness: float | Tensor) -> tuple[Tensor, Tensor]:
+    """D G / (4 nol nov), 0 where light or eye are below the horizon, and the cosine of the half vector and the eye."""
     rough = _rough(roughness, wo)
     nol, nov = cosine(n, wi), cosine(n, wo)
-    above = (nol > 0) & (nov > 0)
     h = _half_vector(wi, wo, n)
-    value = _ndf(h, n, rough) * f0 * fresnel(cosine(wo, h)) * _visibility(nol, nov, rough)
-    return torch.where(above, value, 0.0)
+    value = _ndf(h, n, rough) * _visibility(nol, nov, rough)
+    return torch.where((nol > 0) & (nov > 0), value, 0.0), cosine(wo, h)
+
+
+def schlick(voh: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Part of the reflectance that grows to 1 at grazing angles: F = f0 + (1 - f0) * schlick (Schlick 1994)."""
+    return (1 - voh).clamp(0, 1) ** 5
 
 
 def fresnel(voh: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -69,14 +94,18 @@ def evaluate(
     albedo: Float[Tensor, "*#b 3"],
     roughness: float | Float[Tensor, "*#b 1"],
     f0: float | Float[Tensor, "*#b 1"],
+    metalness: Float[Tensor, "*#b 1"] | None = None,
 ) -> Float[Tensor, "*#b 3"]:
-    """Sum of both lobes (paper section 4.3), for `wi` above the horizon.
+    """Sum of both lobes (paper section 4.3), for `wi` above the horizon; mixed with `metal` by metalness, as in glTF.
 
     As in the paper, the diffuse lobe is not reduced by the specular reflectance, so energy is not conserved: with
     f0 = 0.04 a white surface reflects up to 1.40 of a uniform light at roughness 0.2, seen 8 degrees above its horizon,
     and 1.04 at normal incidence (test_a_white_surface_reflects_more_than_it_receives).
     """
-    return lambert(albedo) + ggx(wi, wo, n, roughness=roughness, f0=f0)
+    dielectric = lambert(albedo) + ggx(wi, wo, n, roughness=roughness, f0=f0)
+    if metalness is None:
+        return dielectric
+    return torch.lerp(dielectric, metal(wi, wo, n, albedo=albedo, roughness=roughness), metalness)
 
 
 def sample(
@@ -123,9 +152,22 @@ def pdf(
 def split_sum_table(size: int = 64) -> Float[Tensor, "{size} {size}"]:
     """Directional albedo of the specular lobe divided by f0: the second factor of the split sum.
 
-    First axis: nov from 0 to 1; second axis: roughness from `MIN_ROUGHNESS` to 1; both ends included. Integrated over a
-    fixed set of half vectors with a density proportional to D noh.
+    First axis: nov from 0 to 1; second axis: roughness from `MIN_ROUGHNESS` to 1; both ends included.
     """
+    return _directional_albedo(size, fresnel)
+
+
+def metal_split_sum_tables(size: int = 64) -> Float[Tensor, "2 {size} {size}"]:
+    """Directional albedo of a metal with the base colour c is c times the first table plus the second one.
+
+    Axes as in `split_sum_table`.
+    """
+    grazing = _directional_albedo(size, schlick)
+    return torch.stack([_directional_albedo(size, torch.ones_like) - grazing, grazing])
+
+
+def _directional_albedo(size: int, fresnel: Callable[[Tensor], Tensor]) -> Float[Tensor, "{size} {size}"]:
+    """Directional albedo of a specular lobe, over fixed half vectors with a density proportional to D noh."""
     rough = torch.linspace(MIN_ROUGHNESS, 1, size)[:, None]
     u = (torch.arange(SPLIT_SUM_SAMPLES) + 0.5) / SPLIT_SUM_SAMPLES
     azimuth = GOLDEN_ANGLE * torch.arange(SPLIT_SUM_SAMPLES)

@@ -42,8 +42,14 @@ def corner_features(material: Material) -> tuple[Float[Tensor, "n 4 7"], Float[T
 
 
 def rasterize_material(asset: HasMaterial, corners: Float[Tensor, "n 4 7"], T_cam_obj: SE3, camera: Camera) -> Buffers:
-    """View with the feature "material": albedo, roughness and normal offset; normals are those without the offset."""
-    return rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, {"material": corners})
+    """View with the feature "material": albedo, roughness and normal offset; normals are those without the offset.
+
+    The feature "metalness" is there, too, if the object has metal.
+    """
+    features, metalness = {"material": corners}, asset.material.metalness
+    if metalness is not None:
+        features["metalness"] = metalness[:, None, None].expand(-1, 4, 1)
+    return rasterize(asset.gaussians, asset.gamma, T_cam_obj, camera, features)
 
 
 def with_offset(view: Buffers) -> Buffers:
@@ -61,8 +67,9 @@ def render_gbuffer(
     """
     corners = corner_features(asset.material)[0] if corners is None else corners
     view = with_offset(rasterize_material(asset, corners, T_cam_obj, camera))
+    others = {name: image for name, image in view.features.items() if name != "material"}
     images = view.features["material"].split([3, 1, 3], -1)
-    return replace(view, features=dict(zip(("albedo", "roughness", "offset"), images, strict=True)))
+    return replace(view, features=dict(zip(("albedo", "roughness", "offset"), images, strict=True)) | others)
 
 
 @torch.no_grad()

@@ -138,6 +138,8 @@ class GlossyBounce:
     """Perceptual roughness of the Gaussians."""
     prefiltered: Prefiltered
     """The light, prefiltered for the specular lobes."""
+    metal: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 1"]] | None = None
+    """Linear base colour and metalness of the Gaussians; None for an object without metal."""
 
 
 @torch.no_grad()
@@ -154,6 +156,7 @@ def relight_surface(
     n_brdf: int = 512,
     n_light: int = 512,
     bounce: GlossyBounce | None = None,
+    metalness: Float[Tensor, "p 1"] | None = None,
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance of points under a light (paper section 4.4); unbiased for direct light.
 
@@ -169,6 +172,7 @@ def relight_surface(
         n_brdf: Samples per point by importance sampling of the BRDF.
         n_light: Samples per point by importance sampling of the light.
         bounce: Indirect light; occluded directions are black when None.
+        metalness: Metalness of the points; None for an object without metal. The kernel is not used for metals.
     """
     shift = torch.rand(len(surface.points), 3, generator=generator, dtype=albedo.dtype, device=generator.device)
     lattice = _lattice(n_brdf + n_light).to(albedo)
@@ -178,9 +182,9 @@ def relight_surface(
     )
     gaussians = None if bounce is None else _glossy_gaussians(bounce, tracer, R_env_obj)
     kernel = backends.relight_kernel(tracer.backend)
-    if kernel is not None:
+    if kernel is not None and metalness is None:
         return kernel(tracer.bvh, samples, light.tables, gaussians, R_env_obj, n_brdf, f0)
-    return relight_by_operations(samples, light, R_env_obj, tracer, n_brdf, f0, bounce, gaussians)
+    return relight_by_operations(samples, light, R_env_obj, tracer, n_brdf, f0, bounce, gaussians, metalness)
 
 
 def relight_by_operations(
@@ -192,8 +196,9 @@ def relight_by_operations(
     f0: float,
     bounce: GlossyBounce | None,
     gaussians: GlossyGaussians | None,
+    metalness: Float[Tensor, "p 1"] | None = None,
 ) -> Float[Tensor, "p 3"]:
-    """The definition of `RelightKernel` by operations of torch, for every device."""
+    """The definition of `RelightKernel` by operations of torch, for every device, and relighting of metals."""
     n_light, radiance = len(samples.lattice) - n_brdf, light.environment.radiance
     backend = backends.choose(radiance.device, radiance.dtype)
     chunk = max(1, MAX_RAYS // (n_brdf + n_light))
@@ -210,7 +215,8 @@ def relight_by_operations(
         wi_env = wi @ R_env_obj.mT
         density = n_brdf * brdf.pdf(wi, views, normals, roughness=rough) + n_light * light.pdf(wi_env)
         albedo = samples.albedo.index_select(0, index)
-        value = brdf.evaluate(wi, views, normals, albedo=albedo, roughness=rough, f0=f0)
+        metal = None if metalness is None else metalness.index_select(0, index)
+        value = brdf.evaluate(wi, views, normals, albedo=albedo, roughness=rough, f0=f0, metalness=metal)
         weight = torch.where(density > 0, value * brdf.cosine(wi, normals) / density, 0.0)
         origins = samples.origins.index_select(0, index)
         environment = backend.lookup(radiance[None], wi_env, torch.zeros_like(wi_env[:, 0]))
@@ -238,7 +244,9 @@ def _arriving_radiance(
     occluded = torch.where(hits.hit >= 0)[0]
     index = hits.hit[occluded].long()
     normals, roughness = gaussians.normals[index], gaussians.roughness[index]
-    glossy = specular(normals, -wi[occluded], roughness, bounce.prefiltered, R_env_obj, f0)
+    albedo, metalness = (None, None) if bounce.metal is None else (x[index] for x in bounce.metal)
+    seen = (normals, -wi[occluded], roughness, bounce.prefiltered, R_env_obj)
+    glossy = specular(*seen, f0, albedo=albedo, metalness=metalness)
     return arriving.index_add(0, occluded, (1 - hits.transmittance[occluded])[:, None] * glossy)
 
 

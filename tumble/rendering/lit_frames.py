@@ -1,6 +1,7 @@
 """Photographs with the light of each pixel, as stage 3 found it: photograph = albedo * diffuse + specular.
 
-Light, normals, roughness and shadows are those of the Gaussians. Radiance is linear RGB.
+On metal the albedo is the reflectance at normal incidence, and "diffuse" the mirrored light that it colours. Light,
+normals, roughness and shadows are those of the Gaussians. Radiance is linear RGB.
 """
 
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from tumble.maths import SE3, fibonacci_sphere, linear_from_srgb
 from tumble.rendering.gbuffer import render_gbuffer
 from tumble.rendering.prefiltered_light import prefilter
-from tumble.rendering.shading import Bounce, split_lobes, surface
+from tumble.rendering.shading import Bounce, coloured_lobes, material_at, surface
 from tumble.rendering.trace import build_tracer, surface_points, transfer, visibility
 from tumble.scene import OBJECT, Asset, Camera, Capture
 
@@ -40,7 +41,7 @@ class LitFrame:
     usable: Bool[np.ndarray, "h w"]
     """Pixels that show one surface of the object for certain, unsaturated."""
     diffuse: Float[np.ndarray, "h w 3"]
-    """Radiance of a white surface without highlights."""
+    """Radiance per albedo; on a dielectric that of a white surface without highlights."""
     specular: Float[np.ndarray, "h w 3"]
     """Radiance of the highlights."""
     mask: UInt8[np.ndarray, "h w"]
@@ -80,7 +81,7 @@ def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
     points = surface_points(gaussians, asset.gamma, poses, camera)
     tracer = build_tracer(gaussians, asset.gamma)
     traced = visibility(tracer, points, gaussians.normals, directions, blockers=True)
-    bounce = Bounce(material.albedo.mean(1), transfer([traced], gaussians.normals))
+    bounce = Bounce(material.diffuse_albedo, transfer([traced], gaussians.normals))
     for i, T_cam_obj in zip(frames, poses, strict=True):
         view = render_gbuffer(asset, T_cam_obj, camera)
         code_values, mask = capture.images[i].cpu().numpy(), capture.masks[i].cpu().numpy()
@@ -88,10 +89,11 @@ def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
         pixels = torch.where(torch.from_numpy(usable).to(view.alpha.device).flatten())[0]
         shown = surface(view, T_cam_obj, camera, pixels=pixels)
         gaussian = view.dominant.flatten()[pixels].clamp_min(0).long()
-        rough = shown.sample(view.features["roughness"])
-        lobes = split_lobes(shown, rough, light, asset.trajectory.R_env_obj[i], traced.gather(gaussian), bounce=bounce)
+        _, rough, metalness = material_at(view, shown)
+        lit = (shown, rough, light, asset.trajectory.R_env_obj[i], traced.gather(gaussian))
+        lobes = coloured_lobes(*lit, f0=float(material.f0), bounce=bounce, metalness=metalness)
         diffuse, specular = (shown.paint(x, camera.height, camera.width).cpu().numpy() for x in lobes)
         photo = linear_from_srgb(capture.images[i].float() / 255).cpu().numpy()
         pose = SE3(T_cam_obj.wxyz.cpu(), T_cam_obj.xyz.cpu())
         lens = Camera(camera.fx_fy_cx_cy.cpu(), camera.height, camera.width)
-        yield LitFrame(photo, usable, diffuse, float(material.f0) * specular, mask, pose, lens)
+        yield LitFrame(photo, usable, diffuse, specular, mask, pose, lens)

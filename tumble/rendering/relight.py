@@ -16,7 +16,7 @@ from tumble.rendering.gbuffer import antialiased_gbuffer
 from tumble.rendering.importance_sampling import GlossyBounce, light_sampler, relight_surface
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import Buffers
-from tumble.rendering.shading import Bounce, Surface, shade_split, surface
+from tumble.rendering.shading import Bounce, Surface, material_at, shade_split, surface
 from tumble.rendering.trace import Tracer, build_tracer, surface_points, transfer, unoccluded, visibility
 from tumble.scene import Asset, Camera, Environment, Trajectory, opengl_from_opencv
 
@@ -86,14 +86,17 @@ def relight(
     material = asset.material
     geometry = geometry or trace_geometry(asset)
     sampler = light_sampler(environment)
-    diffuse = Bounce(material.albedo.mean(1), geometry.transfer)
-    bounce = GlossyBounce(diffuse, material.roughness.mean(1, keepdim=True), prefilter(environment))
+    diffuse = Bounce(material.diffuse_albedo, geometry.transfer)
+    rough, metalness = material.roughness.mean(1, keepdim=True), material.metalness
+    metal = None if metalness is None else (material.albedo.mean(1), metalness[:, None])
+    bounce = GlossyBounce(diffuse, rough, prefilter(environment), metal)
     generator = torch.Generator().manual_seed(seed)
     for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera, buffers):
+        albedo, roughness, metalness = material_at(view, points)
         shaded = relight_surface(
             points,
-            points.sample(view.features["albedo"]),
-            points.sample(view.features["roughness"]),
+            albedo,
+            roughness,
             sampler,
             R_env_obj,
             geometry.tracer,
@@ -102,6 +105,7 @@ def relight(
             n_brdf=cfg.brdf_samples,
             n_light=cfg.light_samples,
             bounce=bounce,
+            metalness=metalness,
         )
         yield points.paint(shaded, camera.height, camera.width) * view.alpha[..., None]
 
@@ -115,15 +119,9 @@ def preview(
     prefiltered = prefilter(environment)
     directions = fibonacci_sphere(cfg.preview_directions).to(asset.gaussians.means)
     for view, points, R_env_obj in _surfaces(cfg, asset, trajectory, camera):
-        shaded = shade_split(
-            points,
-            points.sample(view.features["albedo"]),
-            points.sample(view.features["roughness"]),
-            prefiltered,
-            R_env_obj,
-            unoccluded(directions, len(points.points)),
-            f0=float(material.f0),
-        )
+        albedo, roughness, metalness = material_at(view, points)
+        lit = (prefiltered, R_env_obj, unoccluded(directions, len(points.points)))
+        shaded = shade_split(points, albedo, roughness, *lit, f0=float(material.f0), metalness=metalness)
         yield points.paint(shaded, camera.height, camera.width) * view.alpha[..., None]
 
 
@@ -133,6 +131,7 @@ def gaussian_colours(asset: Asset, frame: int = 0) -> Float[Tensor, "n 3"]:
     material, normals, n = asset.material, asset.gaussians.normals, len(asset.gaussians)
     points = Surface(torch.arange(n, device=normals.device), asset.gaussians.means, normals, normals)
     unshadowed = unoccluded(fibonacci_sphere(VISIBILITY_DIRECTIONS).to(normals), n)
+    metalness = material.metalness
     return shade_split(
         points,
         material.albedo.mean(1),
@@ -141,6 +140,7 @@ def gaussian_colours(asset: Asset, frame: int = 0) -> Float[Tensor, "n 3"]:
         asset.trajectory.R_env_obj[frame],
         unshadowed,
         f0=float(material.f0),
+        metalness=None if metalness is None else metalness[:, None],
     )
 
 

@@ -12,6 +12,7 @@ images use `importance_sampling.relight_surface` instead.
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32, Int64, Shaped
@@ -79,12 +80,21 @@ def surface(
     return Surface(pixels, points, normals, normalize(-ray_cam @ R_cam_obj, dim=-1))
 
 
+def material_at(
+    view: Buffers, points: Surface
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 1"], Float[Tensor, "p 1"] | None]:
+    """Linear albedo, roughness and metalness (None for an object without metal) of a G-buffer's surface points."""
+    metalness = view.features.get("metalness")
+    of_points = points.sample(view.features["albedo"]), points.sample(view.features["roughness"])
+    return *of_points, None if metalness is None else points.sample(metalness)
+
+
 @dataclass(frozen=True)
 class Bounce:
     """Indirect light from the shadowed diffuse radiance of every Gaussian under the light of the frame."""
 
     albedo: Float[Tensor, "n 3"]
-    """Linear base colour of every Gaussian."""
+    """Linear albedo of every Gaussian's diffuse lobe."""
     transfer: Float[Tensor, "n 9"]
     """Transfer vector of every Gaussian (`trace.transfer`)."""
 
@@ -165,15 +175,41 @@ def shade_split(
     *,
     f0: float | Float[Tensor, "*c"],
     bounce: Bounce | AveragedBounce | None = None,
+    metalness: Float[Tensor, "p 1"] | None = None,
 ) -> Float[Tensor, "p 3"]:
     """Reflected radiance with wide lobes summed over the directions, and narrow specular lobes by the split sum.
 
     The split sum is multiplied by the visible fraction of the specular lobe (`Backend.shade`). It is not used for wide
     lobes (`NARROW_ROUGHNESS`), since it is up to 1.6 times too bright at grazing angles, where the horizon cuts the
-    lobe (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`.
+    lobe (test_a_wide_lobe_matches_the_path_tracer). Arguments as for `shade`, and the points' metalness: None for 0.
     """
-    diffuse, specular = split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce=bounce)
-    return albedo * diffuse + f0 * specular
+    lit = (surface, roughness, prefiltered, R_env_obj, visibility)
+    of_colour, other = coloured_lobes(*lit, f0=f0, bounce=bounce, metalness=metalness)
+    return albedo * of_colour + other
+
+
+def coloured_lobes(
+    surface: Surface,
+    roughness: Float[Tensor, "p 1"],
+    prefiltered: Prefiltered,
+    R_env_obj: Float[Tensor, "3 3"],
+    visibility: Visibility,
+    *,
+    f0: float | Float[Tensor, "*c"],
+    bounce: Bounce | AveragedBounce | None = None,
+    metalness: Float[Tensor, "p 1"] | None = None,
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
+    """Radiance of `shade_split` per base colour, and that without the base colour; both are linear in metalness.
+
+    The base colour of a dielectric is that of its diffuse lobe, that of a metal its reflectance at normal incidence.
+    The lobe of a metal is a split sum for every roughness.
+    """
+    lobes = _split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce)
+    if metalness is None:
+        return lobes.diffuse, f0 * lobes.specular
+    reflectance = _metal_reflectance(surface.normals, surface.views, roughness)
+    of_colour, of_all = (lobes.mirrored * x for x in reflectance)
+    return torch.lerp(lobes.diffuse, of_colour, metalness), torch.lerp(f0 * lobes.specular, of_all, metalness)
 
 
 def split_lobes(
@@ -186,6 +222,29 @@ def split_lobes(
     bounce: Bounce | AveragedBounce | None = None,
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
     """Diffuse and specular radiance of `shade_split` for an albedo and a reflectance at normal incidence of 1."""
+    lobes = _split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce)
+    return lobes.diffuse, lobes.specular
+
+
+class _SplitLobes(NamedTuple):
+    """Radiance of the lobes of `shade_split`."""
+
+    diffuse: Float[Tensor, "p 3"]
+    """Of a white diffuse lobe."""
+    specular: Float[Tensor, "p 3"]
+    """Of a dielectric's specular lobe, per reflectance at normal incidence."""
+    mirrored: Float[Tensor, "p 3"]
+    """Mean over a specular lobe, times its visible fraction."""
+
+
+def _split_lobes(
+    surface: Surface,
+    roughness: Float[Tensor, "p 1"],
+    prefiltered: Prefiltered,
+    R_env_obj: Float[Tensor, "3 3"],
+    visibility: Visibility,
+    bounce: Bounce | AveragedBounce | None,
+) -> _SplitLobes:
     # One lookup for both kinds of directions, since its gradient is an image of the size of all levels.
     mirrored = reflect(surface.views, surface.normals)
     in_env = torch.cat([visibility.directions, mirrored]) @ R_env_obj.mT
@@ -193,11 +252,10 @@ def split_lobes(
     radiance = prefiltered.lookup(in_env, torch.cat([cell, roughness]))
     light, of_mirrored = radiance.split([len(cell), len(mirrored)])
     lobes = _lobes(surface, roughness, visibility, light, bounce)
-    narrow = of_mirrored * (
-        lobes.specular_visibility[:, None] * _reflectance(surface.normals, surface.views, roughness)
-    )
+    seen = lobes.specular_visibility[:, None]
+    narrow = of_mirrored * (seen * _reflectance(surface.normals, surface.views, roughness))
     wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
-    return lobes.diffuse, torch.lerp(narrow, lobes.specular, wideness)
+    return _SplitLobes(lobes.diffuse, torch.lerp(narrow, lobes.specular, wideness), of_mirrored * seen)
 
 
 def shading_light(prefiltered: Prefiltered, visibility: Visibility, bounce: Bounce | None) -> backends.ShadingLight:
@@ -226,6 +284,9 @@ def specular(
     prefiltered: Prefiltered,
     R_env_obj: Float[Tensor, "3 3"],
     f0: float | Float[Tensor, "*c"],
+    *,
+    albedo: Float[Tensor, "p 3"] | None = None,
+    metalness: Float[Tensor, "p 1"] | None = None,
 ) -> Float[Tensor, "p 3"]:
     """The specular lobe by the split sum, without occlusion.
 
@@ -235,10 +296,16 @@ def specular(
         roughness: Perceptual roughness.
         prefiltered: Light, env frame.
         R_env_obj: Rotation from the object frame to the env frame.
-        f0: Reflectance at normal incidence.
+        f0: Reflectance at normal incidence of dielectrics.
+        albedo: Linear base colour, of metals.
+        metalness: Metalness; None for 0.
     """
     reflected = prefiltered.lookup(reflect(views, normals) @ R_env_obj.mT, roughness)
-    return f0 * reflected * _reflectance(normals, views, roughness)
+    dielectric = f0 * reflected * _reflectance(normals, views, roughness)
+    if metalness is None or albedo is None:
+        return dielectric
+    of_colour, of_all = _metal_reflectance(normals, views, roughness)
+    return torch.lerp(dielectric, reflected * (albedo * of_colour + of_all), metalness)
 
 
 def _reflectance(
@@ -247,6 +314,21 @@ def _reflectance(
     """Directional albedo of the specular lobe divided by f0."""
     nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
     return brdf.split_sum(reflectance_table(nov.dtype, nov.device), nov, roughness)
+
+
+def _metal_reflectance(
+    normals: Float[Tensor, "p 3"], views: Float[Tensor, "p 3"], roughness: Float[Tensor, "p 1"]
+) -> tuple[Float[Tensor, "p 1"], Float[Tensor, "p 1"]]:
+    """Directional albedo of a metal's lobe: the part that its base colour multiplies, and the rest."""
+    nov = (normals * views).sum(-1, keepdim=True).clamp(0, 1)
+    of_colour, of_all = _metal_reflectance_tables(nov.dtype, nov.device)
+    return brdf.split_sum(of_colour, nov, roughness), brdf.split_sum(of_all, nov, roughness)
+
+
+@cache
+def _metal_reflectance_tables(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 size size"]:
+    """The split-sum tables of metals, cached per device."""
+    return brdf.metal_split_sum_tables().to(device, dtype)
 
 
 @cache

@@ -105,19 +105,25 @@ def _strip(
 
 
 def material_maps(asset: Asset, views: Sequence[RenderedFrame]) -> Markup:
-    """Strips of albedo, roughness and normals, seen from some frames."""
-    albedo, roughness, normals = [], [], []
+    """Strips of albedo, roughness, metalness if there is metal, and normals, seen from some frames."""
+    albedo, roughness, metalness, normals = [], [], [], []
     for frame in views:
         T_cam_obj = asset.trajectory.T_cam_obj[frame.number]
         view = render_gbuffer(asset, T_cam_obj, resized(frame.camera, MAP_SIDE))
         R_gl_obj = opengl_from_opencv(view.normal) @ T_cam_obj.rotation.matrix()
         albedo.append(_with_alpha(srgb_from_linear(view.features["albedo"]), view.alpha))
         roughness.append(_with_alpha(view.features["roughness"].expand(-1, -1, 3), view.alpha))
+        if "metalness" in view.features:
+            metalness.append(_with_alpha(view.features["metalness"].expand(-1, -1, 3), view.alpha))
         normals.append(_with_alpha(0.5 + 0.5 * normalize(view.normal, dim=-1) @ R_gl_obj.T, view.alpha))
-    grey = _colour_bar("linear-gradient(90deg,#000,#fff)", "0 mirror", "1 matte")
+    grey, metal = (
+        _colour_bar("linear-gradient(90deg,#000,#fff)", *ends)
+        for ends in (("0 mirror", "1 matte"), ("0 dielectric", "1 metal"))
+    )
     return (
         _strip("Albedo", "base colour, sRGB", albedo)
         + _strip("Roughness", "perceptual", roughness, grey)
+        + (_strip("Metalness", "1: reflects in its colour", metalness, metal) if metalness else Markup(""))
         + _strip("Normals", "camera axes: red right, green up, blue to the viewer", normals)
     )
 

@@ -18,6 +18,7 @@ from tumble.rendering import (
     Tracer,
     antialiased_gbuffer,
     build_tracer,
+    material_at,
     prefilter,
     shade_split,
     surface,
@@ -118,14 +119,16 @@ def render(scene: LitScene, number: int, camera: Camera) -> tuple[Float[Tensor, 
     view = antialiased_gbuffer(scene.asset, T_cam_obj, camera)
     points = surface(view, T_cam_obj, camera, alpha_min=0.1)
     directions = fibonacci_sphere(N_DIRECTIONS).to(view.alpha)
+    albedo, roughness, metalness = material_at(view, points)
     shaded = shade_split(
         points,
-        points.sample(view.features["albedo"]),
-        points.sample(view.features["roughness"]),
+        albedo,
+        roughness,
         scene.prefiltered,
         trajectory.R_env_obj_at(number, T_cam_obj),
         visibility(scene.tracer, points.points, points.normals, directions),
         f0=float(material.f0),
+        metalness=metalness,
     )
     return points.paint(shaded, camera.height, camera.width) * view.alpha[..., None], view
 

@@ -128,6 +128,8 @@ class Truth:
     """Linear base colour, 0 outside the object."""
     roughness: Float[Tensor, "v h w"] | None = None
     """Perceptual roughness, 0 outside the object."""
+    metalness: Float[Tensor, "v h w"] | None = None
+    """Metalness, 0 outside the object; None if nothing is metal."""
     normals: Float[Tensor, "v h w 3"] | None = None
     """Unit shading normals, object frame, 0 outside the object."""
     depth: Float[Tensor, "v h w"] | None = None

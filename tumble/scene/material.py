@@ -1,4 +1,5 @@
-"""Albedo, roughness and normal offsets at the four corners of the plane of every Gaussian (paper section 4.3).
+"""Albedo, roughness and normal offsets at the four corners of the plane of every Gaussian (paper section 4.3), and its
+metalness, which the paper does not have.
 
 Corner order: (-,-), (+,-), (-,+), (+,+) along the first and second local axis of the Gaussian.
 """
@@ -27,6 +28,8 @@ class Material:
     """Offset added to the normal of the Gaussian before normalisation, object frame."""
     f0_logit: Float[Tensor, ""]
     """Reflectance at normal incidence before activation, shared by the whole object."""
+    metal_logits: Float[Tensor, " n"] | None = None
+    """Metalness of every Gaussian before activation; None for an object without metal."""
 
     @staticmethod
     def constant(n: int, albedo: Float[Tensor, "3"], roughness: float) -> "Material":
@@ -49,6 +52,17 @@ class Material:
     def roughness(self) -> Float[Tensor, "n 4"]:
         """Perceptual roughness in (0, 1)."""
         return torch.sigmoid(self.roughness_logits / TEMPERATURE)
+
+    @property
+    def metalness(self) -> Float[Tensor, " n"] | None:
+        """Metalness in (0, 1): 1 where all light is reflected at the surface, in the base colour, as by a metal."""
+        return None if self.metal_logits is None else torch.sigmoid(self.metal_logits / TEMPERATURE)
+
+    @property
+    def diffuse_albedo(self) -> Float[Tensor, "n 3"]:
+        """Linear albedo of every Gaussian's diffuse lobe, mean of its corners; that of a metal is 0."""
+        albedo = self.albedo.mean(1)
+        return albedo if self.metalness is None else albedo * (1 - self.metalness[:, None])
 
     @property
     def f0(self) -> Float[Tensor, ""]:

@@ -31,6 +31,8 @@ class GlbMaps:
     """Linear base colour."""
     roughness: Float[np.ndarray, "v h w 1"]
     """Perceptual roughness."""
+    metalness: Float[np.ndarray, "v h w 1"]
+    """Metalness."""
     normal: Float[np.ndarray, "v h w 3"]
     """Unit normals of the mesh without its normal map, in the file's frame."""
     mask: Bool[np.ndarray, "v h w"]
@@ -49,14 +51,15 @@ def read_glb(path: Path, metres: float) -> ObjectModel:
 
 def glb_maps(model: ObjectModel, views: Sequence[SE3], camera: Camera) -> GlbMaps:
     """Maps of a model, continued `REACH` pixels beyond its silhouette."""
-    unlit = pathtracer.unlit_scenes(model, None)
+    unlit = pathtracer.unlit_scenes(model, "gltf", None)
     found = [pathtracer.maps(unlit, view, camera, samples=MAP_SAMPLES) for view in views]
     mask = np.stack([view.coverage >= 0.5 for view in found])
 
     def continued(name: str) -> np.ndarray:
         return np.stack([_continued(getattr(view, name), view.coverage >= 0.5) for view in found])
 
-    return GlbMaps(continued("albedo"), continued("roughness"), continued("normal"), mask)
+    albedo, roughness, metalness, normal = map(continued, ("albedo", "roughness", "metalness", "normal"))
+    return GlbMaps(albedo, roughness, metalness, normal, mask)
 
 
 def glb_images(
@@ -77,7 +80,7 @@ def glb_images(
         samples: Samples per pixel.
     """
     parts = tuple(replace(part, albedo=(part.albedo * albedo_scale).clip(0, 0.999)) for part in model.parts)
-    shapes = pathtracer.mitsuba_shapes(replace(model, parts=parts), "original", None, f0)
+    shapes = pathtracer.mitsuba_shapes(replace(model, parts=parts), "gltf", None, f0)
     scene = pathtracer.lit_scene(shapes, light, PATH_DEPTH)
     still = torch.eye(3)
     images = [

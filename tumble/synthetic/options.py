@@ -36,8 +36,9 @@ class SynthOptions:
     """Samples per pixel of the relit ground truth; many, because noise there limits the PSNR that can be measured."""
     path_depth: int = 5
     """Maximum number of path segments: 2 is direct light only, each further one adds one interreflection."""
-    material: Literal["original", "diffuse"] = "original"
-    """original: base colour and roughness of the file as a dielectric (F0 = 0.04); diffuse: Lambertian."""
+    material: Literal["original", "diffuse", "metal", "gltf"] = "original"
+    """original: base colour and roughness of the file as a dielectric (F0 = 0.04); diffuse: Lambertian; metal: base
+    colour and roughness of the file as a metal; gltf: base colour, roughness and metalness of the file."""
     roughness: Annotated[float | None, arg(metavar="VALUE", help_behavior_hint="")] = None
     """Constant roughness that replaces the one of the file."""
     env_rotation: float = 0.0

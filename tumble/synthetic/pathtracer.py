@@ -9,7 +9,7 @@ import importlib.util
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -37,7 +37,7 @@ LLVM_FOLDERS = (
 MAX_TRIANGLES = 5_000_000
 """Maximum number of triangles of a model; a larger one needs more memory to render than a laptop has."""
 
-Shading = Literal["original", "diffuse"]
+Shading = Literal["original", "diffuse", "metal", "gltf"]
 
 
 # The variant ----------------------------------------------------------------------------------------------------------
@@ -109,6 +109,8 @@ class Part:
     """Base colour texture, linear RGB."""
     roughness: Float[np.ndarray, "rows columns 1"]
     """Perceptual roughness texture."""
+    metalness: Float[np.ndarray, "tall wide 1"] = field(default_factory=lambda: np.zeros((1, 1, 1)))
+    """Metalness texture: 0 for dielectrics, 1 for metals."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ class ObjectModel:
 
 
 def read_parts(path: Path) -> tuple[Part, ...]:
-    """The meshes of a GLB with base colour and roughness, in the file's frame; other properties are ignored.
+    """The meshes of a GLB with base colour, roughness and metalness, in the file's frame; the rest is ignored.
 
     Raises:
         BadFile: The file is missing, is not readable, or has no triangles or more than `MAX_TRIANGLES`.
@@ -148,7 +150,7 @@ def read_parts(path: Path) -> tuple[Part, ...]:
 
 
 def read_model(path: Path, up: str = "y") -> ObjectModel:
-    """Read a GLB with its base colour and roughness; metalness, normal maps and emission are ignored.
+    """Read a GLB with its base colour, roughness and metalness; normal maps and emission are ignored.
 
     Args:
         path: The GLB file.
@@ -172,13 +174,13 @@ def read_model(path: Path, up: str = "y") -> ObjectModel:
 
 def _consistent(part: Part) -> bool:
     """Whether the values of a part are finite and its faces refer to its vertices."""
-    finite = all(np.isfinite(x).all() for x in (part.normals, part.uv, part.albedo, part.roughness))
+    finite = all(np.isfinite(x).all() for x in (part.normals, part.uv, part.albedo, part.roughness, part.metalness))
     return bool(finite and part.faces.min(initial=0) >= 0 and part.faces.max(initial=0) < len(part.vertices))
 
 
 def _transformed(part: Part, R_obj_file: np.ndarray, T_obj_file: np.ndarray) -> Part:
     vertices = part.vertices @ T_obj_file[:3, :3].T + T_obj_file[:3, 3]
-    return Part(vertices, part.normals @ R_obj_file.T, part.faces, part.uv, part.albedo, part.roughness)
+    return replace(part, vertices=vertices, normals=part.normals @ R_obj_file.T)
 
 
 def _part(mesh: Any, T: Float[np.ndarray, "4 4"]) -> Part:
@@ -188,18 +190,17 @@ def _part(mesh: Any, T: Float[np.ndarray, "4 4"]) -> Part:
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
     uv = getattr(mesh.visual, "uv", None)
     uv = np.zeros((len(vertices), 2)) if uv is None else np.stack([uv[:, 0], 1 - uv[:, 1]], 1)
-    albedo, roughness = _textures(mesh.visual)
-    return Part(vertices, normals, np.asarray(mesh.faces), uv, albedo, roughness)
+    return Part(vertices, normals, np.asarray(mesh.faces), uv, *_textures(mesh.visual))
 
 
-def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Base colour and roughness textures, each multiplied by its factor (glTF 2.0, section 3.9.2)."""
+def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Base colour, roughness and metalness textures, each multiplied by its factor (glTF 2.0, section 3.9.2)."""
     material: Any = getattr(visual, "material", None)
     material = material.to_pbr() if hasattr(material, "to_pbr") else material
     factor = np.ones(3) if getattr(material, "baseColorFactor", None) is None else _colour(material.baseColorFactor)
-    given = getattr(material, "roughnessFactor", None)
-    roughness_factor = 1.0 if given is None else given
-    albedo, roughness = np.ones((1, 1, 3)) * factor, np.ones((1, 1, 1)) * roughness_factor
+    given = [getattr(material, name, None) for name in ("roughnessFactor", "metallicFactor")]
+    factors = [1.0 if x is None else x for x in given] if material else [1.0, 0.0]
+    albedo, (roughness, metalness) = np.ones((1, 1, 3)) * factor, (np.full((1, 1, 1), x) for x in factors)
     # By tables of all code values, in the precision of the renderer, because textures have many pixels.
     code_values = np.arange(256) / 255.0
     if getattr(material, "baseColorTexture", None) is not None:
@@ -207,9 +208,11 @@ def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray]:
         pixels = np.asarray(material.baseColorTexture.convert("RGB"))
         albedo = np.stack([table[pixels[..., channel], channel] for channel in range(3)], -1)
     if getattr(material, "metallicRoughnessTexture", None) is not None:
-        table = (code_values * roughness_factor).astype(np.float32)
-        roughness = table[np.asarray(material.metallicRoughnessTexture.convert("RGB"))[..., 1:2]]
-    return albedo, roughness
+        packed = np.asarray(material.metallicRoughnessTexture.convert("RGB"))
+        roughness, metalness = (
+            (code_values * x).astype(np.float32)[packed[..., i : i + 1]] for i, x in enumerate(factors, start=1)
+        )
+    return albedo, roughness, metalness
 
 
 def _colour(factor: Any) -> np.ndarray:
@@ -236,12 +239,14 @@ def write_model(source: Path, model: ObjectModel, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Maps:
-    """Ground-truth maps of one view. Albedo, roughness, normal and depth are 0 where `coverage` is below 0.5."""
+    """Ground-truth maps of one view, 0 where `coverage` is below 0.5."""
 
     albedo: Float[np.ndarray, "h w 3"]
     """Linear RGB."""
     roughness: Float[np.ndarray, "h w 1"]
     """Perceptual roughness."""
+    metalness: Float[np.ndarray, "h w 1"]
+    """Metalness."""
     normal: Float[np.ndarray, "h w 3"]
     """Unit shading normals in the object frame."""
     depth: Float[np.ndarray, "h w 1"]
@@ -257,7 +262,8 @@ def mitsuba_shapes(
 
     Args:
         model: The model.
-        shading: "original": a dielectric with the file's base colour and roughness; "diffuse": Lambertian.
+        shading: "original": a dielectric with the file's base colour and roughness; "diffuse": Lambertian; "metal": a
+            metal with them; "gltf": with the file's metalness.
         roughness: Constant roughness that replaces the file's; None keeps the file's.
         f0: Reflectance at normal incidence.
     """
@@ -267,10 +273,16 @@ def mitsuba_shapes(
             return {"type": "diffuse", "reflectance": _bitmap(part.albedo)}
         rough = _bitmap(part.roughness) if roughness is None else roughness
         # Mitsuba's "specular" 0.5 means a refractive index of 1.5, hence F0 = 0.04.
-        specular = f0 / DIELECTRIC / 2
-        return {"type": "principled", "base_color": _bitmap(part.albedo), "roughness": rough, "specular": specular}
+        dielectric = {"base_color": _bitmap(part.albedo), "roughness": rough, "specular": f0 / DIELECTRIC / 2}
+        metallic = {} if shading == "original" else {"metallic": _bitmap(shaded_metalness(part, shading))}
+        return {"type": "principled", **dielectric, **metallic}
 
     return {name: _mesh(part, bsdf(part)) for name, part in model.named_parts().items()}
+
+
+def shaded_metalness(part: Part, shading: Shading) -> Float[np.ndarray, "rows columns 1"]:
+    """Metalness texture of a part as it is shaded (`mitsuba_shapes`)."""
+    return part.metalness if shading == "gltf" else np.full((1, 1, 1), float(shading == "metal"))
 
 
 def surrounding_shapes(parts: dict[str, Part]) -> dict[str, Any]:
@@ -318,11 +330,11 @@ def radiance(
     return pixels[..., :3], pixels[..., 3]
 
 
-def unlit_scenes(model: ObjectModel, roughness: float | None) -> tuple[Any, Any]:
+def unlit_scenes(model: ObjectModel, shading: Shading, roughness: float | None) -> tuple[Any, Any]:
     """The two Mitsuba scenes that `maps` renders; a `roughness` that is not None replaces the file's.
 
     Mitsuba can output only one texture without lighting, the diffuse reflectance. The first scene has the albedo
-    there, the second one (roughness, 1, 0).
+    there, the second one (roughness, 1, metalness).
     """
     mi = mitsuba()
 
@@ -334,8 +346,11 @@ def unlit_scenes(model: ObjectModel, roughness: float | None) -> tuple[Any, Any]
         return mi.load_dict({"type": "scene", "integrator": {"type": "aov", "aovs": aovs}, **parts})
 
     def packed(part: Part) -> np.ndarray:
-        values = part.roughness if roughness is None else np.full((1, 1, 1), roughness)
-        return np.concatenate([values, np.ones_like(values), np.zeros_like(values)], -1)
+        rough = part.roughness if roughness is None else np.full((1, 1, 1), roughness)
+        metal = shaded_metalness(part, shading)
+        if rough.shape != metal.shape:  # one of them is constant
+            rough, metal = np.broadcast_arrays(rough, metal)
+        return np.concatenate([rough, np.ones_like(rough), metal], -1)
 
     return scene("a:albedo,n:sh_normal,g:geo_normal,x:position", lambda part: part.albedo), scene("r:albedo", packed)
 
@@ -359,8 +374,8 @@ def maps(unlit: tuple[Any, Any], T_cam_obj: SE3, camera: Camera, *, samples: int
     def masked(values: np.ndarray) -> np.ndarray:
         return np.where(inside[..., None], values, 0).astype(np.float32)
 
-    albedo, roughness = first[..., :3] / divisor, packed[..., :1] / divisor
-    return Maps(masked(albedo), masked(roughness), masked(normal), masked(depth), coverage)
+    albedo, roughness, metalness = first[..., :3] / divisor, packed[..., :1] / divisor, packed[..., 2:3] / divisor
+    return Maps(masked(albedo), masked(roughness), masked(metalness), masked(normal), masked(depth), coverage)
 
 
 def layer_scene(layers: tuple[dict[str, Part], dict[str, Part], dict[str, Part]]) -> Any:

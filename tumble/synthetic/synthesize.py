@@ -169,7 +169,7 @@ def _prepare_folder(out: Path, manifest: dict[str, Any]) -> bool:
 def _context(parts: pathtracer.ObjectModel, out: Path, options: SynthOptions) -> _RenderContext:
     camera = Camera.from_fov(math.radians(options.fov), options.resolution, options.resolution)
     shapes = pathtracer.mitsuba_shapes(parts, options.material, options.roughness)
-    unlit = pathtracer.unlit_scenes(parts, options.roughness)
+    unlit = pathtracer.unlit_scenes(parts, options.material, options.roughness)
     distance = distance_for(math.radians(options.fov))
     poses = trajectory(options.setting, options.views, distance, seed=options.seed, stride=options.stride)
     around = surroundings(parts, poses, options, distance)
@@ -356,8 +356,9 @@ def _render_truth(context: _RenderContext, frame: _Frame, seed: int) -> np.ndarr
 
 
 def _map_names(options: SynthOptions) -> tuple[str, ...]:
-    """The ground-truth maps of the capture; a Lambertian surface has no roughness."""
-    return tuple(name for name in MAPS if options.material == "original" or name != "roughness")
+    """The ground-truth maps of the capture: a Lambertian surface has no roughness, and no dielectric metalness."""
+    left_out = {"diffuse": ("roughness", "metalness"), "original": ("metalness",)}.get(options.material, ())
+    return tuple(name for name in MAPS if name not in left_out)
 
 
 def _write_srgb(path: Path, radiance: np.ndarray) -> None:
