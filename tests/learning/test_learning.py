@@ -154,15 +154,15 @@ def test_the_committed_capture_is_what_the_script_renders(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_metal_is_recognised(tmp_path: Path) -> None:
-    """The figure in metal. Seen: metalness 0.9, 22.9 dB of albedo; as a dielectric, 18.6 dB."""
+    """The figure in metal. Seen with one seed: metalness 0.82, 21.8 dB of albedo."""
     pytest.importorskip("mitsuba", reason="needs the extra `synth`")
-    path = render(tmp_path / "capture", samples=256, truth_samples=1, material="metal")
+    path = render(tmp_path / "capture", samples=64, truth_samples=1, eval_sphere=0, material="metal")
     capture, truth = folder.load(path), folder.load_truth(path)
     assert truth is not None
     asset = run(SHORT, seed=0, capture=capture)[0]
     assert asset.material.metalness is not None
-    assert asset.material.metalness.mean() > 0.8
-    assert errors(asset, capture, truth).albedo > 20
+    assert asset.material.metalness.mean() > 0.7
+    assert errors(asset, capture, truth).albedo > 20.5
 
 
 @pytest.mark.slow
