@@ -145,7 +145,7 @@ def test_gradients_of_the_native_kernels_match_the_reference() -> None:
     for dtype in (torch.float32, torch.float64):
         base = look_at([1.0, -3.5, 2.0], dtype)
         raw = [x.detach().to(dtype).clone().requires_grad_() for x in vars(sphere(200, torch.float64)).values()]
-        tangent, gamma = torch.zeros(6, dtype=dtype, requires_grad=True), GAMMA.to(dtype).requires_grad_()
+        tangent, gamma = torch.zeros(6, dtype=dtype, requires_grad=True), GAMMA.to(dtype).clone().requires_grad_()
         corners = torch.linspace(0, 1, 200 * 4, dtype=dtype).view(200, 4, 1).clone().requires_grad_()
         view = rasterize(Gaussians(*raw), gamma, SE3.exp(tangent) @ base, CAMERA, {"f": corners})
         ramp = torch.linspace(0, 1, 64, dtype=dtype)
