@@ -87,7 +87,7 @@ def bake(asset: Asset, mesh: UnwrappedMesh, *, resolution: int, views: int, pixe
     local = normalize(torch.cat([local[:, :2], local[:, 2:].clamp(min=0.05)], -1), dim=-1)
     encoded = torch.cat([srgb_from_linear(albedo), roughness, 0.5 + 0.5 * local], -1)
     image, metalness = _texture_image(texels, encoded, resolution), asset.material.metalness
-    metal = None if metalness is None else nearest_gaussian_texture(metalness, asset, mesh, resolution=resolution)
+    metal = None if metalness is None else _nearest_gaussian_image(metalness, asset, texels, resolution)
     return Textures(image[..., :3], image[..., 3], image[..., 4:], metal)
 
 
@@ -96,7 +96,13 @@ def nearest_gaussian_texture(
     values: Float[Tensor, " n"], asset: Asset, mesh: UnwrappedMesh, *, resolution: int
 ) -> UInt8[np.ndarray, "r r"]:
     """Texture of values in [0, 1], one per Gaussian: each texel has the value of the nearest Gaussian."""
-    texels = locate_texels(mesh, resolution)
+    return _nearest_gaussian_image(values, asset, locate_texels(mesh, resolution), resolution)
+
+
+def _nearest_gaussian_image(
+    values: Float[Tensor, " n"], asset: Asset, texels: Texels, resolution: int
+) -> UInt8[np.ndarray, "r r"]:
+    """The texture of `nearest_gaussian_texture` for texels that are located already."""
     index = _nearest(texels.points, asset.gaussians.means)
     return _texture_image(texels, values[index, None], resolution)[..., 0]
 

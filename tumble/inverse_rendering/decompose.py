@@ -264,12 +264,13 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     start = glossy
     if error >= (1 - MIN_EXPLAINED) * error_without:
         best, error, start = without, error_without, matte
-    regions = specular_fit.metal_regions(fitted, params.gaussians.means)
-    if cfg.rates.metalness and float(regions[samples.gaussian].float().mean()) > MIN_METAL:
-        metal = with_metal(glossy, regions)
-        metallic, error_of_metal = _trial(cfg, inputs, state, metal)
-        if error_of_metal < error:
-            best, error, start = metallic, error_of_metal, metal
+    if cfg.rates.metalness:
+        regions = specular_fit.metal_regions(fitted, params.gaussians.means)
+        if float(regions[samples.gaussian].float().mean()) > MIN_METAL:
+            metal = with_metal(glossy, regions)
+            metallic, error_of_metal = _trial(cfg, inputs, state, metal)
+            if error_of_metal < error:
+                best, error, start = metallic, error_of_metal, metal
     for _ in range(MAX_HALVINGS):
         start = with_half_the_contrast(start)
         flatter, error_of_flatter = _trial(cfg, inputs, state, start)
@@ -311,8 +312,10 @@ def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
         R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
         gaussian, rough = _dominant_gaussian(view, points), torch.full_like(points.normals[:, :1], cfg.roughness)
         visible = _pixel_visibility(cfg, state, params, points, gaussian)
-        diffuse, specular = split_lobes(points, rough, light, R_env_obj, visible, bounce=bounce)
-        parts.append((gaussian, diffuse, DIELECTRIC * specular, linear_from_srgb(points.sample(truth.image))))
+        lobes = split_lobes(points, rough, light, R_env_obj, visible, bounce=bounce)
+        parts.append(
+            (gaussian, lobes.diffuse, DIELECTRIC * lobes.specular, linear_from_srgb(points.sample(truth.image)))
+        )
     return specular_fit.Samples(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
 

@@ -204,7 +204,7 @@ def coloured_lobes(
     The base colour of a dielectric is that of its diffuse lobe, that of a metal its reflectance at normal incidence.
     The lobe of a metal is a split sum for every roughness.
     """
-    lobes = _split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce)
+    lobes = split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce=bounce)
     if metalness is None:
         return lobes.diffuse, f0 * lobes.specular
     reflectance = _metal_reflectance(surface.normals, surface.views, roughness)
@@ -212,21 +212,7 @@ def coloured_lobes(
     return torch.lerp(lobes.diffuse, of_colour, metalness), torch.lerp(f0 * lobes.specular, of_all, metalness)
 
 
-def split_lobes(
-    surface: Surface,
-    roughness: Float[Tensor, "p 1"],
-    prefiltered: Prefiltered,
-    R_env_obj: Float[Tensor, "3 3"],
-    visibility: Visibility,
-    *,
-    bounce: Bounce | AveragedBounce | None = None,
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Diffuse and specular radiance of `shade_split` for an albedo and a reflectance at normal incidence of 1."""
-    lobes = _split_lobes(surface, roughness, prefiltered, R_env_obj, visibility, bounce)
-    return lobes.diffuse, lobes.specular
-
-
-class _SplitLobes(NamedTuple):
+class SplitLobes(NamedTuple):
     """Radiance of the lobes of `shade_split`."""
 
     diffuse: Float[Tensor, "p 3"]
@@ -237,14 +223,16 @@ class _SplitLobes(NamedTuple):
     """Mean over a specular lobe, times its visible fraction."""
 
 
-def _split_lobes(
+def split_lobes(
     surface: Surface,
     roughness: Float[Tensor, "p 1"],
     prefiltered: Prefiltered,
     R_env_obj: Float[Tensor, "3 3"],
     visibility: Visibility,
-    bounce: Bounce | AveragedBounce | None,
-) -> _SplitLobes:
+    *,
+    bounce: Bounce | AveragedBounce | None = None,
+) -> SplitLobes:
+    """Lobes of `shade_split`, whatever the base colour and the reflectance at normal incidence are."""
     # One lookup for both kinds of directions, since its gradient is an image of the size of all levels.
     mirrored = reflect(surface.views, surface.normals)
     in_env = torch.cat([visibility.directions, mirrored]) @ R_env_obj.mT
@@ -255,7 +243,7 @@ def _split_lobes(
     seen = lobes.specular_visibility[:, None]
     narrow = of_mirrored * (seen * _reflectance(surface.normals, surface.views, roughness))
     wideness = ((roughness - NARROW_ROUGHNESS[0]) / (NARROW_ROUGHNESS[1] - NARROW_ROUGHNESS[0])).clamp(0, 1)
-    return _SplitLobes(lobes.diffuse, torch.lerp(narrow, lobes.specular, wideness), of_mirrored * seen)
+    return SplitLobes(lobes.diffuse, torch.lerp(narrow, lobes.specular, wideness), of_mirrored * seen)
 
 
 def shading_light(prefiltered: Prefiltered, visibility: Visibility, bounce: Bounce | None) -> backends.ShadingLight:
