@@ -48,8 +48,12 @@ class Tumble:
 
 def tumbling(n: int, *, size: int = 128, points: int = 400, seed: int = 1) -> Tumble:
     """`n` hand-held frames, 5 to 12 degrees apart."""
-    camera = Camera.from_fov(math.radians(30), size, size)
-    T_cam_obj = trajectories.handheld(n, DISTANCE, seed=seed)
+    return moving(trajectories.handheld(n, DISTANCE, seed=seed), size=size, points=points, seed=seed)
+
+
+def moving(T_cam_obj: SE3, *, size: int = 128, points: int = 400, seed: int = 1) -> Tumble:
+    """The object in some poses, one per frame."""
+    camera, n = Camera.from_fov(math.radians(30), size, size), len(T_cam_obj.xyz)
     directions = camera.directions().double()
     masks = []
     for i in range(n):

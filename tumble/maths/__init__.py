@@ -1,4 +1,4 @@
-"""Rotations and rigid motions, directions on the sphere, spherical harmonics, images, least squares, point sets.
+"""Rotations, their averages, rigid motions, directions on the sphere, harmonics, images, least squares, points.
 
 Pure functions of tensors, without cameras, scenes or files.
 """
@@ -29,6 +29,7 @@ from tumble.maths.images import (
 )
 from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, select_rows
 from tumble.maths.points import nearest, neighbours, smallest_enclosing_sphere
+from tumble.maths.rotation_averaging import average_rotations
 from tumble.maths.se3 import SE3, SO3, angle_between, interpolate, mean_rotation, umeyama
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "SE3",
     "SO3",
     "angle_between",
+    "average_rotations",
     "crop",
     "crop_box",
     "direction_from_equirect",

@@ -9,12 +9,11 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from tumble.maths import SO3, angle_between, fibonacci_sphere, mean_rotation
+from tumble.maths import SO3, angle_between, average_rotations, fibonacci_sphere, mean_rotation
 from tumble.poses.sfm import bundle_adjustment, frontier_points
 from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
 from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres
 from tumble.poses.sfm.perturbation import mirrored
-from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.tracks import Tracks, concatenate
 
 CONTRADICTION_COST = 3.0

@@ -122,6 +122,11 @@ class KeepBest:
 
 
 @dataclass(frozen=True)
+class TryCircularMotion:
+    """Take the motion of a turntable, with which all is done, if it explains the contours (`circular_motion`)."""
+
+
+@dataclass(frozen=True)
 class Perturb:
     """Change parts of the motion at random, and keep what is better (`perturbation`)."""
 
@@ -174,6 +179,7 @@ Phase = (
     | AdjustWindows
     | AdjustAll
     | KeepBest
+    | TryCircularMotion
     | Perturb
     | AlignTexture
     | CheckSettled
@@ -207,7 +213,7 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
     keep = KeepBest(cfg.global_scales[-1])
     relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
     steps: list[Step] = []
-    first = [AverageRotations(), *map(AdjustWindows, cfg.window_sizes)]
+    first = [TryCircularMotion(), AverageRotations(), *map(AdjustWindows, cfg.window_sizes)]
     others = [
         [
             AverageRotations(),

@@ -11,6 +11,9 @@ What contours do not show is corrected by texture: the rotation of a body of rev
 part of the motion that leave the visual hull as it is (`symmetry`). These corrections are repeated until the poses
 settle.
 
+The motion of a turntable is found before all that from contours alone, and then nothing else is done
+(`circular_motion`).
+
 A capture that has not converged is attempted again with the settings in `Config.fallbacks`, until two attempts agree.
 Otherwise parts of the best one are changed at random, and what lowers the loss is kept (`perturbation`). A focal length
 that is only assumed is estimated as well whenever all frames are adjusted together.
@@ -26,9 +29,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.engine import State
-from tumble.maths import SE3, SO3, angle_between, mean_rotation
+from tumble.maths import SE3, SO3, angle_between, average_rotations, mean_rotation
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import relative_pose, segments, symmetry
+from tumble.poses.sfm import circular_motion, relative_pose, segments, symmetry
 from tumble.poses.sfm.adjustment import adjust_round, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.finalize import Solution, pose_result
@@ -46,7 +49,6 @@ from tumble.poses.sfm.relocalization import (
     relocalize,
     robust_cost,
 )
-from tumble.poses.sfm.rotation_averaging import average_rotations
 from tumble.poses.sfm.schedule import (
     RELOCALIZATION_SCALE,
     AdjustAll,
@@ -62,12 +64,13 @@ from tumble.poses.sfm.schedule import (
     Relocalize,
     Step,
     TrackTexture,
+    TryCircularMotion,
     schedule,
 )
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 22
+VERSION = 23
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -170,18 +173,14 @@ def _run_phase(now: Step, cfg: Config, inputs: Inputs, state: State) -> "PhaseRe
             return _keep_best(cfg, inputs, state, scale, is_other=now.attempt > 0 and not now.mends)
         case Perturb(scale):
             return _perturb(cfg, inputs, state, scale)
-        case AlignTexture():
-            return _align_texture(inputs, state)
         case CheckSettled(scale):
             return _check_settled(cfg, inputs, state, scale)
-        case AlignColours():
-            return _align_colours(inputs, state)
-        case TrackTexture():
-            return _track_texture(inputs, state)
         case Relocalize(scale):
             return _relocalize(inputs, state, scale)
         case JoinSegments():
             return _join_segments(cfg, inputs, state)
+        case TryCircularMotion() | AlignTexture() | AlignColours() | TrackTexture():
+            return _WITHOUT_SETTINGS[type(now.phase)](inputs, state)
 
 
 # Phases ---------------------------------------------------------------------------------------------------------------
@@ -371,6 +370,15 @@ def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_ot
     return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
 
 
+def _try_circular_motion(inputs: Inputs, state: State) -> PhaseResult:
+    """Take a circular motion if it explains the contours; nothing else is to be done then."""
+    found, poses = circular_motion.fit(inputs), state.params
+    if found is None:
+        return poses, {}
+    state.memory |= {"settled": torch.tensor(True), "circular": found.disagreement}
+    return Poses(found.R, found.t, poses.log_focal + found.log_focal), {"circular": found.disagreement.median()}
+
+
 def _perturb(cfg: Config, inputs: Inputs, state: State, scale: float) -> PhaseResult:
     """Try random changes of the poses, and keep those after which the adjusted poses have a lower loss."""
     best, loss, accepted = state.params, _comparable_loss(cfg, inputs, state, state.params, scale), 0
@@ -495,8 +503,20 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     return pose_result(inputs.capture, tracks, contours, inputs.mirror_symmetry, solution)
 
 
+_WITHOUT_SETTINGS = {
+    TryCircularMotion: _try_circular_motion,
+    AlignTexture: _align_texture,
+    AlignColours: _align_colours,
+    TrackTexture: _track_texture,
+}
+"""The phases that have none."""
+
+
 def _rotation_disagreement(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
-    """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]."""
+    """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]; between those
+    fitted to the even and to the odd frames for a circular motion, which is found without tracks."""
+    if "circular" in state.memory:
+        return state.memory["circular"]
     fits = []
     for weight in (cfg.frontier_weight / DISAGREEMENT_FACTOR, cfg.frontier_weight * DISAGREEMENT_FACTOR):
         trial = State(0, state.params, None, torch.Generator().manual_seed(0), state.memory)

@@ -2,8 +2,8 @@
 
 import torch
 
+from tumble.maths import average_rotations
 from tumble.maths.se3 import SO3
-from tumble.poses.sfm.rotation_averaging import average_rotations
 
 
 def graph(n: int, offsets: tuple[int, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.maths import SO3
+from tumble.maths.se3 import SO3
 
 TRIANGLE_TOLERANCE = 0.17
 """Angle up to which the composition of three edges around a triangle counts as closed [radians]."""
