@@ -24,7 +24,8 @@ from tumble.maths import SO3
 from tumble.poses.sfm import bundle_adjustment
 from tumble.poses.sfm.adjustment import deviation
 from tumble.poses.sfm.frontier_points import epipolar_tangencies
-from tumble.poses.sfm.observations import Inputs, with_focal_length
+from tumble.poses.sfm.observations import Inputs, silhouette_centres, with_focal_length
+from tumble.poses.sfm.relocalization import robust_cost
 from tumble.scene import BACKGROUND, Capture
 
 GRID = 32
@@ -109,7 +110,8 @@ def fit(inputs: Inputs) -> CircularMotion | None:
     if not found:
         return None
     best = min(found, key=problem.loss)
-    others = [x for x in found if deviation(problem.poses(x)[0], problem.poses(best)[0]).median() > SAME_MOTION]
+    R, _ = problem.poses(best)
+    others = [x for x in found if deviation(problem.poses(x)[0], R).median() > SAME_MOTION]
     others += [best + np.array([change, *(0.0 for _ in best[1:])]) for change in (-EXCLUDED, EXCLUDED)]
     if min(map(problem.loss, others)) < problem.loss(best) + MIN_RISE:
         return None
@@ -137,9 +139,12 @@ class _Problem:
     @cached_property
     def _rays(self) -> Float[Tensor, "t 3"]:
         """Unit vectors towards the silhouettes' centres, camera frame."""
-        focal, principal = self.inputs.capture.camera.fx_fy_cx_cy.double().split(2)
-        xy = (self.inputs.silhouettes.centre - principal) / focal
-        return normalize(torch.cat([xy, torch.ones_like(xy[:, :1])], 1), dim=1)
+        return normalize(silhouette_centres(self.inputs.capture, self.inputs.silhouettes), dim=1)
+
+    @cached_property
+    def _across(self) -> Float[Tensor, "t 3 3"]:
+        """Projections onto the planes across `_rays`."""
+        return torch.eye(3, dtype=torch.float64) - self._rays[:, :, None] * self._rays[:, None]
 
     def start(self, elevation: float, step: float) -> np.ndarray:
         """Unknowns of a rotation about an upright axis through the mean centre of the silhouettes."""
@@ -171,9 +176,8 @@ class _Problem:
         middle = self._rays.mean(0)
         # Any point of the axis gives the same poses: the one at the silhouettes' mean height.
         on_axis = torch.stack([middle.new_tensor(offset), middle[1] / middle[2], middle.new_ones(())])
-        across = torch.eye(3, dtype=torch.float64) - self._rays[:, :, None] * self._rays[:, None]
-        A = (R.mT @ across @ R).mean(0)
-        t = on_axis - R @ torch.linalg.solve(A, (R.mT @ across @ on_axis).mean(0))
+        A = (R.mT @ self._across @ R).mean(0)
+        t = on_axis - R @ torch.linalg.solve(A, (R.mT @ self._across @ on_axis).mean(0))
         return R, t / t[:, 2].mean()
 
     def log_focal(self, x: np.ndarray) -> Float[Tensor, ""]:
@@ -189,8 +193,8 @@ class _Problem:
         return torch.where(found.valid, found.gap, torch.nan)
 
     def loss(self, x: np.ndarray) -> float:
-        """Mean Cauchy loss of the gaps; infinite without any."""
-        return float(torch.log1p((self.gaps(x) / GAP_SCALE).square()).nanmean().nan_to_num(torch.inf))
+        """Mean Cauchy loss of the gaps; infinite if too few are valid."""
+        return float(robust_cost(self.gaps(x).flatten()[None], GAP_SCALE))
 
     def deviations(self, x: np.ndarray) -> Float[Tensor, " t"]:
         """Angle by which every frame's own contour deviates from the motion, from one Gauss-Newton step [radians]."""

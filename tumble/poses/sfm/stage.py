@@ -472,6 +472,15 @@ def _contour_costs(inputs: Inputs, poses: Poses, scale: float) -> Float[Tensor, 
     return torch.cat([robust_cost(each, scale) for each in gaps])
 
 
+_WITHOUT_SETTINGS = {
+    TryCircularMotion: _try_circular_motion,
+    AlignTexture: _align_texture,
+    AlignColours: _align_colours,
+    TrackTexture: _track_texture,
+}
+"""The phases that have none."""
+
+
 def assess(inputs: Inputs, trajectory: Trajectory) -> PoseResult:
     """The result for poses that another method has estimated: lost frames, points and quality as for this method."""
     T_cam_obj = trajectory.T_cam_obj
@@ -503,18 +512,9 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     return pose_result(inputs.capture, tracks, contours, inputs.mirror_symmetry, solution)
 
 
-_WITHOUT_SETTINGS = {
-    TryCircularMotion: _try_circular_motion,
-    AlignTexture: _align_texture,
-    AlignColours: _align_colours,
-    TrackTexture: _track_texture,
-}
-"""The phases that have none."""
-
-
 def _rotation_disagreement(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
-    """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]; between those
-    fitted to the even and to the odd frames for a circular motion, which is found without tracks."""
+    """Angle between the rotation fitted mainly to tracks and the one fitted mainly to contours [radians]; for a
+    circular motion, which is found without tracks, `CircularMotion.disagreement`."""
     if "circular" in state.memory:
         return state.memory["circular"]
     fits = []
