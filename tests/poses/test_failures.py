@@ -23,9 +23,11 @@ QUICK = stage.Config(
     window_sizes=(6,),
     window_scales=(3.0, 1.0, 0.5),
     global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
+    fallbacks=(),
     relocalizations=0,
     perturbations=0,
     max_corrections=0,
+    texture_rounds=1,
 )
 
 

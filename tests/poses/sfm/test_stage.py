@@ -23,9 +23,11 @@ QUICK = stage.Config(
     window_sizes=(6,),
     window_scales=(3.0, 1.0, 0.5),
     global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
+    fallbacks=(),
     relocalizations=0,
     perturbations=0,
     max_corrections=0,
+    texture_rounds=1,
 )
 
 
@@ -208,7 +210,7 @@ def rotated(state: State, degrees: float) -> Tensor:
 def test_a_part_of_the_motion_that_is_joined_wrongly_is_found_by_perturbation(scene: Tumble) -> None:
     """All frames from the eleventh on are turned by 50 degrees, from which bundle adjustment alone does not return."""
     inputs = stage.gather(scene.capture, matches(scene))
-    cfg = replace(QUICK, converged_loss=0.0, perturbations=5, fallbacks=QUICK.fallbacks[:1])
+    cfg = replace(QUICK, converged_loss=0.0, perturbations=5, fallbacks=stage.Config().fallbacks[:1])
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(1))
     good = turned(scene, 3, 0.0)
     behind = torch.arange(20)[:, None, None] >= 10

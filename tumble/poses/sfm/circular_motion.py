@@ -42,9 +42,9 @@ PAIRS = 1000
 """Number of frame pairs, chosen at random, whose tangency gaps are fitted."""
 GAP_SCALE = 1.0
 """Scale of the Cauchy loss of a tangency gap [pixels]."""
-MAX_LOSS = math.log1p(0.5**2)
-"""Largest loss with which a motion explains the contours: that of gaps of half a pixel. With true masks turntables have
-losses of 0.01 to 0.07, the best circular motions for objects in a hand 2.8 to 3.6."""
+MAX_LOSS = math.log(2)
+"""Largest loss with which a motion explains the contours: that of gaps of a pixel, which masks of films may have. With
+true masks turntables have losses of 0.01 to 0.07, the best circular motions for objects in a hand 2.8 to 3.6."""
 MIN_RISE = math.log1p(0.25**2)
 """Smallest rise of the loss by which other motions count as excluded: that of gaps of a quarter of a pixel, about as
 large as the pixel grid makes them."""
@@ -52,6 +52,9 @@ EXCLUDED = math.radians(10)
 """Change of the axis' elevation that has to be excluded [radians]."""
 SPEED_TERMS = 8
 """Number of sines by which the angle may deviate from a constant speed: a hand does not turn a table evenly."""
+MIN_EXPLAINED = 0.1
+"""Part of the loss of frames that were not fitted that they must explain, or the speed is constant: a motor's is, and
+noise of the contours would be taken for changes."""
 SAME_MOTION = math.radians(5)
 """Median difference of rotations up to which two fits have found the same motion [radians]."""
 DIFFERENCE, EVALUATIONS = 1e-4, 30
@@ -115,11 +118,15 @@ def fit(inputs: Inputs) -> CircularMotion | None:
     others += [best + np.array([change, *(0.0 for _ in best[1:])]) for change in (-EXCLUDED, EXCLUDED)]
     if min(map(problem.loss, others)) < problem.loss(best) + MIN_RISE:
         return None
-    best = problem.refined(np.concatenate([best, np.zeros(SPEED_TERMS)]))
+    even, odd = (replace(problem, pairs=pairs[(pairs % 2 == k).all(1)]) for k in (0, 1))
+    choices = [best, problem.refined(np.concatenate([best, np.zeros(SPEED_TERMS)]))]
+    fitted = [(even.refined(x), odd.refined(x)) for x in choices]
+    constant, varying = (odd.loss(a) + even.loss(b) for a, b in fitted)
+    chosen = int(varying < (1 - MIN_EXPLAINED) * constant)
+    best = choices[chosen]
     if problem.loss(best) > MAX_LOSS:
         return None
-    halves = (replace(problem, pairs=pairs[(pairs % 2 == k).all(1)]).refined(best) for k in (0, 1))
-    disagreement = deviation(*(problem.poses(x)[0] for x in halves))
+    disagreement = deviation(*(problem.poses(x)[0] for x in fitted[chosen]))
     return CircularMotion(*problem.poses(best), problem.log_focal(best), disagreement.maximum(problem.deviations(best)))
 
 
