@@ -1,4 +1,7 @@
-"""Turntables with true silhouettes and without a single match."""
+"""Turntables with true silhouettes and without a single match.
+
+The contours of a lopsided ellipsoid tell its motion; those of a body of revolution do not, but the paint on it does.
+"""
 
 import math
 from dataclasses import replace
@@ -8,12 +11,14 @@ import torch
 from torch import Tensor
 
 from tests.lopsided import DISTANCE, Tumble, moving, truth, tumbling
+from tests.poses.sfm import test_spin as revolution
 from tumble.engine.loop import drive
 from tumble.evaluation import metrics
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.sfm import circular_motion, stage
 from tumble.poses.sfm.observations import Inputs
-from tumble.scene.capture import Capture
+from tumble.poses.sfm.symmetry import texture_agreement
+from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.trajectory import Trajectory
 from tumble.synthetic import trajectories
 
@@ -27,14 +32,34 @@ def turning(azimuth: Tensor) -> Tumble:
     return moving(trajectories.look_at_object(position))
 
 
+def painted(frames: int, sense: int = 1, contrast: float = 0.12) -> tuple[Capture, Trajectory]:
+    """A shaded body of revolution that stands on the axis of the turntable, seen from 25 degrees above."""
+    k, x, z = torch.arange(frames), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
+    upright = SO3.exp((math.pi / 2 + math.radians(25)) * x)
+    turns = SO3.exp((sense * 2 * math.pi / frames) * k[:, None] * z)
+    T = SE3.from_rotation(upright @ turns, torch.tensor([0.0, 0.0, revolution.DISTANCE]).expand(frames, 3))
+    waves = 10 * torch.randn(3, 12, generator=torch.Generator().manual_seed(1))
+    images, masks = [], []
+    for i in range(frames):
+        at, hit = revolution.intersect(T[i], revolution.CAMERA.pixel_centers())
+        normal = torch.nn.functional.normalize(T.rotation[i] @ (at / revolution.RADII.square()), dim=-1)
+        albedo = 0.5 + contrast * (at @ waves).sin().sum(-1)
+        grey = 255 * (albedo * (0.4 + 0.6 * (normal @ revolution.LIGHT).clamp_min(0))).clamp(0, 1) * hit
+        images.append(grey[..., None].expand(-1, -1, 3).to(torch.uint8))
+        masks.append(torch.where(hit, OBJECT, BACKGROUND).to(torch.uint8))
+    names = tuple(f"{i}.png" for i in range(frames))
+    capture = Capture(torch.stack(images), torch.stack(masks), revolution.CAMERA, names, "camera")
+    return capture, Trajectory(T, "camera")
+
+
 def gathered(capture: Capture) -> Inputs:
     return stage.gather(capture, ())
 
 
-def error(scene: Tumble, motion: circular_motion.CircularMotion) -> float:
+def error(right: Trajectory, motion: circular_motion.CircularMotion) -> float:
     """Median rotation error [degrees]."""
     T = SE3.from_rotation(SO3.from_matrix(motion.R.float()), motion.t.float())
-    return metrics.rotation_scores(Trajectory(T, "camera"), truth(scene))["rotation_median_degrees"]
+    return metrics.rotation_scores(Trajectory(T, "camera"), right)["rotation_median_degrees"]
 
 
 @pytest.mark.parametrize("sense", [1, -1])
@@ -53,7 +78,7 @@ def test_a_table_may_turn_unevenly() -> None:
     scene = turning(time + 0.3 / (2 * math.pi) * torch.sin(2 * math.pi * time))
     found = circular_motion.fit(gathered(scene.capture))
     assert found is not None
-    assert error(scene, found) < 1
+    assert error(truth(scene), found) < 1
 
 
 def test_the_error_of_a_frame_that_does_not_fit_is_known() -> None:
@@ -73,7 +98,7 @@ def test_a_focal_length_that_is_only_assumed_is_estimated() -> None:
     short = replace(scene.capture, camera=scene.capture.camera.zoomed(0.8), focal_assumed=True)
     found = circular_motion.fit(gathered(short))
     assert found is not None
-    assert error(scene, found) < 1
+    assert error(truth(scene), found) < 1
     assert 0.5 * math.log(1 / 0.8) < float(found.log_focal) < 1.5 * math.log(1 / 0.8)
 
 
@@ -86,8 +111,10 @@ def test_an_object_in_a_hand_has_no_circular_motion(monkeypatch: pytest.MonkeyPa
     assert circular_motion.fit(inputs) is None
 
 
-def test_contours_that_stay_the_same_do_not_tell_how_a_body_of_revolution_turns() -> None:
-    capture = turning(torch.arange(24) / 24).capture
+def test_contours_that_stay_the_same_do_not_tell_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither does the texture of another object."""
+    monkeypatch.setattr(circular_motion, "ELEVATIONS", (-30, 0, 30))
+    capture = turning(torch.arange(16) / 16).capture
     same = replace(capture, masks=capture.masks[:1].expand_as(capture.masks).clone())
     assert circular_motion.periods(same)
     assert circular_motion.fit(gathered(same)) is None
@@ -97,3 +124,29 @@ def test_frames_recur_after_every_turn() -> None:
     assert 22 in circular_motion.periods(turning(torch.arange(55) / 22).capture)
     assert circular_motion.periods(turning(torch.arange(36) / 36).capture) == [36]
     assert circular_motion.periods(turning(torch.arange(36) / 45).capture) == []
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_paint_tells_how_a_body_of_revolution_turns(sense: int) -> None:
+    capture, right = painted(24, sense)
+    found = circular_motion.fit(gathered(capture))
+    assert found is not None
+    assert error(right, found) < 3
+    assert float(torch.rad2deg(found.disagreement).median()) > 0.3 * error(right, found)
+
+
+def test_a_body_of_revolution_without_paint_has_no_known_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(circular_motion, "ELEVATIONS", (-30, 0, 30))
+    assert circular_motion.fit(gathered(painted(24, contrast=0.0)[0])) is None
+
+
+def test_frames_agree_about_the_texture_at_the_right_poses_only() -> None:
+    capture, right = painted(24)
+    other_way = painted(24, -1)[1]
+    assert texture_agreement(capture, right, 300).mean() > 0.8
+    assert texture_agreement(capture, other_way, 300).mean() < 0.4
+    # What is left of smooth shading is faint, and fits both ways.
+    plain = painted(24, contrast=0.0)[0]
+    shading = [texture_agreement(plain, poses, 300) for poses in (right, other_way)]
+    assert abs(shading[0].mean() - shading[1].mean()) < circular_motion.MIN_LEAD
+    assert shading[0].weight.mean() < 0.1 * texture_agreement(capture, right, 300).weight.mean()

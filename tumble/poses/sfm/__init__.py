@@ -1,7 +1,7 @@
 """Structure from motion of a rotating object in front of a static camera.
 
 Relative poses of pairs of frames, rotation averaging, bundle adjustment of feature tracks and frontier points of
-silhouettes, and relocalization; before them, the motion of a turntable from contours alone (`circular_motion`).
+silhouettes, and relocalization; before them, the motion of a turntable (`circular_motion`).
 `schedule` has the order of the steps, `stage` carries them out. An object that hands hide in part is posed by
 `segments` instead, from parts of the capture that are certain. `symmetry` has what concerns symmetric objects.
 """

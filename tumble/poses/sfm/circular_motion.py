@@ -1,4 +1,4 @@
-"""The motion of a turntable, found from contours alone: a constant rotation about one axis.
+"""The motion of a turntable: a rotation about one axis, found from contours, or from the texture where those are equal.
 
 Shading and highlights stay in place while a surface turns below them, so that matches of a round object with little
 texture show too small a rotation, or one of the wrong sense, and bundle adjustment of all poses follows them. A
@@ -7,9 +7,12 @@ any match. Light and camera stand still, so that a frame looks like another exac
 more, from which the rotation per frame is known in advance.
 
 A body of revolution that stands on the axis has the same contour in all frames, which then do not tell how it turns.
+They still leave two unknowns only: the sense, and the elevation of the camera above the plane of rotation. Under the
+right ones all frames show the same texture at a point of the visual hull (`symmetry.texture_agreement`).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -24,8 +27,9 @@ from tumble.maths import SO3
 from tumble.poses.sfm import bundle_adjustment
 from tumble.poses.sfm.adjustment import deviation
 from tumble.poses.sfm.frontier_points import epipolar_tangencies
-from tumble.poses.sfm.observations import Inputs, silhouette_centres, with_focal_length
+from tumble.poses.sfm.observations import Inputs, in_unit_sphere, silhouette_centres, with_focal_length
 from tumble.poses.sfm.relocalization import robust_cost
+from tumble.poses.sfm.symmetry import Agreement, texture_agreement
 from tumble.scene import BACKGROUND, Capture
 
 GRID = 32
@@ -50,6 +54,17 @@ MIN_RISE = math.log1p(0.25**2)
 large as the pixel grid makes them."""
 EXCLUDED = math.radians(10)
 """Change of the axis' elevation that has to be excluded [radians]."""
+MIN_AGREEMENT = 0.5
+"""Smallest mean correlation of the texture by which a motion is found: half of the contrast is common to all frames."""
+MIN_LEAD = 0.1
+"""Lead of this correlation over that of all other rotations per frame: a turn the other way, or another period."""
+COARSE_POINTS, POINTS = 500, 1500
+"""Number of surface points whose texture is compared at all elevations, and near the best one."""
+FINE_STEP, FINE_STEPS = 2, 4
+"""Distance of elevations near the best one [degrees], and their number on either side."""
+PARTS = 4
+"""Number of parts of the object along the axis, from each of which the elevation is found as well; between them the
+visual hull has other errors."""
 SPEED_TERMS = 8
 """Number of sines by which the angle may deviate from a constant speed: a hand does not turn a table evenly."""
 MIN_EXPLAINED = 0.1
@@ -65,7 +80,7 @@ ANGLE_STEP = math.radians(1)
 
 @dataclass(frozen=True)
 class CircularMotion:
-    """Poses of all frames under a circular motion."""
+    """Poses of all frames under a circular motion, and how far they may be wrong."""
 
     R: Float[Tensor, "t 3 3"]
     """`R_cam_obj`"""
@@ -75,7 +90,8 @@ class CircularMotion:
     """Logarithm of the focal length over that of the capture; 0 if the latter is known."""
     disagreement: Float[Tensor, " t"]
     """Angle between the rotations fitted to the even frames alone and to the odd ones alone, or the one by which the
-    frame's own contour deviates from the motion if that is larger [radians]."""
+    frame's own contour deviates from the motion if that is larger; where texture tells the elevation, the standard
+    deviation of those that parts of the object tell [radians]."""
 
 
 def periods(capture: Capture) -> list[int]:
@@ -100,15 +116,17 @@ def periods(capture: Capture) -> list[int]:
 
 
 def fit(inputs: Inputs) -> CircularMotion | None:
-    """The circular motion that explains the contours.
+    """The circular motion that explains the contours, and the texture if others explain the contours about as well.
 
-    None if no frame recurs, if there is no such motion, or if others explain the contours about as well.
+    None if no frame recurs, or if there is no such motion.
     """
     pairs = torch.combinations(torch.arange(len(inputs.capture)))
     pairs = pairs[torch.randperm(len(pairs), generator=torch.Generator().manual_seed(0))[:PAIRS]]
     problem, found = _Problem(inputs, pairs), []
-    for period, sense in product(periods(inputs.capture)[:MAX_PERIODS], (1, -1)):
-        starts = [problem.start(math.radians(elevation), sense * 2 * math.pi / period) for elevation in ELEVATIONS]
+    periods_and_senses = product(periods(inputs.capture)[:MAX_PERIODS], (1, -1))
+    steps = [sense * 2 * math.pi / period for period, sense in periods_and_senses]
+    for step in steps:
+        starts = [problem.start(math.radians(elevation), step) for elevation in ELEVATIONS]
         found += [problem.refined(start) for start in sorted(starts, key=problem.loss)[:REFINED]]
     if not found:
         return None
@@ -117,7 +135,7 @@ def fit(inputs: Inputs) -> CircularMotion | None:
     others = [x for x in found if deviation(problem.poses(x)[0], R).median() > SAME_MOTION]
     others += [best + np.array([change, *(0.0 for _ in best[1:])]) for change in (-EXCLUDED, EXCLUDED)]
     if min(map(problem.loss, others)) < problem.loss(best) + MIN_RISE:
-        return None
+        return _by_texture(problem, steps) if problem.loss(best) <= MAX_LOSS else None
     even, odd = (replace(problem, pairs=pairs[(pairs % 2 == k).all(1)]) for k in (0, 1))
     choices = [best, problem.refined(np.concatenate([best, np.zeros(SPEED_TERMS)]))]
     fitted = [(even.refined(x), odd.refined(x)) for x in choices]
@@ -128,6 +146,43 @@ def fit(inputs: Inputs) -> CircularMotion | None:
         return None
     disagreement = deviation(*(problem.poses(x)[0] for x in fitted[chosen]))
     return CircularMotion(*problem.poses(best), problem.log_focal(best), disagreement.maximum(problem.deviations(best)))
+
+
+def _by_texture(problem: "_Problem", steps: list[float]) -> CircularMotion | None:
+    """The circular motion under which the frames agree about the texture; None if none is clearly the best.
+
+    Args:
+        steps: Possible rotations per frame [radians].
+    """
+    rated = [
+        (problem.agreement(problem.upright(math.radians(elevation), step), COARSE_POINTS).mean(), elevation, step)
+        for step in steps
+        for elevation in ELEVATIONS
+    ]
+    agreement, elevation, step = max(rated)
+    if agreement < max([MIN_AGREEMENT, *(other + MIN_LEAD for other, _, its in rated if its != step)]):
+        return None
+    elevations = [elevation + FINE_STEP * k for k in range(-FINE_STEPS, FINE_STEPS + 1)]
+    motions = [problem.upright(math.radians(each), step) for each in elevations]
+    found = [problem.agreement(x, POINTS) for x in motions]
+    whole = _peak(elevations, [each.mean() for each in found])
+    places = [problem.along_axis(x, each.positions).argsort().argsort() for x, each in zip(motions, found, strict=True)]
+    parts = [
+        _peak(elevations, [each.mean(at * PARTS // POINTS == k) for at, each in zip(places, found, strict=True)])
+        for k in range(PARTS)
+    ]
+    R, t = problem.poses(problem.upright(math.radians(whole), step))
+    disagreement = torch.full_like(t[:, 0], math.radians(float(np.std(parts))))
+    return CircularMotion(R, t, torch.zeros_like(t[0, 0]), disagreement)
+
+
+def _peak(x: list[int], y: list[float]) -> float:
+    """Place of the maximum of values at evenly spaced places, by a parabola through the seven around the largest one,
+    since values are noisy."""
+    middle = min(max(int(np.argmax(y)), 3), len(x) - 4)
+    curvature, slope, _ = np.polyfit(np.arange(-3, 4), y[middle - 3 : middle + 4], 2)
+    shift = float(np.clip(-slope / (2 * curvature), -3, 3)) if curvature < 0 else 3.0 * float(np.sign(slope))
+    return x[middle] + shift * (x[1] - x[0])
 
 
 @dataclass(frozen=True)
@@ -159,6 +214,23 @@ class _Problem:
         focal = [1.0] if self.inputs.capture.focal_assumed else []
         return np.array([elevation, 0.0, float(middle[0] / middle[2]), step, *focal])
 
+    def upright(self, elevation: float, step: float) -> np.ndarray:
+        """Unknowns of a rotation with a known elevation and step, whose axis' slant and position fit the contours."""
+        return self.refined(self.start(elevation, step), [1, 2])
+
+    def agreement(self, x: np.ndarray, points: int) -> Agreement:
+        """Agreement of all frames about the texture of the visual hull; none if the poses contradict each other."""
+        try:
+            return texture_agreement(self.inputs.capture, in_unit_sphere(self.inputs, *self.poses(x)), points)
+        except ValueError:
+            nothing = torch.zeros(points)
+            return Agreement(torch.zeros(points, 3), nothing, nothing)
+
+    def along_axis(self, x: np.ndarray, positions: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Places of points along the axis, object frame."""
+        # The first frame's rotation is the identity: the object frame has the axes of the camera's.
+        return positions @ torch.tensor(self._axis(x), dtype=positions.dtype)
+
     @property
     def _first_term(self) -> int:
         """Index of the first deviation from a constant speed."""
@@ -172,20 +244,23 @@ class _Problem:
         Args:
             turned: Angle about the axis by which every frame is turned in addition [radians].
         """
-        elevation, slant, offset, step = x[:4]
-        # Camera frame: x to the right, y down, z forward. Seen from above, the axis leans towards the camera.
-        axis = [math.sin(slant) * math.cos(elevation), -math.cos(slant) * math.cos(elevation), -math.sin(elevation)]
+        offset, step = x[2:4]
         time = torch.arange(len(self._rays), dtype=torch.float64)
         angle = step * time + turned
         for k, amplitude in enumerate(x[self._first_term :].tolist(), 1):
             angle = angle + amplitude * torch.sin(math.pi * k / (len(time) - 1) * time)
-        R = SO3.exp(angle[:, None] * torch.tensor(axis, dtype=torch.float64)).matrix()
+        R = SO3.exp(angle[:, None] * torch.tensor(self._axis(x), dtype=torch.float64)).matrix()
         middle = self._rays.mean(0)
         # Any point of the axis gives the same poses: the one at the silhouettes' mean height.
         on_axis = torch.stack([middle.new_tensor(offset), middle[1] / middle[2], middle.new_ones(())])
         A = (R.mT @ self._across @ R).mean(0)
         t = on_axis - R @ torch.linalg.solve(A, (R.mT @ self._across @ on_axis).mean(0))
         return R, t / t[:, 2].mean()
+
+    def _axis(self, x: np.ndarray) -> list[float]:
+        """Direction of the axis: x to the right, y down, z forward. Seen from above, it leans towards the camera."""
+        elevation, slant = x[:2]
+        return [math.sin(slant) * math.cos(elevation), -math.cos(slant) * math.cos(elevation), -math.sin(elevation)]
 
     def log_focal(self, x: np.ndarray) -> Float[Tensor, ""]:
         """Logarithm of the focal length over the capture's."""
@@ -219,16 +294,27 @@ class _Problem:
             denominator.index_add_(0, frame, (weight * slope.square()).nan_to_num().sum(1))
         return (numerator / denominator.clamp_min(1e-9)).abs()
 
-    def refined(self, x: np.ndarray) -> np.ndarray:
-        """The unknowns with the least Cauchy loss of the gaps near some others."""
+    def refined(self, x: np.ndarray, free: Sequence[int] | None = None) -> np.ndarray:
+        """The unknowns with the least Cauchy loss of the gaps near some others.
+
+        Args:
+            free: Indices of the unknowns that change; all by default.
+        """
         from scipy.optimize import least_squares
 
+        free = range(len(x)) if free is None else free
         prior = bundle_adjustment.FOCAL_NOISE / bundle_adjustment.FOCAL_SIGMA * math.sqrt(2 * len(self.pairs))
         focal = slice(4, self._first_term)
 
-        def residuals(x: np.ndarray) -> np.ndarray:
-            return np.concatenate([self.gaps(x).nan_to_num().flatten().numpy(), prior * (x[focal] - 1)])
+        def changed(values: np.ndarray) -> np.ndarray:
+            new = x.copy()
+            new[free] = values
+            return new
+
+        def residuals(values: np.ndarray) -> np.ndarray:
+            new = changed(values)
+            return np.concatenate([self.gaps(new).nan_to_num().flatten().numpy(), prior * (new[focal] - 1)])
 
         scale = np.concatenate([[0.3, 0.1, 0.02, 0.02 * abs(x[3])], np.full(len(x) - 4, 0.1)])
-        options = {"loss": "cauchy", "f_scale": GAP_SCALE, "x_scale": scale, "diff_step": DIFFERENCE}
-        return least_squares(residuals, x, max_nfev=EVALUATIONS, **options).x
+        options = {"loss": "cauchy", "f_scale": GAP_SCALE, "x_scale": scale[free], "diff_step": DIFFERENCE}
+        return changed(least_squares(residuals, x[free], max_nfev=EVALUATIONS, **options).x)

@@ -14,17 +14,20 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from tumble.maths import SE3, SO3
 from tumble.poses.sfm import frontier_points, relative_pose
 from tumble.poses.sfm.frontier_points import Contours
 from tumble.poses.sfm.relative_pose import Silhouettes
 from tumble.poses.sfm.symmetry import MirrorSymmetry, mirror_symmetry
 from tumble.poses.sfm.tracks import Tracks, chain_matches
-from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match, Trajectory
 
 TRACKS_PER_FRAME = 150
 """Number of tracks aimed at in every frame; it determines the distance between tracks."""
 RADIUS_MARGIN = 1.1
 """Assumed radius of the object over the median radius of the spheres that its silhouettes indicate."""
+BOUNDING_RADIUS_FACTOR = 1.3
+"""Radius of a sphere about the origin that safely contains the object, over the object's approximate radius."""
 RIM = 2
 """Width of the rim around an object in which something that hides it shows [pixels]."""
 MAX_HIDDEN_RIM = 0.25
@@ -136,6 +139,12 @@ def with_focal_length(inputs: Inputs, log_focal: Float[Tensor, ""]) -> Inputs:
     capture = replace(inputs.capture, camera=inputs.capture.camera.zoomed(factor))
     silhouettes = replace(inputs.silhouettes, radius=inputs.silhouettes.radius / factor)
     return replace(inputs, capture=capture, silhouettes=silhouettes, radius=inputs.radius / factor)
+
+
+def in_unit_sphere(inputs: Inputs, R: Float[Tensor, "t 3 3"], t: Float[Tensor, "t 3"]) -> Trajectory:
+    """Poses in a unit in which the object lies in the unit sphere, from `R_cam_obj` and the object's origin."""
+    distance = t.float() / (BOUNDING_RADIUS_FACTOR * inputs.radius)
+    return Trajectory(SE3.from_rotation(SO3.from_matrix(R.float()), distance), inputs.capture.light)
 
 
 def silhouette_centres(capture: Capture, silhouettes: Silhouettes) -> Float[Tensor, "t 3"]:

@@ -123,7 +123,7 @@ class KeepBest:
 
 @dataclass(frozen=True)
 class TryCircularMotion:
-    """Take the motion of a turntable, with which all is done, if it explains the contours (`circular_motion`)."""
+    """Take the motion of a turntable, with which all is done, if there is one (`circular_motion`)."""
 
 
 @dataclass(frozen=True)

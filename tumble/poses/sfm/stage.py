@@ -11,8 +11,8 @@ What contours do not show is corrected by texture: the rotation of a body of rev
 part of the motion that leave the visual hull as it is (`symmetry`). These corrections are repeated until the poses
 settle.
 
-The motion of a turntable is found before all that from contours alone, and then nothing else is done
-(`circular_motion`).
+The motion of a turntable is found before all that, from contours or from the texture of a body of revolution, and then
+nothing else is done (`circular_motion`).
 
 A capture that has not converged is attempted again with the settings in `Config.fallbacks`, until two attempts agree.
 Otherwise parts of the best one are changed at random, and what lowers the loss is kept (`perturbation`). A focal length
@@ -29,13 +29,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.engine import State
-from tumble.maths import SE3, SO3, angle_between, average_rotations, mean_rotation
+from tumble.maths import SO3, angle_between, average_rotations, mean_rotation
 from tumble.poses.result import PoseResult
 from tumble.poses.sfm import circular_motion, relative_pose, segments, symmetry
 from tumble.poses.sfm.adjustment import adjust_round, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.finalize import Solution, pose_result
-from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres, with_focal_length
+from tumble.poses.sfm.observations import (
+    BOUNDING_RADIUS_FACTOR,
+    Inputs,
+    focal_length,
+    in_unit_sphere,
+    silhouette_centres,
+    with_focal_length,
+)
 from tumble.poses.sfm.observations import gather as gather
 from tumble.poses.sfm.observations import is_hidden as is_hidden
 from tumble.poses.sfm.observations import shown as shown
@@ -70,7 +77,7 @@ from tumble.poses.sfm.schedule import (
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 24
+VERSION = 25
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -85,8 +92,6 @@ It is finite, because neither tracks nor contours alone determine all poses.
 """
 MAX_COST_RATIO = 4.0
 """Robust cost of a frame's tangency gaps above which its pose does not show a gap of the motion [median]."""
-BOUNDING_RADIUS_FACTOR = 1.3
-"""Radius of a sphere about the origin that safely contains the object, over the object's approximate radius."""
 SETTLED_ANGLE = math.radians(1.0)
 """Largest change of a frame's rotation by a round of corrections below which no more rounds follow [radians]. A frame
 that is relocated or turned moves farther, one that is only adjusted less."""
@@ -293,14 +298,8 @@ def _steady_tracks(inputs: Inputs, state: State) -> Tracks:
     return inputs.tracks if steady is None or bool(steady.all()) else inputs.tracks.select(steady)
 
 
-def _in_unit_sphere(inputs: Inputs, poses: Poses) -> Trajectory:
-    """Poses in a unit in which the object lies in the unit sphere."""
-    R, t = poses.R.float(), poses.t.float() / (BOUNDING_RADIUS_FACTOR * inputs.radius)
-    return Trajectory(SE3.from_rotation(SO3.from_matrix(R), t), inputs.capture.light)
-
-
 def _from_unit_sphere(inputs: Inputs, poses: Poses, trajectory: Trajectory) -> Poses:
-    """Poses in the unit of this stage, of which others are those of `_in_unit_sphere`."""
+    """Poses in the unit of this stage, of which others are those of `in_unit_sphere`."""
     T_cam_obj = trajectory.T_cam_obj
     t = T_cam_obj.xyz.double() * (BOUNDING_RADIUS_FACTOR * inputs.radius)
     return replace(poses, R=T_cam_obj.rotation.matrix().double(), t=t)
@@ -311,7 +310,7 @@ def _align_texture(inputs: Inputs, state: State) -> PhaseResult:
     found = _spin(inputs, state.params)
     if found is None or not found.is_better:
         return state.params, {}
-    trajectory = found.surface.turned(_in_unit_sphere(inputs, state.params), found.angle)
+    trajectory = found.surface.turned(in_unit_sphere(inputs, state.params.R, state.params.t), found.angle)
     state.memory["steady"] = symmetry.steady_observations(inputs.capture, trajectory, found.surface, inputs.tracks)
     return _from_unit_sphere(inputs, state.params, trajectory), {"turned": found.angle.abs().median()}
 
@@ -338,7 +337,7 @@ def _align_colours(inputs: Inputs, state: State) -> PhaseResult:
     state.memory["confirmed"] = found.confirmed
     if not found.is_better:
         return state.params, {}
-    trajectory = found.turned(_in_unit_sphere(inputs, state.params))
+    trajectory = found.turned(in_unit_sphere(inputs, state.params.R, state.params.t))
     return _from_unit_sphere(inputs, state.params, trajectory), {"turned": float((found.chosen > 0).sum())}
 
 
@@ -346,7 +345,7 @@ def _turns(inputs: Inputs, poses: Poses) -> symmetry.Turns | None:
     """Symmetric turns of parts of the motion that colours show."""
     cost = _contour_costs(inputs, poses, RELOCALIZATION_SCALE)
     usable = cost <= max(MAX_COST_RATIO * float(cost.median()), TOLERATED_COST)
-    return symmetry.estimate_turns(inputs.capture, _in_unit_sphere(inputs, poses), usable & ~cost.isinf())
+    return symmetry.estimate_turns(inputs.capture, in_unit_sphere(inputs, poses.R, poses.t), usable & ~cost.isinf())
 
 
 def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
@@ -354,7 +353,7 @@ def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
     silhouettes = inputs.mirror_symmetry
     if not silhouettes.is_revolution or silhouettes.is_sphere:
         return None
-    return symmetry.estimate_spin(inputs.capture, _in_unit_sphere(inputs, poses))
+    return symmetry.estimate_spin(inputs.capture, in_unit_sphere(inputs, poses.R, poses.t))
 
 
 def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_other: bool) -> PhaseResult:
@@ -371,7 +370,7 @@ def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_ot
 
 
 def _try_circular_motion(inputs: Inputs, state: State) -> PhaseResult:
-    """Take a circular motion if it explains the contours; nothing else is to be done then."""
+    """Take a circular motion if there is one; nothing else is to be done then."""
     found, poses = circular_motion.fit(inputs), state.params
     if found is None:
         return poses, {}
@@ -411,7 +410,10 @@ def _comparable_loss(cfg: Config, inputs: Inputs, state: State, poses: Poses, sc
 def _track_texture(inputs: Inputs, state: State) -> PhaseResult:
     """Locate points of the visual hull in all frames by their texture, in place of those located before."""
     frames = torch.nonzero(_posed(state))[:, 0]
-    capture, trajectory = inputs.capture.select(frames.tolist()), _in_unit_sphere(inputs, state.params).select(frames)
+    capture, trajectory = (
+        inputs.capture.select(frames.tolist()),
+        in_unit_sphere(inputs, state.params.R, state.params.t).select(frames),
+    )
     tracks = symmetry.texture_tracks(capture, trajectory, state.rng)
     tracks = replace(tracks, frame=frames[tracks.frame])
     state.memory |= {f"texture_{name}": x for name, x in vars(tracks).items()}

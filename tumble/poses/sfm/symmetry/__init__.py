@@ -2,16 +2,18 @@
 
 The silhouettes of a body of revolution (`mirror`) hide its rotation about the axis (`spin`), those of a box or a prism
 hide the turns that leave the visual hull as it is (`turns`). Texture and colours show both, if there is enough of them
-(`texture_information`). Points of the surface that all frames locate by their texture (`texture_tracks`) limit drift.
+(`texture_information`). Points of the surface that all frames locate by their texture (`texture_tracks`) limit drift, and tell how a body of
+revolution turns on a turntable.
 """
 
 from tumble.poses.sfm.symmetry import texture_information
 from tumble.poses.sfm.symmetry.mirror import MirrorSymmetry, mirror_symmetry
 from tumble.poses.sfm.symmetry.spin import Spin, estimate_spin, steady_observations
-from tumble.poses.sfm.symmetry.texture_tracks import texture_tracks
+from tumble.poses.sfm.symmetry.texture_tracks import Agreement, texture_agreement, texture_tracks
 from tumble.poses.sfm.symmetry.turns import Turns, estimate_turns
 
 __all__ = [
+    "Agreement",
     "MirrorSymmetry",
     "Spin",
     "Turns",
@@ -19,6 +21,7 @@ __all__ = [
     "estimate_turns",
     "mirror_symmetry",
     "steady_observations",
+    "texture_agreement",
     "texture_information",
     "texture_tracks",
 ]

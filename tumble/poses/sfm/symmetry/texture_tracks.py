@@ -92,6 +92,46 @@ def texture_tracks(capture: Capture, trajectory: Trajectory, rng: torch.Generato
     return concatenate(NO_TRACKS, *found)
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """How much the frames agree about the texture of surface points at given poses."""
+
+    positions: Float[Tensor, "n 3"]
+    """Points of the visual hull, object frame."""
+    correlation: Float[Tensor, " n"]
+    """Correlation of a point's patch in each frame with its mean patch of all others, averaged over the frames."""
+    weight: Float[Tensor, " n"]
+    """Contrast of the texture, summed over the frames; 0 for a point that no frame shows."""
+
+    def mean(self, some: Bool[Tensor, " n"] | None = None) -> float:
+        """Mean correlation, weighted by contrast, of some points or of all; 0 if none is seen."""
+        weight = self.weight if some is None else self.weight * some
+        return float((self.correlation * weight).sum() / weight.sum().clamp_min(1e-6))
+
+
+def texture_agreement(capture: Capture, trajectory: Trajectory, points: int) -> Agreement:
+    """The agreement of all frames about `points` points of the visual hull; the object lies in the unit sphere.
+
+    Raises:
+        ValueError: The poses contradict each other, so that there is no hull.
+    """
+    cells = visual_hull.carve(
+        visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCE
+    )
+    surface = visual_hull.sample_surface(cells, points, torch.Generator().manual_seed(0))
+    patches, middle = _sampled(capture, trajectory, cells, surface), slice(REACH, REACH + 2 * HALF + 1)
+    window, smooth = _window(2 * HALF + 1)
+    values, contrast = _normalised(patches.values[:, middle, middle].flatten(1), window, smooth)
+    weight, point = patches.cosine * contrast, patches.point
+    total = torch.zeros(points, values.shape[1]).index_add_(0, point, values * weight[:, None])
+    # Of the other frames, as every patch agrees with itself.
+    mean, _ = _normalised(total[point] - values * weight[:, None], window, smooth)
+    agreement, weights = torch.zeros(2, points)
+    agreement.index_add_(0, point, weight * (values * mean * window).sum(-1))
+    weights.index_add_(0, point, weight)
+    return Agreement(surface.positions, agreement / weights.clamp_min(1e-6), weights)
+
+
 def _plane(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 3"]:
     """Two orthogonal unit vectors along the surface."""
     across = torch.eye(3).to(normals)[normals.abs().argmin(1)]
@@ -162,13 +202,7 @@ def _shifts(patches: _Patches) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, " m"]
     width, shifts = 2 * HALF + 1, 2 * REACH + 1
     window, smooth = _window(width)
     candidates = patches.values.unfold(1, width, 1).unfold(2, width, 1).reshape(-1, shifts * shifts, width * width)
-
-    def normalised(values: Tensor) -> tuple[Tensor, Tensor]:
-        rest = values - values @ smooth.T
-        contrast = (rest.square() * window).sum(-1, keepdim=True).sqrt()
-        return rest / contrast.clamp_min(1e-6), contrast[..., 0]
-
-    candidates, contrast = normalised(candidates)
+    candidates, contrast = _normalised(candidates, window, smooth)
     every, middle = torch.arange(len(candidates)), shifts * shifts // 2
     own_weight = patches.cosine * contrast[:, middle]
     weight, best = own_weight, torch.full_like(every, middle)
@@ -177,11 +211,20 @@ def _shifts(patches: _Patches) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, " m"]
         chosen = candidates[every, best] * weight[:, None]
         total = torch.zeros(len(points), width * width).index_add_(0, point, chosen)
         # Of the other frames, as every patch agrees with itself.
-        mean, _ = normalised(total[point] - chosen)
+        mean, _ = _normalised(total[point] - chosen, window, smooth)
         correlation = torch.einsum("msp,mp->ms", candidates, mean * window)
         best = correlation.argmax(1)
         weight = own_weight * correlation.amax(1).clamp_min(0).square()
     return _peak(correlation.reshape(-1, shifts, shifts), best // shifts, best % shifts)
+
+
+def _normalised(
+    values: Float[Tensor, "*b p"], window: Float[Tensor, " p"], smooth: Float[Tensor, "p p"]
+) -> tuple[Float[Tensor, "*b p"], Float[Tensor, "*b"]]:
+    """Patches without mean and slope, of unit contrast, and their contrast before [code values]."""
+    rest = values - values @ smooth.T
+    contrast = (rest.square() * window).sum(-1, keepdim=True).sqrt()
+    return rest / contrast.clamp_min(1e-6), contrast[..., 0]
 
 
 def _window(width: int) -> tuple[Float[Tensor, " p"], Float[Tensor, "p p"]]:
