@@ -114,6 +114,7 @@ def test_an_object_in_a_hand_has_no_circular_motion(monkeypatch: pytest.MonkeyPa
 def test_contours_that_stay_the_same_do_not_tell_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither does the texture of another object."""
     monkeypatch.setattr(circular_motion, "ELEVATIONS", (-30, 0, 30))
+    monkeypatch.setattr(circular_motion, "MAX_PERIODS", 1)
     capture = turning(torch.arange(16) / 16).capture
     same = replace(capture, masks=capture.masks[:1].expand_as(capture.masks).clone())
     assert circular_motion.periods(same)

@@ -2,8 +2,8 @@
 
 The silhouettes of a body of revolution (`mirror`) hide its rotation about the axis (`spin`), those of a box or a prism
 hide the turns that leave the visual hull as it is (`turns`). Texture and colours show both, if there is enough of them
-(`texture_information`). Points of the surface that all frames locate by their texture (`texture_tracks`) limit drift, and tell how a body of
-revolution turns on a turntable.
+(`texture_information`). Points of the surface that all frames locate by their texture limit drift, and that all frames
+agree about them tells how a body of revolution turns on a turntable (`texture_tracks`).
 """
 
 from tumble.poses.sfm.symmetry import texture_information
