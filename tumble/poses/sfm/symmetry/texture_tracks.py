@@ -77,14 +77,11 @@ def texture_tracks(capture: Capture, trajectory: Trajectory, rng: torch.Generato
         trajectory: Approximate poses, wrong by a few pixels; the object lies in the unit sphere.
         rng: Source of the random choice of points.
     """
-    cells = visual_hull.carve(
-        visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCE
-    )
     try:
-        surface = visual_hull.sample_surface(cells, POINTS, rng)
-    except ValueError:  # The poses contradict each other.
+        surface, patches = _surface_patches(capture, trajectory, POINTS, rng)
+    except ValueError:
         return NO_TRACKS
-    patches, found = _sampled(capture, trajectory, cells, surface), []
+    found = []
     for first in range(0, len(surface.positions), POINTS_AT_ONCE):
         some = patches.of_points(first, first + POINTS_AT_ONCE)
         if len(some.frame):
@@ -115,21 +112,30 @@ def texture_agreement(capture: Capture, trajectory: Trajectory, points: int) -> 
     Raises:
         ValueError: The poses contradict each other, so that there is no hull.
     """
-    cells = visual_hull.carve(
-        visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCE
-    )
-    surface = visual_hull.sample_surface(cells, points, torch.Generator().manual_seed(0))
-    patches, middle = _sampled(capture, trajectory, cells, surface), slice(REACH, REACH + 2 * HALF + 1)
-    window, smooth = _window(2 * HALF + 1)
+    surface, patches = _surface_patches(capture, trajectory, points, torch.Generator().manual_seed(0))
+    middle, (window, smooth) = slice(REACH, REACH + 2 * HALF + 1), _window(2 * HALF + 1)
     values, contrast = _normalised(patches.values[:, middle, middle].flatten(1), window, smooth)
     weight, point = patches.cosine * contrast, patches.point
-    total = torch.zeros(points, values.shape[1]).index_add_(0, point, values * weight[:, None])
-    # Of the other frames, as every patch agrees with itself.
-    mean, _ = _normalised(total[point] - values * weight[:, None], window, smooth)
+    mean = _mean_of_others(values * weight[:, None], point, points, window, smooth)
     agreement, weights = torch.zeros(2, points)
     agreement.index_add_(0, point, weight * (values * mean * window).sum(-1))
     weights.index_add_(0, point, weight)
     return Agreement(surface.positions, agreement / weights.clamp_min(1e-6), weights)
+
+
+def _surface_patches(
+    capture: Capture, trajectory: Trajectory, points: int, rng: torch.Generator
+) -> tuple[visual_hull.OrientedPoints, _Patches]:
+    """Points on the visual hull, and their patches in all frames.
+
+    Raises:
+        ValueError: The poses contradict each other, so that there is no hull.
+    """
+    cells = visual_hull.carve(
+        visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCE
+    )
+    surface = visual_hull.sample_surface(cells, points, rng)
+    return surface, _sampled(capture, trajectory, cells, surface)
 
 
 def _plane(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 3"]:
@@ -209,9 +215,7 @@ def _shifts(patches: _Patches) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, " m"]
     correlation = torch.zeros_like(contrast)
     for _ in range(SEARCHES):
         chosen = candidates[every, best] * weight[:, None]
-        total = torch.zeros(len(points), width * width).index_add_(0, point, chosen)
-        # Of the other frames, as every patch agrees with itself.
-        mean, _ = _normalised(total[point] - chosen, window, smooth)
+        mean = _mean_of_others(chosen, point, len(points), window, smooth)
         correlation = torch.einsum("msp,mp->ms", candidates, mean * window)
         best = correlation.argmax(1)
         weight = own_weight * correlation.amax(1).clamp_min(0).square()
@@ -225,6 +229,23 @@ def _normalised(
     rest = values - values @ smooth.T
     contrast = (rest.square() * window).sum(-1, keepdim=True).sqrt()
     return rest / contrast.clamp_min(1e-6), contrast[..., 0]
+
+
+def _mean_of_others(
+    patches: Float[Tensor, "m p"],
+    point: Int64[Tensor, " m"],
+    points: int,
+    window: Float[Tensor, " p"],
+    smooth: Float[Tensor, "p p"],
+) -> Float[Tensor, "m p"]:
+    """Mean patch of all other frames that show a patch's point, of unit contrast; every patch agrees with itself.
+
+    Args:
+        patches: Normalised patches times their weights.
+        points: Number of points.
+    """
+    total = torch.zeros(points, patches.shape[1]).index_add_(0, point, patches)
+    return _normalised(total[point] - patches, window, smooth)[0]
 
 
 def _window(width: int) -> tuple[Float[Tensor, " p"], Float[Tensor, "p p"]]:
