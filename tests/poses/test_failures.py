@@ -1,6 +1,7 @@
 """Captures without observable rotation are rated "bad"; single faulty masks do not prevent estimation."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -13,7 +14,7 @@ from tumble.evaluation import metrics
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.frame_pairs import neighbours
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import stage
+from tumble.poses.sfm import circular_motion, stage
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.match import Match
@@ -29,6 +30,14 @@ QUICK = stage.Config(
     max_corrections=0,
     texture_rounds=1,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_turntable() -> Iterator[None]:
+    """No capture here is a turntable; that white frames look alike by chance would cost seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(circular_motion, "periods", lambda capture: [])
+        yield
 
 
 def untextured_capture(T_cam_obj: SE3, half_height: float | None) -> Capture:

@@ -62,9 +62,8 @@ def error(right: Trajectory, motion: circular_motion.CircularMotion) -> float:
     return metrics.rotation_scores(Trajectory(T, "camera"), right)["rotation_median_degrees"]
 
 
-@pytest.mark.parametrize("sense", [1, -1])
-def test_the_motion_of_a_turntable_is_found_from_contours_alone(sense: int) -> None:
-    scene = turning(sense * torch.arange(36) / 36)
+def test_the_motion_of_a_turntable_is_found_from_contours_alone() -> None:
+    scene = turning(torch.arange(36) / 36)
     out = drive(stage, stage.Config(), gathered(scene.capture), seed=0)
     scores = metrics.rotation_scores(out.trajectory, truth(scene))
     assert scores["rotation_median_degrees"] < 0.6
@@ -73,8 +72,8 @@ def test_the_motion_of_a_turntable_is_found_from_contours_alone(sense: int) -> N
     assert out.quality.uncertainty > math.radians(0.5 * scores["rotation_median_degrees"])
 
 
-def test_a_table_may_turn_unevenly() -> None:
-    time = torch.arange(36) / 36
+def test_a_table_may_turn_unevenly_and_the_other_way() -> None:
+    time = -torch.arange(36) / 36
     scene = turning(time + 0.3 / (2 * math.pi) * torch.sin(2 * math.pi * time))
     found = circular_motion.fit(gathered(scene.capture))
     assert found is not None

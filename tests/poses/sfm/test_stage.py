@@ -1,6 +1,7 @@
 """Stage 1 by structure from motion, on a tumbling ellipsoid with noisy and partly wrong matches."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
 from tumble.maths import SO3
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import schedule, stage
+from tumble.poses.sfm import circular_motion, schedule, stage
 from tumble.poses.sfm.adjustment import deviation
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
@@ -29,6 +30,14 @@ QUICK = stage.Config(
     max_corrections=0,
     texture_rounds=1,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_turntable() -> Iterator[None]:
+    """No capture here is a turntable; that white frames look alike by chance would cost seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(circular_motion, "periods", lambda capture: [])
+        yield
 
 
 def matches(scene: Tumble, wrong: float = 0.15) -> tuple[Match, ...]:
