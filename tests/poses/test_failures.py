@@ -1,43 +1,26 @@
 """Captures without observable rotation are rated "bad"; single faulty masks do not prevent estimation."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
 
 from tests.lopsided import Tumble, truth, tumbling
+from tests.poses.sfm.test_stage import QUICK
 from tumble import matching
 from tumble.engine.loop import drive
 from tumble.evaluation import metrics
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.frame_pairs import neighbours
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import circular_motion, stage
+from tumble.poses.sfm import stage
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, Capture
 from tumble.scene.match import Match
 
 SIZE, DISTANCE = 96, 4.4
-QUICK = stage.Config(
-    window_sizes=(6,),
-    window_scales=(3.0, 1.0, 0.5),
-    global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
-    fallbacks=(),
-    relocalizations=0,
-    perturbations=0,
-    max_corrections=0,
-    texture_rounds=1,
-)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_turntable() -> Iterator[None]:
-    """No capture here is a turntable; that white frames look alike by chance would cost seconds."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(circular_motion, "periods", lambda capture: [])
-        yield
+pytestmark = pytest.mark.usefixtures("no_turntable")
 
 
 def untextured_capture(T_cam_obj: SE3, half_height: float | None) -> Capture:

@@ -18,7 +18,7 @@ from tumble.maths.se3 import SE3, SO3
 from tumble.poses.sfm import circular_motion, stage
 from tumble.poses.sfm.observations import Inputs
 from tumble.poses.sfm.symmetry import texture_agreement
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.capture import Capture
 from tumble.scene.trajectory import Trajectory
 from tumble.synthetic import trajectories
 
@@ -39,17 +39,7 @@ def painted(frames: int, sense: int = 1, contrast: float = 0.12) -> tuple[Captur
     turns = SO3.exp((sense * 2 * math.pi / frames) * k[:, None] * z)
     T = SE3.from_rotation(upright @ turns, torch.tensor([0.0, 0.0, revolution.DISTANCE]).expand(frames, 3))
     waves = 10 * torch.randn(3, 12, generator=torch.Generator().manual_seed(1))
-    images, masks = [], []
-    for i in range(frames):
-        at, hit = revolution.intersect(T[i], revolution.CAMERA.pixel_centers())
-        normal = torch.nn.functional.normalize(T.rotation[i] @ (at / revolution.RADII.square()), dim=-1)
-        albedo = 0.5 + contrast * (at @ waves).sin().sum(-1)
-        grey = 255 * (albedo * (0.4 + 0.6 * (normal @ revolution.LIGHT).clamp_min(0))).clamp(0, 1) * hit
-        images.append(grey[..., None].expand(-1, -1, 3).to(torch.uint8))
-        masks.append(torch.where(hit, OBJECT, BACKGROUND).to(torch.uint8))
-    names = tuple(f"{i}.png" for i in range(frames))
-    capture = Capture(torch.stack(images), torch.stack(masks), revolution.CAMERA, names, "camera")
-    return capture, Trajectory(T, "camera")
+    return revolution.photographed(T, lambda x: 0.5 + contrast * (x @ waves).sin().sum(-1))
 
 
 def gathered(capture: Capture) -> Inputs:

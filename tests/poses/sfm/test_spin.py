@@ -1,6 +1,7 @@
 """Spin of a body of revolution with little texture: an ellipsoid whose every pixel is known in closed form."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -45,12 +46,17 @@ def film(painted: bool = True, frames: int = FRAMES) -> tuple[Capture, Trajector
     swing = torch.stack([1.5 + 0.4 * (6 * k).sin(), 0.2 * (4 * k).cos(), 0.5 * (5 * k).sin()], -1)
     about_z = torch.tensor([0.0, 0.0, 1.0]) * torch.deg2rad(8.0 * torch.arange(frames))[:, None]
     T = SE3.from_rotation(SO3.exp(swing) @ SO3.exp(about_z), torch.tensor([0.0, 0.0, DISTANCE]))
+    return photographed(T, albedo if painted else lambda x: torch.tensor(0.8))
+
+
+def photographed(T: SE3, albedo: Callable[[Tensor], Tensor]) -> tuple[Capture, Trajectory]:
+    """Noisy photographs of the shaded ellipsoid at these poses, with an albedo as a function of the surface point."""
     rng = torch.Generator().manual_seed(0)
-    images, masks = [], []
+    frames, images, masks = len(T.xyz), [], []
     for i in range(frames):
         x, hit = intersect(T[i], CAMERA.pixel_centers())
         normal = torch.nn.functional.normalize(T.rotation[i] @ (x / RADII.square()), dim=-1)
-        grey = (albedo(x) if painted else 0.8) * (0.5 + 0.5 * (normal @ LIGHT).clamp_min(0))
+        grey = albedo(x) * (0.5 + 0.5 * (normal @ LIGHT).clamp_min(0))
         grey = (255 * grey.clamp(0, 1) + torch.randn(grey.shape, generator=rng)).clamp(0, 255) * hit
         images.append(grey[..., None].expand(-1, -1, 3).to(torch.uint8))
         masks.append(torch.where(hit, OBJECT, BACKGROUND).to(torch.uint8))

@@ -1,7 +1,6 @@
 """Stage 1 by structure from motion, on a tumbling ellipsoid with noisy and partly wrong matches."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +14,12 @@ from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
 from tumble.maths import SO3
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import circular_motion, schedule, stage
+from tumble.poses.sfm import schedule, stage
 from tumble.poses.sfm.adjustment import deviation
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
 
+pytestmark = pytest.mark.usefixtures("no_turntable")
 QUICK = stage.Config(
     window_sizes=(6,),
     window_scales=(3.0, 1.0, 0.5),
@@ -30,14 +30,6 @@ QUICK = stage.Config(
     max_corrections=0,
     texture_rounds=1,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_turntable() -> Iterator[None]:
-    """No capture here is a turntable; that white frames look alike by chance would cost seconds."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(circular_motion, "periods", lambda capture: [])
-        yield
 
 
 def matches(scene: Tumble, wrong: float = 0.15) -> tuple[Match, ...]:

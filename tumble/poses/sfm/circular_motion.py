@@ -166,9 +166,9 @@ def _by_texture(problem: "_Problem", steps: list[float]) -> CircularMotion | Non
     motions = [problem.upright(math.radians(each), step) for each in elevations]
     found = [problem.agreement(x, POINTS) for x in motions]
     whole = _peak(elevations, [each.mean() for each in found])
-    places = [problem.along_axis(x, each.positions).argsort().argsort() for x, each in zip(motions, found, strict=True)]
+    ranks = [problem.along_axis(x, each.positions).argsort().argsort() for x, each in zip(motions, found, strict=True)]
     parts = [
-        _peak(elevations, [each.mean(at * PARTS // POINTS == k) for at, each in zip(places, found, strict=True)])
+        _peak(elevations, [each.mean(rank * PARTS // POINTS == k) for rank, each in zip(ranks, found, strict=True)])
         for k in range(PARTS)
     ]
     R, t = problem.poses(problem.upright(math.radians(whole), step))

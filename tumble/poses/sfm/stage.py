@@ -410,11 +410,8 @@ def _comparable_loss(cfg: Config, inputs: Inputs, state: State, poses: Poses, sc
 def _track_texture(inputs: Inputs, state: State) -> PhaseResult:
     """Locate points of the visual hull in all frames by their texture, in place of those located before."""
     frames = torch.nonzero(_posed(state))[:, 0]
-    capture, trajectory = (
-        inputs.capture.select(frames.tolist()),
-        in_unit_sphere(inputs, state.params.R, state.params.t).select(frames),
-    )
-    tracks = symmetry.texture_tracks(capture, trajectory, state.rng)
+    trajectory = in_unit_sphere(inputs, state.params.R, state.params.t).select(frames)
+    tracks = symmetry.texture_tracks(inputs.capture.select(frames.tolist()), trajectory, state.rng)
     tracks = replace(tracks, frame=frames[tracks.frame])
     state.memory |= {f"texture_{name}": x for name, x in vars(tracks).items()}
     return state.params, {"texture": float(tracks.n)}

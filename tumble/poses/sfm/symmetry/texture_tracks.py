@@ -79,7 +79,7 @@ def texture_tracks(capture: Capture, trajectory: Trajectory, rng: torch.Generato
     """
     try:
         surface, patches = _surface_patches(capture, trajectory, POINTS, rng)
-    except ValueError:
+    except ValueError:  # The poses contradict each other.
         return NO_TRACKS
     found = []
     for first in range(0, len(surface.positions), POINTS_AT_ONCE):
