@@ -16,13 +16,13 @@ RECIPE = recipes.replace(recipes.SMOKE, track=QUICK)
 
 @pytest.fixture(autouse=True)
 def short_clip(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unpack only the first 12 frames of the bundled clip."""
+    """Unpack only the first 12 frames and 2 evaluation views of the bundled clip."""
     unpack = demo.unpack
 
     def shortened(out: Path) -> Path:
         document = files.read_json(unpack(out) / "transforms.json")
-        train = [frame for frame in document["frames"] if frame["split"] == "train"]
-        document["frames"] = [frame for frame in document["frames"] if frame not in train[12:]]
+        train, views = ([frame for frame in document["frames"] if frame["split"] == x] for x in ("train", "eval"))
+        document["frames"] = train[:12] + views[:2]
         files.write_json(out / "transforms.json", document)
         return out
 

@@ -16,7 +16,7 @@ from tumble import recipes
 from tumble.datasets import folder
 from tumble.engine import loop
 from tumble.engine.loop import State
-from tumble.inverse_rendering import decompose, refine
+from tumble.inverse_rendering import decompose, refine, specular_fit
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.rendering.shading import Surface
 from tumble.scene.environment import Environment
@@ -113,22 +113,52 @@ def test_larger_images_have_more_pixels_in_a_step(part: float, factor: float) ->
     assert decompose.pixels_per_step(cfg, capture) == 100 * factor
 
 
-@pytest.mark.parametrize("exaggerated", [False, True])
-def test_an_exaggerated_contrast_of_the_first_albedo_is_halved(exaggerated: bool) -> None:
-    """The figure of `tests.learning` with its true shape, light and albedo, or twice the albedo's contrast."""
+def true_figure() -> decompose.Inputs:
+    """The figure of `tests.learning` with its true shape and albedo."""
     asset, capture = true_asset(2500), folder.load(CAPTURE)
     assert capture.trajectory is not None
-    true = asset.material.albedo.mean(1)
-    mean = true.log().mean(0).exp()
     light = SHLight.constant(0.4, asset.gamma)
-    refined = refine.Refined(asset.gaussians, asset.gamma, true, light, capture.trajectory)
+    true = asset.material.albedo.mean(1)
+    return decompose.Inputs(capture, refine.Refined(asset.gaussians, asset.gamma, true, light, capture.trajectory))
+
+
+@pytest.mark.parametrize(
+    ("glossy", "metal", "chosen"),
+    [(0.94, 0.92, "metal"), (0.94, 0.935, "matte"), (0.92, 0.925, "glossy"), (0.92, 0.91, "metal")],
+)
+def test_metal_must_explain_as_much_as_a_lobe_must_and_more_than_it_does(
+    glossy: float, metal: float, chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors of the trials relative to that without a lobe; of the last ones, with less contrast, all are worse."""
+
+    def tried(cfg: object, inputs: object, before: State, start: decompose.Params) -> tuple[State, float]:
+        kind = "matte" if start.log_specular_scale.max() == decompose.NO_LOBE else "glossy"
+        kind = kind if start.material.metal_logits is None else "metal"
+        first = kind not in kinds
+        kinds.append(kind)
+        return replace(before, params=start), {"glossy": glossy, "matte": 1.0, "metal": metal}[kind] if first else 2.0
+
+    kinds: list[str] = []
+    inputs = true_figure()
+    monkeypatch.setattr(decompose, "_trial", tried)
+    monkeypatch.setattr(specular_fit, "metal_regions", lambda fitted, means: torch.ones(len(means), dtype=torch.bool))
+    cfg = replace(recipes.DRAFT.decompose, sets=1, directions=32, pixels=64)
+    decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    assert kinds == ["glossy", "matte", "metal", chosen]
+
+
+@pytest.mark.parametrize("exaggerated", [False, True])
+def test_an_exaggerated_contrast_of_the_first_albedo_is_halved(exaggerated: bool) -> None:
+    """The first albedo is the true one, or has twice its contrast."""
+    inputs = true_figure()
+    true = inputs.refined.albedo
+    mean = true.log().mean(0).exp()
     cfg = replace(recipes.DRAFT.decompose, try_matte=False, steps=120, pixels=512, sets=2)
-    inputs = decompose.Inputs(capture, refined)
     state = decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
     albedo = (true.square() / mean if exaggerated else true).clamp(1e-3, 0.99)
     logits = (TEMPERATURE * torch.logit(albedo))[:, None].repeat(1, 4, 1)
     material = replace(state.params.material, albedo_logits=logits)
-    state.params = replace(state.params, material=material, environment=asset.environment)
+    state.params = replace(state.params, material=material, environment=true_asset(2500).environment)
     chosen = decompose.choose_start(cfg, inputs, state).params.material.albedo.mean(1).detach()
     contrast = [float(x.log().std(0).mean()) for x in (true, chosen)]
     assert contrast[1] == pytest.approx(contrast[0], rel=0.25)

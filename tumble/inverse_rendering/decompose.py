@@ -68,7 +68,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 23
+VERSION = 24
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -249,9 +249,10 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     the albedo, whichever explains the frames better by then.
 
     Albedos make up for a change of the lobe, so that neither is ahead, and both take the same steps with their own
-    light. A lobe that explains less than `MIN_EXPLAINED` of the error compensates for errors of light and shape. One
-    that is brighter than that of a dielectric and than in stage 2 would compensate for them, too. So does the albedo of
-    stage 2 where an object has little texture: its contrast is halved for as long as that explains the frames better.
+    light. A lobe, also that of metal, which explains less than `MIN_EXPLAINED` of the error compensates for errors of
+    light and shape. One that is brighter than that of a dielectric and than in stage 2 would compensate for them, too.
+    So does the albedo of stage 2 where an object has little texture: its contrast is halved for as long as that
+    explains the frames better.
     """
     params = state.params
     before = params.log_specular_scale.detach().exp()
@@ -261,15 +262,15 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     glossy = with_lobe(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
     matte = with_lobe(params, before * fitted.albedo_per_scale, NO_LOBE)
     (best, error), (without, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
-    start = glossy
-    if error >= (1 - MIN_EXPLAINED) * error_without:
+    start, limit = glossy, min(error, (1 - MIN_EXPLAINED) * error_without)
+    if error > limit:
         best, error, start = without, error_without, matte
     if cfg.rates.metalness:
         regions = specular_fit.metal_regions(fitted, params.gaussians.means)
         if float(regions[samples.gaussian].float().mean()) > MIN_METAL:
             metal = with_metal(glossy, regions)
             metallic, error_of_metal = _trial(cfg, inputs, state, metal)
-            if error_of_metal < error:
+            if error_of_metal < limit:
                 best, error, start = metallic, error_of_metal, metal
     for _ in range(MAX_HALVINGS):
         start = with_half_the_contrast(start)
