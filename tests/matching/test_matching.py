@@ -8,13 +8,14 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 from tumble import matching
 from tumble.io import weights, write_tensors
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin, plugin_names
-from tumble.matching import _aliked, _gmflow, _lightglue, _window, match_pairs, xfeat
+from tumble.matching import _aliked, _gmflow, _lightglue, _window, aliked, match_pairs, xfeat
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.scene.match import Match, View
 
@@ -319,6 +320,25 @@ def test_a_deformable_convolution_moves_each_tap_independently() -> None:
     # Row 3 - 1 + 2 = 4, column 4 + 1 - 1.5 = 3.5; without offsets row 1, column 6 for pixel (2, 5).
     assert float(out[0, 0, 3, 4]) == pytest.approx(4 * 9 + 3.5, abs=1e-4)
     assert float(out[0, 0, 2, 5]) == pytest.approx(1 * 9 + 6, abs=1e-4)
+
+
+def test_pixel_features_and_scores_are_those_of_enlarged_features() -> None:
+    """As published: features of all resolutions are enlarged and joined, and the score is computed from them."""
+    tensors = safetensors.torch.load_file(aliked.WEIGHTS)
+    p = {name.removeprefix("aliked."): x.float() for name, x in tensors.items() if name.startswith("aliked.")}
+    levels, score = _aliked.dense(torch.rand(1, 3, 32, 64, generator=torch.Generator().manual_seed(0)), p)
+    large = [torch.nn.functional.interpolate(x, (32, 64), mode="bilinear", align_corners=True) for x in levels]
+    joined = torch.cat(large, 1)
+    y = torch.nn.functional.conv2d(joined, p["score_head.0.weight"])
+    for k in (2, 4, 6):
+        y = torch.nn.functional.conv2d(torch.nn.functional.selu(y), p[f"score_head.{k}.weight"], padding=1)
+    torch.testing.assert_close(score, y.sigmoid(), atol=1e-5, rtol=1e-4)
+    pixel = torch.tensor([[[0, 0], [63, 31], [17, 5]], [[-1, 3], [64, 3], [3, 32]]])
+    found = _aliked.pixel_features(levels, pixel)
+    column, row = pixel[0].T
+    unit = torch.nn.functional.normalize(joined, dim=1)
+    torch.testing.assert_close(found[0], unit[0, :, row, column].T, atol=1e-5, rtol=1e-4)
+    assert (found[1] == 0).all()
 
 
 def test_keypoints_have_sub_pixel_positions() -> None:

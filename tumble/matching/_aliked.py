@@ -4,8 +4,10 @@ Implemented from the paper. The deformable convolution consists of bilinear look
 torchvision.
 """
 
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,21 +22,40 @@ Parameters = dict[str, Tensor]
 """Published weights by name."""
 
 
-def dense(image: Float[Tensor, "1 3 h w"], p: Parameters) -> tuple[Float[Tensor, "1 c h w"], Float[Tensor, "1 1 h w"]]:
-    """Unit features and keypoint scores of every pixel, from sRGB values in [0, 1]."""
+def dense(image: Float[Tensor, "1 3 h w"], p: Parameters) -> tuple[list[Tensor], Float[Tensor, "1 1 h w"]]:
+    """Features at four resolutions, of which those of a pixel are made (`pixel_features`), and every pixel's score.
+
+    The published network enlarges the features before it computes scores. A convolution of one pixel may come first,
+    since both are linear: the enlarged features of all pixels, 128 MiB, take longer than the network itself.
+
+    Args:
+        image: sRGB values in [0, 1].
+        p: Published weights.
+    """
     x1 = _block(image, p, "block1")
     x2 = _block(functional.avg_pool2d(x1, 2), p, "block2")
     x3 = _block(functional.avg_pool2d(x2, 4), p, "block3")
     x4 = _block(functional.avg_pool2d(x3, 4), p, "block4")
-    levels = []
-    for k, x in enumerate((x1, x2, x3, x4), start=1):
-        x = functional.selu(functional.conv2d(x, p[f"conv{k}.weight"]))
-        levels.append(functional.interpolate(x, image.shape[-2:], mode="bilinear", align_corners=True))
-    joined = torch.cat(levels, 1)
-    score = functional.conv2d(joined, p["score_head.0.weight"])
+    levels = [functional.selu(functional.conv2d(x, p[f"conv{k}.weight"])) for k, x in enumerate((x1, x2, x3, x4), 1)]
+    parts = p["score_head.0.weight"].split([x.shape[1] for x in levels], 1)
+    score = torch.stack(
+        [
+            functional.interpolate(functional.conv2d(x, part), image.shape[-2:], mode="bilinear", align_corners=True)
+            for x, part in zip(levels, parts, strict=True)
+        ]
+    ).sum(0)
     for k in (2, 4, 6):
         score = functional.conv2d(functional.selu(score), p[f"score_head.{k}.weight"], padding=1)
-    return functional.normalize(joined, dim=1), score.sigmoid()
+    return levels, score.sigmoid()
+
+
+def pixel_features(levels: Sequence[Tensor], pixel: Int64[Tensor, "n m 2"]) -> Float[Tensor, "n m c"]:
+    """Unit features of pixels (column, row); 0 outside the image, whose size is that of the first level."""
+    size = pixel.new_tensor([levels[0].shape[-1], levels[0].shape[-2]])
+    at = (2 * pixel / (size - 1) - 1)[None].to(levels[0])
+    parts = [functional.grid_sample(x, at, align_corners=True)[0] for x in levels]
+    inside = ((pixel >= 0) & (pixel < size)).all(-1)
+    return functional.normalize(torch.cat(parts).movedim(0, -1), dim=-1) * inside[..., None]
 
 
 def keypoints(
@@ -58,21 +79,29 @@ def keypoints(
     return torch.stack([best % width, best // width], -1) + refinement
 
 
-def descriptors(features: Float[Tensor, "1 c h w"], at: Float[Tensor, "n 2"], p: Parameters) -> Float[Tensor, "n c"]:
-    """Unit descriptors from features at learned positions around every keypoint (SDDH, section III-D)."""
-    height, width = features.shape[-2:]
-    column, row = at.long().unbind(-1)
-    taps = torch.arange(3, device=at.device)
-    padded = functional.pad(features[0], (1, 1, 1, 1))
-    patches = padded[:, (row[:, None] + taps)[:, :, None], (column[:, None] + taps)[:, None, :]].transpose(0, 1)
+def descriptors(levels: Sequence[Tensor], at: Float[Tensor, "n 2"], p: Parameters) -> Float[Tensor, "n c"]:
+    """Unit descriptors from features at learned positions around every keypoint (SDDH, section III-D).
+
+    Args:
+        levels: From `dense`.
+        at: Positions (x, y) of the keypoints [pixels, first centre at 0].
+        p: Published weights.
+    """
+    taps = torch.arange(-1, 2, device=at.device)
+    around = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).flatten(0, 1)
+    patches = pixel_features(levels, at.long()[:, None] + around).transpose(1, 2).unflatten(-1, (3, 3))
     hidden = functional.conv2d(patches, p["desc_head.offset_conv.0.weight"], p["desc_head.offset_conv.0.bias"])
     last = functional.conv2d(
         functional.selu(hidden), p["desc_head.offset_conv.2.weight"], p["desc_head.offset_conv.2.bias"]
     )
-    farthest = max(height, width) / 4
+    farthest = max(levels[0].shape[-2:]) / 4
     offsets = last[:, :, 0, 0].clamp(-farthest, farthest).unflatten(1, (2, -1)).transpose(1, 2)
-    sampled = _sample(features, (at[:, None] + offsets)[None])
-    mixed = functional.selu(functional.conv2d(sampled, p["desc_head.sf_conv.weight"]))[0]
+    position = at[:, None] + offsets
+    corners = torch.stack(torch.meshgrid(taps[1:], taps[1:], indexing="xy"), -1).flatten(0, 1)
+    pixel = position.floor().long()[:, :, None] + corners
+    weight = (1 - (position[:, :, None] - pixel).abs()).prod(-1)
+    sampled = (pixel_features(levels, pixel.flatten(1, 2)).unflatten(1, pixel.shape[1:3]) * weight[..., None]).sum(2)
+    mixed = functional.selu(functional.conv2d(sampled.movedim(-1, 0)[None], p["desc_head.sf_conv.weight"]))[0]
     return functional.normalize(torch.einsum("cnp,pcd->nd", mixed, p["desc_head.agg_weights"]), dim=-1)
 
 
@@ -127,7 +156,8 @@ def _local_maxima(score: Tensor) -> Tensor:
     """Local maxima, and twice the local maxima of what remains without the neighbourhoods of earlier ones."""
 
     def maximum(x: Tensor) -> Tensor:
-        return functional.max_pool2d(x, 2 * RADIUS + 1, 1, RADIUS)
+        across = functional.max_pool2d(x, (1, 2 * RADIUS + 1), 1, (0, RADIUS))
+        return functional.max_pool2d(across, (2 * RADIUS + 1, 1), 1, (RADIUS, 0))
 
     maxima = score == maximum(score)
     for _ in range(2):

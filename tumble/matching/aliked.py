@@ -14,7 +14,7 @@ from tumble.matching import _aliked, _lightglue
 from tumble.matching._window import MARGIN, crop_window, digest, extent
 from tumble.scene import Match, View, empty_match
 
-VERSION = 3
+VERSION = 4
 WEIGHTS = Path(__file__).with_suffix(".safetensors")
 SIZE = 512
 """Height and width of the window around the object that is matched [pixels]."""
@@ -67,10 +67,10 @@ def _extract(view: View, parameters: dict[str, Tensor]) -> Features:
         return torch.zeros(0, 2), torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device)
     window = crop_window(view, width, SIZE)
     image = torch.from_numpy(window.rgb).to(device).permute(2, 0, 1)[None] / 255
-    features, score = _aliked.dense(image, parameters)
+    levels, score = _aliked.dense(image, parameters)
     usable = torch.from_numpy(window.usable).to(device)
     at = _aliked.keypoints(score, usable, max_count=MAX_KEYPOINTS, min_score=MIN_SCORE)
     # Sub-pixel refinement may move a keypoint off the usable pixels.
     at = at[torch.from_numpy(window.contains(at.cpu().numpy() + 0.5)).to(device)]
-    unit = _aliked.descriptors(features, at, parameters)
+    unit = _aliked.descriptors(levels, at, parameters)
     return window.in_frame(at.cpu().numpy().astype(np.float64) + 0.5), 2 * at / SIZE - 1, unit
