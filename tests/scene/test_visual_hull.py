@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from torch.nn.functional import max_pool2d
 
 from tumble.maths.se3 import SE3
 from tumble.scene import visual_hull
@@ -72,6 +73,19 @@ def test_unknown_pixels_carve_nothing() -> None:
     ticks = (torch.arange(8) + 0.5) / 8 * 2 - 1
     sphere = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).norm(dim=-1) <= 1
     torch.testing.assert_close(carved, sphere.float())
+
+
+@pytest.mark.parametrize("half", [1, 2])
+def test_a_band_of_unknown_pixels_along_the_silhouette_does_not_enlarge_the_hull(
+    half: int, carved: torch.Tensor
+) -> None:
+    """Half of the band lies inside, half outside of the true silhouettes."""
+    capture, trajectory = silhouettes()
+    background, inside = ((capture.masks == label).float()[:, None] for label in (BACKGROUND, OBJECT))
+    near = [max_pool2d(x, 2 * half + 1, 1, half)[:, 0] > 0 for x in (background, inside)]
+    masks = torch.where(near[0] & near[1], UNKNOWN, capture.masks).to(torch.uint8)
+    found = visual_hull.carve(dataclasses.replace(capture, masks=masks), trajectory, resolution=64)
+    assert int((found > 0.5).sum()) == pytest.approx(int((carved > 0.5).sum()), rel=0.03)
 
 
 def test_a_hand_that_never_lets_go_is_left_out_but_not_what_it_hides() -> None:

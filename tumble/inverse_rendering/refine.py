@@ -36,7 +36,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 15
+VERSION = 16
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3

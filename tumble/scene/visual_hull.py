@@ -7,7 +7,7 @@ unknown, such as a hand that never lets go, is left out where it protrudes from 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import conv3d, grid_sample, max_pool2d, normalize, pad
 
@@ -52,10 +52,11 @@ def carve(
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
     smallest = (x_obj.norm(dim=-1) <= 1).to(**like).repeat(1 + int(tolerance * len(trajectory)), 1)
-    left = torch.where(smallest[-1] > 0)[0]
+    left, hidden = torch.where(smallest[-1] > 0)[0], _wide_unknown(capture)
+    foreground = _foreground(capture.masks, hidden)
     for frame in range(len(trajectory)):
         uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj.index_select(0, left))
-        mask = (capture.masks[frame] != BACKGROUND).to(**like)
+        mask = foreground[frame].to(**like)
         at = (uv / size * 2 - 1)[None, None]
         sampled = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         in_image = ((uv > 0) & (uv < size)).all(-1)
@@ -64,11 +65,29 @@ def carve(
             old = smallest[k].index_select(0, left)
             smallest[k, left], value = torch.minimum(old, value), torch.maximum(old, value)
         left = left[smallest[-1].index_select(0, left) > 0]
-    hidden = _wide_unknown(capture)
     if bool(hidden.any()):
         protrudes = _protruding(x_obj[left], _sure_fraction(capture, trajectory, x_obj[left], hidden), 2 / resolution)
         smallest[-1, left[protrudes]] = 0
     return smallest[-1].reshape(resolution, resolution, resolution)
+
+
+def _foreground(masks: UInt8[Tensor, "t h w"], hidden: Bool[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
+    """Masks in which narrow bands of unknown pixels rise evenly from 0 at the background to 1 at the object.
+
+    The silhouette lies in the middle of such a band. If it carved nothing, the hull would be too large all around.
+    """
+    out, inward = (_distance(masks == label) for label in (BACKGROUND, OBJECT))
+    band = (masks == UNKNOWN) & ~hidden & (out < WIDE) & (inward < WIDE)
+    return torch.where(band, out / (out + inward).clamp_min(1), (masks != BACKGROUND).float())
+
+
+def _distance(region: Bool[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
+    """Distance of every pixel from a region, the larger of columns and rows, up to `WIDE` [pixels]."""
+    reached, distance = region.float()[:, None], torch.zeros(region.shape, device=region.device)
+    for _ in range(WIDE):
+        distance += reached[:, 0] == 0
+        reached = max_pool2d(reached, 3, 1, 1)
+    return distance
 
 
 def padded(capture: Capture) -> Capture:
