@@ -77,7 +77,7 @@ def _foreground(masks: UInt8[Tensor, "t h w"], hidden: Bool[Tensor, "t h w"]) ->
     The silhouette lies in the middle of such a band. If it carved nothing, the hull would be too large all around.
     """
     out, inward = (_distance(masks == label) for label in (BACKGROUND, OBJECT))
-    band = (masks == UNKNOWN) & ~hidden & (out < WIDE) & (inward < WIDE)
+    band = (masks == UNKNOWN) & ~hidden & (out + inward <= WIDE)
     return torch.where(band, out / (out + inward).clamp_min(1), (masks != BACKGROUND).float())
 
 
