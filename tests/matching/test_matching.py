@@ -339,6 +339,9 @@ def test_pixel_features_and_scores_are_those_of_enlarged_features() -> None:
     unit = torch.nn.functional.normalize(joined, dim=1)
     torch.testing.assert_close(found[0], unit[0, :, row, column].T, atol=1e-5, rtol=1e-4)
     assert (found[1] == 0).all()
+    at = torch.tensor([[[17.25, 5.5], [62.9, 30.1], [-0.4, 12.0]]])
+    between = _aliked._sample(unit, at[None])[0, :, 0].T
+    torch.testing.assert_close(_aliked.features_at(levels, at)[0], between, atol=1e-5, rtol=1e-4)
 
 
 def test_keypoints_have_sub_pixel_positions() -> None:

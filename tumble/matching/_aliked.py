@@ -58,6 +58,14 @@ def pixel_features(levels: Sequence[Tensor], pixel: Int64[Tensor, "n m 2"]) -> F
     return functional.normalize(torch.cat(parts).movedim(0, -1), dim=-1) * inside[..., None]
 
 
+def features_at(levels: Sequence[Tensor], at: Float[Tensor, "n m 2"]) -> Float[Tensor, "n m c"]:
+    """Bilinear interpolation of the unit features of pixels at positions (x, y) [pixels, first centre at 0]."""
+    pixel = at.floor().long()[:, :, None] + _square(0, 1, at.device)
+    weight = (1 - (at[:, :, None] - pixel).abs()).prod(-1)
+    corners = pixel_features(levels, pixel.flatten(1, 2)).unflatten(1, pixel.shape[1:3])
+    return (corners * weight[..., None]).sum(2)
+
+
 def keypoints(
     score: Float[Tensor, "1 1 h w"], usable: Tensor, *, max_count: int, min_score: float
 ) -> Float[Tensor, "n 2"]:
@@ -72,8 +80,7 @@ def keypoints(
     width = score.shape[-1]
     peaks = score[0, 0] * (_local_maxima(score)[0, 0] & usable)
     best = peaks.flatten().topk(min(max_count, int((peaks > min_score).sum()))).indices
-    taps = torch.arange(-RADIUS, RADIUS + 1, device=score.device)
-    offsets = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).reshape(-1, 2).to(score)
+    offsets = _square(-RADIUS, RADIUS, score.device).to(score)
     patches = functional.unfold(score, 2 * RADIUS + 1, padding=RADIUS)[0].T[best]
     refinement = (patches / TEMPERATURE).softmax(-1) @ offsets
     return torch.stack([best % width, best // width], -1) + refinement
@@ -87,21 +94,16 @@ def descriptors(levels: Sequence[Tensor], at: Float[Tensor, "n 2"], p: Parameter
         at: Positions (x, y) of the keypoints [pixels, first centre at 0].
         p: Published weights.
     """
-    taps = torch.arange(-1, 2, device=at.device)
-    around = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).flatten(0, 1)
-    patches = pixel_features(levels, at.long()[:, None] + around).transpose(1, 2).unflatten(-1, (3, 3))
+    patches = pixel_features(levels, at.long()[:, None] + _square(-1, 1, at.device))
+    patches = patches.transpose(1, 2).unflatten(-1, (3, 3))
     hidden = functional.conv2d(patches, p["desc_head.offset_conv.0.weight"], p["desc_head.offset_conv.0.bias"])
     last = functional.conv2d(
         functional.selu(hidden), p["desc_head.offset_conv.2.weight"], p["desc_head.offset_conv.2.bias"]
     )
     farthest = max(levels[0].shape[-2:]) / 4
     offsets = last[:, :, 0, 0].clamp(-farthest, farthest).unflatten(1, (2, -1)).transpose(1, 2)
-    position = at[:, None] + offsets
-    corners = torch.stack(torch.meshgrid(taps[1:], taps[1:], indexing="xy"), -1).flatten(0, 1)
-    pixel = position.floor().long()[:, :, None] + corners
-    weight = (1 - (position[:, :, None] - pixel).abs()).prod(-1)
-    sampled = (pixel_features(levels, pixel.flatten(1, 2)).unflatten(1, pixel.shape[1:3]) * weight[..., None]).sum(2)
-    mixed = functional.selu(functional.conv2d(sampled.movedim(-1, 0)[None], p["desc_head.sf_conv.weight"]))[0]
+    sampled = features_at(levels, at[:, None] + offsets).movedim(-1, 0)[None]
+    mixed = functional.selu(functional.conv2d(sampled, p["desc_head.sf_conv.weight"]))[0]
     return functional.normalize(torch.einsum("cnp,pcd->nd", mixed, p["desc_head.agg_weights"]), dim=-1)
 
 
@@ -117,13 +119,18 @@ def deformable(
     """
     height, width = x.shape[-2:]
     half = kernel.shape[-1] // 2
-    taps = torch.arange(-half, half + 1, device=x.device)
     rows, columns = torch.arange(height, device=x.device), torch.arange(width, device=x.device)
     pixel = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
-    tap = torch.stack(torch.meshgrid(taps, taps, indexing="xy"), -1).reshape(-1, 1, 1, 2)
+    tap = _square(-half, half, x.device)[:, None, None]
     shift = offsets[0].unflatten(0, (-1, 2)).permute(0, 2, 3, 1).flip(-1)
     sampled = _sample(x, (pixel + tap + shift).flatten(1, 2)[None])
     return torch.einsum("bcks,dck->bds", sampled, kernel.flatten(2)).unflatten(-1, (height, width))
+
+
+def _square(first: int, last: int, device: torch.device) -> Int64[Tensor, "k 2"]:
+    """Offsets (x, y) of the pixels of a square, row by row."""
+    along = torch.arange(first, last + 1, device=device)
+    return torch.stack(torch.meshgrid(along, along, indexing="xy"), -1).flatten(0, 1)
 
 
 def _sample(x: Float[Tensor, "1 c h w"], at: Float[Tensor, "1 n m 2"]) -> Float[Tensor, "1 c n m"]:

@@ -1,7 +1,8 @@
 """The visual hull on a voxel grid, and oriented points on its surface from which the Gaussians are initialised.
 
-Object frame, object radius 1. UNKNOWN pixels count as foreground, so that they carve nothing. What most frames show as
-unknown, such as a hand that never lets go, is left out where it protrudes from the rest.
+Object frame, object radius 1. UNKNOWN pixels count as foreground, so that they carve nothing, but for narrow bands
+along silhouettes, which carve from their middle. What most frames show as unknown, such as a hand that never lets go,
+is left out where it protrudes from the rest.
 """
 
 from dataclasses import dataclass
@@ -53,10 +54,9 @@ def carve(
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
     smallest = (x_obj.norm(dim=-1) <= 1).to(**like).repeat(1 + int(tolerance * len(trajectory)), 1)
     left, hidden = torch.where(smallest[-1] > 0)[0], _wide_unknown(capture)
-    foreground = _foreground(capture.masks, hidden)
     for frame in range(len(trajectory)):
         uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj.index_select(0, left))
-        mask = foreground[frame].to(**like)
+        mask = _foreground(capture.masks[frame], hidden[frame]).to(**like)
         at = (uv / size * 2 - 1)[None, None]
         sampled = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         in_image = ((uv > 0) & (uv < size)).all(-1)
@@ -71,23 +71,25 @@ def carve(
     return smallest[-1].reshape(resolution, resolution, resolution)
 
 
-def _foreground(masks: UInt8[Tensor, "t h w"], hidden: Bool[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
-    """Masks in which narrow bands of unknown pixels rise evenly from 0 at the background to 1 at the object.
+def _foreground(mask: UInt8[Tensor, "h w"], hidden: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """A mask in which narrow bands of unknown pixels rise evenly from 0 at the background to 1 at the object.
 
     The silhouette lies in the middle of such a band. If it carved nothing, the hull would be too large all around.
+
+    Args:
+        hidden: Pixels of wide unknown regions.
     """
-    out, inward = (_distance(masks == label) for label in (BACKGROUND, OBJECT))
-    band = (masks == UNKNOWN) & ~hidden & (out + inward <= WIDE)
-    return torch.where(band, out / (out + inward).clamp_min(1), (masks != BACKGROUND).float())
+    import cv2
 
-
-def _distance(region: Bool[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
-    """Distance of every pixel from a region, the larger of columns and rows, up to `WIDE` [pixels]."""
-    reached, distance = region.float()[:, None], torch.zeros(region.shape, device=region.device)
-    for _ in range(WIDE):
-        distance += reached[:, 0] == 0
-        reached = max_pool2d(reached, 3, 1, 1)
-    return distance
+    foreground, narrow = (mask != BACKGROUND).float(), (mask == UNKNOWN) & ~hidden
+    if not bool(narrow.any()):
+        return foreground
+    out, inward = (
+        torch.from_numpy(cv2.distanceTransform((mask != label).byte().cpu().numpy(), cv2.DIST_C, 3)).to(foreground)
+        for label in (BACKGROUND, OBJECT)
+    )
+    band = narrow & (out + inward <= WIDE)
+    return torch.where(band, out / (out + inward).clamp_min(1), foreground)
 
 
 def padded(capture: Capture) -> Capture:
@@ -107,7 +109,10 @@ def view_cosine(
 
 def _wide_unknown(capture: Capture) -> Bool[Tensor, "t h w"]:
     """Unknown pixels except those of narrow bands (morphological opening)."""
-    known = (capture.masks != UNKNOWN).float()[:, None]
+    unknown = capture.masks == UNKNOWN
+    if not bool(unknown.any()):
+        return unknown
+    known = (~unknown).float()[:, None]
     eroded = max_pool2d(known, WIDE, 1, WIDE // 2) == 0
     return max_pool2d(eroded.float(), WIDE, 1, WIDE // 2)[:, 0] > 0
 
