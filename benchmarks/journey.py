@@ -1,10 +1,10 @@
 """End-to-end benchmark: a video and a box as input, the asset as output, scored against the ground truth of the video.
 
-`python -m benchmarks.journey FOLDER` renders captures without poses of three objects, 120 frames of 256 x 256 (kept in
-FOLDER), runs `tumble check` and `tumble run` on each `clip.mp4` with a box around the object in its first frame,
-exports a GLB, scores both with `tumble evaluate`, and writes `benchmarks/journey.json` and the table
-`benchmarks/journey.md`. Existing rows are kept. Time and memory are those of the processes. `--smoke` uses tiny
-captures, to test this program.
+`python -m benchmarks.journey FOLDER` renders captures without poses, 120 frames of 256 x 256 (kept in FOLDER), of three
+objects on which constants were chosen, or, with `--only`, of those of the suite paper-table1. It runs `tumble check`
+and `tumble run` on each `clip.mp4` with a box around the object in its first frame, exports a GLB, scores both with
+`tumble evaluate`, and writes `benchmarks/journey.json` and the table `benchmarks/journey.md`. Existing rows are kept.
+Time and memory are those of the processes. `--smoke` uses tiny captures, to test this program.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from benchmarks.kernels import machine
 from benchmarks.pose_captures import DATA
+from tumble import bench
 from tumble.actions import GLB_SCORES
 from tumble.datasets import folder
 from tumble.engine import run as runs
@@ -31,10 +33,15 @@ from tumble.preprocess import FootageOptions
 from tumble.scene import OBJECT
 from tumble.synthetic import SynthOptions, render_capture
 
-OBJECTS = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "chess_Knight")
-LIGHT = "immenstadter_horn"
-"""Light map of the videos."""
-RELIGHT = ("forest_slope", "studio_small_03")
+TUNE = dict.fromkeys(("ycb_006_mustard_bottle", "ycb_003_cracker_box", "chess_Knight"), "immenstadter_horn_1k.hdr")
+"""Objects on which constants of the method were chosen, with the light map of their videos."""
+SUITE = bench.read_suite("paper-table1")
+REPORT = {Path(entry["model"]).stem: str(entry["env"]) for entry in SUITE.object}
+"""Objects on which none was chosen, with light maps that were not used for choices either."""
+OBJECTS = TUNE | REPORT
+RELIGHT = dict.fromkeys(TUNE, ("forest_slope_1k.hdr", "studio_small_03_1k.hdr")) | dict.fromkeys(
+    REPORT, tuple(SUITE.capture["relight"])
+)
 """Light maps of the relit ground truth."""
 FOV = 30.0
 """Field of view of the videos, given to `tumble run` [degrees]."""
@@ -48,6 +55,7 @@ COLUMNS = {
     "relit.psnr_fg_srgb": "relit fg [dB]",
     "relit.psnr_full_srgb": "relit full [dB]",
     "normal.mean_fg_degrees": "normal [deg]",
+    "roughness.mae_fg": "roughness MAE",
     "silhouette.iou": "IoU",
 }
 """Titles of the score columns, by the score."""
@@ -63,7 +71,7 @@ Row = dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of captures and runs")
-    parser.add_argument("--only", nargs="+", default=OBJECTS, choices=OBJECTS)
+    parser.add_argument("--only", nargs="+", default=list(TUNE), choices=list(OBJECTS), metavar="OBJECT")
     parser.add_argument("--quality", default="draft")
     parser.add_argument("--smoke", action="store_true")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
@@ -82,8 +90,8 @@ def main() -> None:
 def rendered(model: str, root: Path, smoke: bool) -> Path:
     """A capture without poses and its video, rendered if it does not exist."""
     options = SynthOptions(
-        env=hdri(LIGHT),
-        relight=tuple(map(hdri, RELIGHT)),
+        env=hdri(OBJECTS[model]),
+        relight=tuple(map(hdri, RELIGHT[model])),
         views=48 if smoke else 120,
         resolution=128 if smoke else 256,
         samples=16 if smoke else 256,
@@ -98,8 +106,8 @@ def rendered(model: str, root: Path, smoke: bool) -> Path:
 
 
 def hdri(name: str) -> str:
-    """Path of a light map."""
-    return str(DATA / "hdri" / f"{name}_1k.hdr")
+    """Path of the file of a light map."""
+    return str(DATA / "hdri" / name)
 
 
 def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
@@ -107,7 +115,15 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
     shutil.rmtree(run, ignore_errors=True)
     clip = [str(capture / "clip.mp4"), "--fov", f"{FOV:g}", "--box", *map(str, box(capture))]
     size = folder.load(capture).images.shape
-    row: Row = {"object": model, "light": LIGHT, "frames": size[0], "side": size[1], "quality": quality}
+    code = bench.current_code()["commit"]
+    row: Row = {
+        "object": model,
+        "code": code,
+        "light": OBJECTS[model].removesuffix("_1k.hdr"),
+        "frames": size[0],
+        "side": size[1],
+        "quality": quality,
+    }
     check = tumble("check", *clip, "-o", str(run) + "-check")
     row |= {"check": "GO" if check["exit"] == 0 else "NO-GO", "check_seconds": check["seconds"]}
     reconstruction = tumble("run", *clip, "-o", str(run), "--quality", quality)
@@ -165,6 +181,7 @@ def report(rows: list[Row]) -> str:
     """The rows as a table in Markdown: scores of the shared views, and of the poses of all frames."""
     titles = [
         "object",
+        "light",
         "check",
         *COLUMNS.values(),
         *GLB_COLUMNS.values(),
@@ -173,7 +190,7 @@ def report(rows: list[Row]) -> str:
         "frames",
         "pose rating",
     ]
-    titles += ["run [min]", "score [min]", "memory [GiB]"]
+    titles += ["run [min]", "score [min]", "memory [GiB]", "code"]
     first = rows[0]
     lines = [
         f"# From a video to an asset: {first['frames']} frames of {first['side']} x {first['side']} pixels",
@@ -185,19 +202,30 @@ def report(rows: list[Row]) -> str:
         "divided by the mean camera distance. Frames: number of frames with a pose. Unscaled: without the factor per "
         "channel between albedo and truth. GLB: the file of `tumble export --preset web`, path traced by Mitsuba; its "
         "normals are those of the mesh.",
-        "",
-        f"| {' | '.join(titles)} |",
-        "|" + "---|" * len(titles),
     ]
+    for title, objects in (("Objects on which constants were chosen", TUNE), ("Other objects", REPORT)):
+        if of_these := [row for row in rows if row["object"] in objects]:
+            lines += ["", f"## {title}", "", *table(titles, of_these)]
+    errors = [f"- {row['object']}: {row['said']}" for row in rows if "said" in row]
+    return "\n".join([*lines, *([""] if errors else []), *errors, ""])
+
+
+def table(titles: list[str], rows: list[Row]) -> list[str]:
+    """Lines of a table, and a last one with the means of the scores."""
+    lines = [f"| {' | '.join(titles)} |", "|" + "---|" * len(titles)]
     lines += [f"| {' | '.join(cells(row))} |" for row in rows]
     complete = [row for row in rows if "shared" in row]
     if complete:
-        means = [f"{statistics.fmean(row['shared'][key] for row in complete):.3g}" for key in COLUMNS]
-        exported = [row["glb"] for row in complete if "glb" in row]
-        means += [f"{statistics.fmean(glb[key] for glb in exported):.3g}" if exported else "-" for key in GLB_COLUMNS]
-        lines.append(f"| mean of {len(complete)} | | {' | '.join(means)} |" + " |" * (len(titles) - 2 - len(means)))
-    errors = [f"- {row['object']}: {row['said']}" for row in rows if "said" in row]
-    return "\n".join([*lines, *([""] if errors else []), *errors, ""])
+        means = [mean(row["shared"].get(key) for row in complete) for key in COLUMNS]
+        means += [mean(row.get("glb", {}).get(key) for row in complete) for key in GLB_COLUMNS]
+        lines.append(f"| mean of {len(complete)} | | | {' | '.join(means)} |" + " |" * (len(titles) - 3 - len(means)))
+    return lines
+
+
+def mean(values: Iterable[float | None]) -> str:
+    """The mean of the values that are known, as text."""
+    known = [value for value in values if value is not None]
+    return f"{statistics.fmean(known):.3g}" if known else "-"
 
 
 def cells(row: Row) -> list[str]:
@@ -207,7 +235,7 @@ def cells(row: Row) -> list[str]:
         return "-" if value is None else f"{factor * value:{digits}}"
 
     shared, poses = row.get("shared", {}), row.get("poses", {})
-    digits = {"silhouette.iou": ".3f"}
+    digits = {"silhouette.iou": ".3f", "roughness.mae_fg": ".3f"}
     scores = [text(shared.get(key), digits.get(key, ".1f")) for key in COLUMNS]
     scores += [text(row.get("glb", {}).get(key)) for key in GLB_COLUMNS]
     # The tolerance of the AUC is a tenth of the camera's distance.
@@ -217,12 +245,14 @@ def cells(row: Row) -> list[str]:
     result = [str(row.get("kept", "-")), row.get("verdict", f"exit {row['run_exit']}")]
     return [
         row["object"],
+        row["light"],
         row["check"],
         *scores,
         *pose_errors,
         *result,
         *minutes,
         text(row["run_memory_MiB"], ".1f", 1 / 1024),
+        row.get("code", "-"),
     ]
 
 
