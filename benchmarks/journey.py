@@ -166,11 +166,11 @@ def box(capture: Path) -> list[int]:
 
 
 def tumble(*words: str) -> dict[str, Any]:
-    """Run a command in a process of its own; exit code, seconds, peak memory, and its last message on stderr."""
+    """Run a command in a process of its own; exit code, seconds, peak memory, and its last line on stderr."""
     started = time.perf_counter()
     process = subprocess.Popen([sys.executable, "-m", "tumble", *words], stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None, "stderr is a pipe"
-    lines = [line.strip() for line in process.stderr if line.startswith("tumble: ")]
+    lines = [line.strip() for line in process.stderr if line.strip()]
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     seconds, memory = round(time.perf_counter() - started, 1), usage.ru_maxrss // 1024

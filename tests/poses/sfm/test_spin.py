@@ -160,3 +160,22 @@ def test_the_stage_corrects_the_spin_and_drops_the_observations_that_slipped(
     stage.step(cfg, inputs, state)
     assert error(SE3.from_rotation_matrix(state.params.R.float()), truth) < 2
     assert not bool(state.memory["steady"].all())
+
+
+def test_nothing_contradicts_the_observations_of_a_frame_that_looks_along_the_axis(
+    filmed: tuple[Capture, Trajectory],
+) -> None:
+    """The body is taken for a tube, of which no cell faces the camera there."""
+    capture, truth = filmed
+    found = symmetry.estimate_spin(capture, truth)
+    assert found is not None
+    tube = replace(found.surface, radius=torch.full_like(found.surface.radius, 0.35))
+    T = truth.T_cam_obj
+    R = T.rotation.matrix().clone()
+    R[3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    end_on = replace(truth, T_cam_obj=SE3.from_rotation(SO3.from_matrix(R), T.xyz))
+    tracks = consistent_inputs(capture, truth).tracks
+    steady = symmetry.steady_observations(capture, end_on, tube, tracks)
+    assert bool((tracks.frame == 3).any())
+    assert bool(steady[tracks.frame == 3].all())
+    assert 0.5 < float(steady[tracks.frame != 3].float().mean()) < 1

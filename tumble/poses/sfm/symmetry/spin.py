@@ -241,13 +241,18 @@ def _best_shifts(score: Float[Tensor, "t t a"]) -> Int64[Tensor, " t"]:
 def steady_observations(
     capture: Capture, trajectory: Trajectory, surface: SurfaceOfRevolution, tracks: Tracks
 ) -> Bool[Tensor, " o"]:
-    """Whether each observation shows the surface point that its track shows where it is seen most nearly head-on."""
+    """Whether each observation shows the surface point that its track shows where it is seen most nearly head-on.
+
+    Nothing contradicts those of a frame that shows no part of the surface.
+    """
     uv, visible = _visible_cells(capture, trajectory, surface)
     uv, visible = uv.flatten(1, 2), visible.flatten(1)
     cell, facing = torch.zeros_like(tracks.point), torch.zeros(len(tracks))
     for k in range(len(trajectory)):
         mine = torch.nonzero(tracks.frame == k)[:, 0]
         seen = torch.nonzero(visible[k])[:, 0]
+        if not len(seen):
+            continue
         cell[mine] = seen[torch.cdist(tracks.uv[mine].float(), uv[k, seen]).argmin(1)]
         facing[mine] = visible[k, cell[mine]]
     order = torch.argsort(facing, stable=True)
@@ -255,4 +260,4 @@ def steady_observations(
     reference[tracks.point[order]] = order
     reference = reference[tracks.point]
     moved = uv[tracks.frame, cell[reference]] - uv[tracks.frame[reference], cell[reference]]
-    return (tracks.uv - tracks.uv[reference] - moved).norm(dim=-1) < MAX_SLIP
+    return (facing == 0) | ((tracks.uv - tracks.uv[reference] - moved).norm(dim=-1) < MAX_SLIP)
