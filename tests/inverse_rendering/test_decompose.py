@@ -147,6 +147,25 @@ def test_metal_must_explain_as_much_as_a_lobe_must_and_more_than_it_does(
     assert kinds == ["glossy", "matte", "metal", chosen]
 
 
+@pytest.mark.parametrize(("factor", "halvings"), [(0.0, 0), (0.51, 0), (0.5, 1), (0.25, 2)])
+def test_large_images_are_made_smaller_for_the_trials(
+    factor: float, halvings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`side` is this fraction of the images' side; 0 never makes them smaller."""
+
+    def tried(cfg: object, inputs: decompose.Inputs, before: State, start: object) -> tuple[State, float]:
+        sides.append(inputs.capture.camera.width)
+        return before, 1.0
+
+    sides: list[int] = []
+    inputs = true_figure()
+    side = inputs.capture.camera.width
+    monkeypatch.setattr(decompose, "_trial", tried)
+    cfg = replace(recipes.DRAFT.decompose, sets=1, directions=32, pixels=64, side=round(factor * side))
+    decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
+    assert set(sides) == {side // 2**halvings}
+
+
 @pytest.mark.parametrize("exaggerated", [False, True])
 def test_an_exaggerated_contrast_of_the_first_albedo_is_halved(exaggerated: bool) -> None:
     """The first albedo is the true one, or has twice its contrast."""

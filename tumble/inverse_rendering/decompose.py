@@ -68,7 +68,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 24
+VERSION = 25
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -254,14 +254,14 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     So does the albedo of stage 2 where an object has little texture: its contrast is halved for as long as that
     explains the frames better.
     """
-    params = state.params
+    params, coarse = state.params, _coarse(cfg, inputs)
     before = params.log_specular_scale.detach().exp()
     samples = _samples(cfg, inputs, state)
     fitted = specular_fit.fit(samples, len(params.gaussians.means))
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
     glossy = with_lobe(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
     matte = with_lobe(params, before * fitted.albedo_per_scale, NO_LOBE)
-    (best, error), (without, error_without) = (_trial(cfg, inputs, state, start) for start in (glossy, matte))
+    (best, error), (without, error_without) = (_trial(cfg, coarse, state, start) for start in (glossy, matte))
     start, limit = glossy, min(error, (1 - MIN_EXPLAINED) * error_without)
     if error > limit:
         best, error, start = without, error_without, matte
@@ -269,16 +269,23 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
         regions = specular_fit.metal_regions(fitted, params.gaussians.means)
         if float(regions[samples.gaussian].float().mean()) > MIN_METAL:
             metal = with_metal(glossy, regions)
-            metallic, error_of_metal = _trial(cfg, inputs, state, metal)
+            metallic, error_of_metal = _trial(cfg, coarse, state, metal)
             if error_of_metal < limit:
                 best, error, start = metallic, error_of_metal, metal
     for _ in range(MAX_HALVINGS):
         start = with_half_the_contrast(start)
-        flatter, error_of_flatter = _trial(cfg, inputs, state, start)
+        flatter, error_of_flatter = _trial(cfg, coarse, state, start)
         if error_of_flatter >= error:
             break
         best, error = flatter, error_of_flatter
     return best
+
+
+def _coarse(cfg: Config, inputs: Inputs) -> Inputs:
+    """Inputs with images of half the side as long as `Config.side` allows. Geometry is fixed in the trials."""
+    while cfg.side and min(inputs.capture.camera.height, inputs.capture.camera.width) >= 2 * cfg.side:
+        inputs = replace(inputs, capture=inputs.capture.halved())
+    return inputs
 
 
 def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[State, float]:

@@ -20,7 +20,7 @@ from tumble.inverse_rendering.photometric_alignment import align_pose
 from tumble.inverse_rendering.self_shadowing import VisibilityTransfer, trace_visibility
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.io import tree
-from tumble.maths import SE3, Index, entry, fibonacci_sphere, spherical_harmonics
+from tumble.maths import SE3, Index, entry, fibonacci_sphere, morton_order, spherical_harmonics
 from tumble.rendering import Buffers, rasterize, threads_for_kernels
 from tumble.scene import (
     Camera,
@@ -36,7 +36,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 16
+VERSION = 17
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3
@@ -243,8 +243,14 @@ def for_resolution(cfg: Config, inputs: Inputs) -> Config:
 
 
 def _start(cfg: Config, inputs: Inputs, rng: torch.Generator) -> visual_hull.OrientedPoints:
-    """Points on the initial surface."""
-    cfg = for_resolution(cfg, inputs)
+    """Points on the initial surface, in Morton order: kernels then find neighbours in the caches."""
+    points = _initial_surface(for_resolution(cfg, inputs), inputs, rng)
+    order = morton_order(points.positions)
+    return visual_hull.OrientedPoints(points.positions[order], points.normals[order], points.spacing[order])
+
+
+def _initial_surface(cfg: Config, inputs: Inputs, rng: torch.Generator) -> visual_hull.OrientedPoints:
+    """Points of the sphere or of the visual hull."""
     if cfg.start == "sphere":
         x_obj = fibonacci_sphere(cfg.points).to(inputs.trajectory.T_cam_obj.xyz)
         spacing = math.sqrt(4 * math.pi / cfg.points)
@@ -464,6 +470,8 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     plan = densify.plan(growth, score, prune)
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
     densify.place_children(points.gaussians, plan)
+    order = morton_order(points.gaussians.means)
+    points = optim.regrow(points, state.optimizer, order, torch.zeros_like(plan.fresh))
     state.params = replace(params, points=points)
     state.memory["max_weight"] = torch.zeros_like(points.albedo_logits[:, 0])
 

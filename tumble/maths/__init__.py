@@ -20,6 +20,7 @@ from tumble.maths.images import (
     Box,
     crop,
     crop_box,
+    gaussian_blur,
     iou,
     linear_from_srgb,
     resize_area,
@@ -28,7 +29,7 @@ from tumble.maths.images import (
     to_srgb8,
 )
 from tumble.maths.levenberg_marquardt import Damping, Linearised, minimise, select_rows
-from tumble.maths.points import nearest, neighbours, smallest_enclosing_sphere
+from tumble.maths.points import morton_order, nearest, neighbours, smallest_enclosing_sphere
 from tumble.maths.rotation_averaging import average_rotations
 from tumble.maths.se3 import SE3, SO3, angle_between, interpolate, mean_rotation, umeyama
 
@@ -48,12 +49,14 @@ __all__ = [
     "entry",
     "equirect_from_direction",
     "fibonacci_sphere",
+    "gaussian_blur",
     "interpolate",
     "iou",
     "linear_from_srgb",
     "local_frame",
     "mean_rotation",
     "minimise",
+    "morton_order",
     "nearest",
     "neighbours",
     "to_srgb8",

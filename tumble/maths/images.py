@@ -4,6 +4,7 @@ Rows run downwards. Pixel centres lie at +0.5, so that a resized image covers th
 unless the name contains `srgb`.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -97,13 +98,13 @@ def ssim_map(
     if min(x.shape[:2]) < window:
         raise ValueError(f"an image of {x.shape[1]} x {x.shape[0]} is smaller than the window of {window} pixels")
     c1, c2 = ((k * range) ** 2 for k in STABILISERS)
-    return _similarity(channels_first(x), channels_first(y), _gaussian(window, sigma), c1, c2).movedim(0, -1)
+    return _similarity(channels_first(x), channels_first(y), window, sigma, c1, c2).movedim(0, -1)
 
 
-def _similarity(x: Tensor, y: Tensor, weight: list[float], c1: float, c2: float) -> Tensor:
+def _similarity(x: Tensor, y: Tensor, window: int, sigma: float, c1: float, c2: float) -> Tensor:
     """`ssim_map` of images `[c h w]`."""
     moments = torch.stack([x, y, x * x + y * y, x * y]).flatten(0, 1)
-    mean_x, mean_y, power, product = _blur(moments, weight).unflatten(0, (4, -1))
+    mean_x, mean_y, power, product = gaussian_blur(moments, window, sigma, (1, 2)).unflatten(0, (4, -1))
     mean_product, squares = mean_x * mean_y, mean_x.square() + mean_y.square()
     numerator = (2 * mean_product + c1) * (2 * (product - mean_product) + c2)
     return numerator / ((squares + c1) * (power - squares + c2))
@@ -157,20 +158,17 @@ def crop(x: Shaped[Tensor, "h w *c"], box: Box) -> Shaped[Tensor, "i j *c"]:
     return x[top : top + height, left : left + width]
 
 
-def _gaussian(window: int, sigma: float) -> list[float]:
-    """Weights of a Gaussian filter, which sum to 1."""
+def gaussian_blur(x: Float[Tensor, "*n"], window: int, sigma: float, axes: Sequence[int]) -> Float[Tensor, "*m"]:
+    """The values filtered by a Gaussian of `window` values along some axes, without padding, which shortens them.
+
+    It sums shifted values because torch prepares a convolution anew for each new size, and takes four times as long
+    with large grids.
+    """
     offset = torch.arange(window, dtype=torch.float64) - (window - 1) / 2
     weight = (-0.5 * (offset / sigma).square()).exp()
-    return (weight / weight.sum()).tolist()
-
-
-def _blur(x: Float[Tensor, "n h w"], weight: list[float]) -> Float[Tensor, "n i j"]:
-    """Separable filter of rows and columns, without padding.
-
-    It sums shifted images because torch prepares a convolution anew for each new image size.
-    """
-    for axis in (1, 2):
-        size = x.shape[axis] - len(weight) + 1
+    weight = (weight / weight.sum()).tolist()
+    for axis in axes:
+        size = x.shape[axis] - window + 1
         blurred = x.narrow(axis, 0, size) * weight[0]
         for i, w in enumerate(weight[1:], 1):
             blurred.add_(x.narrow(axis, i, size), alpha=w)

@@ -1,4 +1,4 @@
-"""Point sets: nearest neighbours and smallest enclosing spheres."""
+"""Point sets: nearest neighbours, order in memory and smallest enclosing spheres."""
 
 from collections.abc import Callable, Iterator
 
@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+CURVE_BITS = 10
+"""Bits per coordinate of a place on the space-filling curve."""
 CHUNK_ROWS = 1024
 """Rows of the distance matrix that are computed at once; limits memory and does not affect results."""
 
@@ -34,6 +36,17 @@ def neighbours(x: Float[Tensor, "n 3"], k: int) -> Iterator[Int64[Tensor, "rows 
         return
     for rows in x.split(CHUNK_ROWS):
         yield torch.cdist(rows, x).topk(k, largest=False).indices
+
+
+def morton_order(x: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+    """Order of the points along a space-filling curve (Morton 1966): points close in space are close in memory."""
+    low, high = x.amin(0), x.amax(0)
+    cells = ((x - low) / (high - low).clamp_min(1e-12) * (2**CURVE_BITS - 1)).long()
+    place = torch.zeros_like(cells[:, 0])
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            place |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return place.argsort(stable=True)
 
 
 def smallest_enclosing_sphere(

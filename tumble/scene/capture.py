@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from tumble.io import tree
-from tumble.maths import SE3
+from tumble.maths import SE3, linear_from_srgb, to_srgb8
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Light, Trajectory
@@ -90,6 +90,22 @@ class Capture:
         images, masks = self.images[frames], self.masks[frames]
         full_images = None if self.full_images is None else self.full_images[frames]
         return replace(self, images=images, masks=masks, names=names, trajectory=trajectory, full_images=full_images)
+
+    def halved(self) -> "Capture":
+        """The capture at half the resolution, without `full_images`: 2 x 2 pixels become their mean in linear light.
+
+        Their mask is UNKNOWN unless they agree. An odd last row or column is left out.
+        """
+        h, w = self.camera.height // 2, self.camera.width // 2
+        curve = linear_from_srgb(torch.arange(256, device=self.images.device) / 255)
+        images, masks = (
+            x[:, : 2 * h, : 2 * w].unflatten(2, (w, 2)).unflatten(1, (h, 2)) for x in (self.images, self.masks)
+        )
+        mean = torch.stack([to_srgb8(curve[image.long()].mean((1, 3))) for image in images])
+        least, most = masks.amin((2, 4)), masks.amax((2, 4))
+        mask = torch.where(least == most, least, torch.full_like(least, UNKNOWN))
+        camera = self.camera.cropped(0, 0, 2 * h, 2 * w).resized(h, w)
+        return replace(self, images=mean, masks=mask, camera=camera, full_images=None)
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import conv3d, grid_sample, max_pool2d, normalize, pad
+from torch.nn.functional import grid_sample, max_pool2d, normalize, pad
 
+from tumble.maths import gaussian_blur
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.scene.trajectory import Trajectory
 
@@ -190,13 +191,8 @@ def outward_gradient(inside: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z 3"]
 
 def _smoothed(inside: Float[Tensor, "x y z"], sigma: float = 1.5) -> Float[Tensor, "x y z"]:
     """The occupancy convolved with a Gaussian of `sigma` [cells], which removes staircases from its normals."""
-    taps = torch.arange(-4, 5).to(inside)
-    kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    smoothed = torch.nn.functional.pad(inside[None, None], (4,) * 6, mode="replicate")
-    for shape in ((1, 1, -1, 1, 1), (1, 1, 1, -1, 1), (1, 1, 1, 1, -1)):
-        smoothed = conv3d(smoothed, kernel.reshape(shape))
-    return smoothed[0, 0]
+    padded = pad(inside[None, None], (4,) * 6, mode="replicate")[0, 0]
+    return gaussian_blur(padded, 9, sigma, (0, 1, 2))
 
 
 def neighbour_spacing(positions: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
