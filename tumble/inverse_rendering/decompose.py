@@ -282,8 +282,8 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
 
 
 def _coarse(cfg: Config, inputs: Inputs) -> Inputs:
-    """Inputs with images of half the side as long as `Config.side` allows. Geometry is fixed in the trials."""
-    while cfg.side and min(inputs.capture.camera.height, inputs.capture.camera.width) >= 2 * cfg.side:
+    """Inputs with images of half the side, as often as that leaves twice `Config.side`; geometry is fixed in trials."""
+    while cfg.side and min(inputs.capture.camera.height, inputs.capture.camera.width) >= 4 * cfg.side:
         inputs = replace(inputs, capture=inputs.capture.halved())
     return inputs
 
