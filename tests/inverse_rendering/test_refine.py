@@ -14,6 +14,7 @@ from tumble.inverse_rendering.refine import Params, Points
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.maths.directions import fibonacci_sphere
 from tumble.maths.images import srgb_from_linear
+from tumble.maths.points import morton_order
 from tumble.maths.se3 import SE3, SO3, angle_between
 from tumble.maths.spherical_harmonics import basis as basis_of_harmonics
 from tumble.recipes import SMOKE
@@ -89,6 +90,31 @@ def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_prun
     n_left = len(state.params.points.albedo_logits)
     assert n_left == (visible[3] & (torch.arange(600) % 3 > 0)).sum()
     assert torch.equal(state.memory["max_weight"], torch.zeros(n_left))
+
+
+def test_gaussians_stay_in_morton_order_and_keep_their_moments() -> None:
+    def means_and_moments() -> list[tuple[torch.Tensor, torch.Tensor]]:
+        means = state.params.points.gaussians.means
+        assert state.optimizer is not None
+        return list(zip(means.detach(), state.optimizer.state_of(means)["exp_avg"], strict=True))
+
+    _, true, capture = textured_sphere()
+    growth = densify.Config(max_gaussians=700, grow_score=-0.5, prune_opacity=0.0, prune_weight=-1.0, refine_every=1000)
+    cfg = replace(SMOKE.refine, points=600, densification=growth)
+    inputs = refine.Inputs(capture, Trajectory(true, "camera"))
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+    assert torch.equal(morton_order(state.params.points.gaussians.means.detach()), torch.arange(600))
+    refine.step(cfg, inputs, state)
+    moments = {tuple(x.tolist()): moment for x, moment in means_and_moments()}
+    refine._densify(cfg, inputs, state)
+    after = means_and_moments()
+    assert len(after) == 600 + 72  # the fraction that is split
+    assert torch.equal(morton_order(torch.stack([x for x, _ in after])), torch.arange(len(after)))
+    kept = [(x, moment) for x, moment in after if tuple(x.tolist()) in moments]
+    assert len(kept) == 600 - 72
+    assert any(bool(moment.any()) for _, moment in kept)
+    for x, moment in kept:
+        assert torch.equal(moment, moments[tuple(x.tolist())])
 
 
 def test_the_weight_of_the_gamma_term_is_the_stated_one() -> None:
