@@ -37,7 +37,7 @@ TUNE = dict.fromkeys(("ycb_006_mustard_bottle", "ycb_003_cracker_box", "chess_Kn
 """Objects on which constants of the method were chosen, with the light map of their videos."""
 SUITE = bench.read_suite("paper-table1")
 REPORT = {Path(entry["model"]).stem: str(entry["env"]) for entry in SUITE.object}
-"""Objects on which none was chosen, with light maps that were not used for choices either."""
+"""Objects on which no constant was chosen, under other light maps; the suite says which of them design looked at."""
 OBJECTS = TUNE | REPORT
 RELIGHT = dict.fromkeys(TUNE, ("forest_slope_1k.hdr", "studio_small_03_1k.hdr")) | dict.fromkeys(
     REPORT, tuple(SUITE.capture["relight"])

@@ -246,7 +246,7 @@ def _start(cfg: Config, inputs: Inputs, rng: torch.Generator) -> visual_hull.Ori
     """Points on the initial surface, in Morton order: kernels then find neighbours in the caches."""
     points = _initial_surface(for_resolution(cfg, inputs), inputs, rng)
     order = morton_order(points.positions)
-    return visual_hull.OrientedPoints(points.positions[order], points.normals[order], points.spacing[order])
+    return tree.map(lambda x: x[order], points)
 
 
 def _initial_surface(cfg: Config, inputs: Inputs, rng: torch.Generator) -> visual_hull.OrientedPoints:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from tumble.io import tree
-from tumble.maths import SE3, linear_from_srgb, to_srgb8
+from tumble.maths import SE3, linear_from_srgb, resize_area, to_srgb8
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Light, Trajectory
@@ -98,10 +98,9 @@ class Capture:
         """
         h, w = self.camera.height // 2, self.camera.width // 2
         curve = linear_from_srgb(torch.arange(256, device=self.images.device) / 255)
-        images, masks = (
-            x[:, : 2 * h, : 2 * w].unflatten(2, (w, 2)).unflatten(1, (h, 2)) for x in (self.images, self.masks)
-        )
-        mean = torch.stack([to_srgb8(curve[image.long()].mean((1, 3))) for image in images])
+        images, masks = self.images[:, : 2 * h, : 2 * w], self.masks[:, : 2 * h, : 2 * w]
+        mean = torch.stack([to_srgb8(resize_area(curve[image.long()], h, w)) for image in images])
+        masks = masks.unflatten(2, (w, 2)).unflatten(1, (h, 2))
         least, most = masks.amin((2, 4)), masks.amax((2, 4))
         mask = torch.where(least == most, least, torch.full_like(least, UNKNOWN))
         camera = self.camera.cropped(0, 0, 2 * h, 2 * w).resized(h, w)
