@@ -49,6 +49,21 @@ def film(painted: bool = True, frames: int = FRAMES) -> tuple[Capture, Trajector
     return photographed(T, albedo if painted else lambda x: torch.tensor(0.8))
 
 
+def past_the_end(albedo: Callable[[Tensor], Tensor]) -> tuple[Capture, Trajectory]:
+    """The ellipsoid turns about its axis by 5 degrees a frame, and tilts so that the camera sees one side of it, then
+    its end, then the other side."""
+    k = torch.arange(44)
+    tilt = torch.tensor([1.0, 0.0, 0.0]) * torch.linspace(1.55, -1.55, 44)[:, None]
+    about_z = torch.tensor([0.0, 0.0, 1.0]) * torch.deg2rad(5.0 * k)[:, None]
+    T = SE3.from_rotation(SO3.exp(tilt) @ SO3.exp(about_z), torch.tensor([0.0, 0.0, DISTANCE]))
+    return photographed(T, albedo)
+
+
+def twice(x: Tensor) -> Tensor:
+    """One half of the albedo on both sides of the body."""
+    return albedo(torch.where(x[..., 1:2] < 0, x * torch.tensor([-1.0, -1.0, 1.0]), x))
+
+
 def photographed(T: SE3, albedo: Callable[[Tensor], Tensor]) -> tuple[Capture, Trajectory]:
     """Noisy photographs of the shaded ellipsoid at these poses, with an albedo as a function of the surface point."""
     rng = torch.Generator().manual_seed(0)
@@ -126,6 +141,24 @@ def test_right_poses_are_not_contradicted(filmed: tuple[Capture, Trajectory]) ->
     found = symmetry.estimate_spin(*filmed)
     assert found is not None
     assert not found.is_better
+
+
+@pytest.mark.parametrize("pattern", [albedo, twice])
+def test_parts_before_and_after_a_view_of_the_end_are_joined(pattern: Callable[[Tensor], Tensor]) -> None:
+    """Texture that repeats after half a turn is joined without it, as the motion is smooth."""
+    capture, truth = past_the_end(pattern)
+    right = symmetry.estimate_spin(capture, truth)
+    assert right is not None
+    assert not right.is_better
+    slip = torch.deg2rad(50 * ((torch.arange(44) - 18) / 8).clamp(0, 1))[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    T = truth.T_cam_obj
+    wrong = replace(truth, T_cam_obj=SE3.from_rotation(T.rotation @ SO3.exp(slip), T.xyz))
+    assert error(wrong.T_cam_obj, truth) > 20
+    found = symmetry.estimate_spin(capture, wrong)
+    assert found is not None
+    assert found.joined == 1
+    assert found.is_better
+    assert error(found.surface.turned(wrong, found.angle).T_cam_obj, truth) < 3
 
 
 def test_shading_alone_does_not_contradict_poses() -> None:

@@ -9,10 +9,15 @@ surface, over the angle about the axis and the position along it: a spin shifts 
 all pairs of frames are compared for all shifts by their normalised cross-correlation, after the mean over nearby angles
 is subtracted. This removes smooth shading, and weighs texture by its contrast instead of its area. A spin that shading
 explains as well, because it keeps the object still before the camera, is not used.
+
+Frames that look along the axis show nothing of the side, so that the parts of the capture before and after them are
+compared as wholes. A label that repeats on the other side correlates as well after half a turn: the turn between two
+parts is to leave the motion smooth.
 """
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -48,8 +53,8 @@ MIN_CONTRAST = 0.1
 """Energy of the texture that two maps have in common, relative to the median frame's, at which a correlation counts
 half: where only untextured parts overlap, noise correlates."""
 STEP_PENALTY = 0.006
-"""Penalty on a change of the given spin between consecutive frames, which decides where a frame shows no texture
-[mean correlation / degree]."""
+"""Penalty on a change of the given spin between consecutive frames, which decides where a frame shows no texture, and
+on the difference between the spin from one part to the next and that of a smooth motion [mean correlation / degree]."""
 MIN_CORRELATION = 0.3
 """Minimum mean correlation of a frame with those near in time, with the spin found, for its texture to show the spin;
 shading and noise alone reach 0.28."""
@@ -58,6 +63,12 @@ CONTRADICTION = 0.8
 MIN_CONTRADICTED = 4
 """Number of frames that contradict the given poses from which these are wrong; the first or last two may do so by
 noise, as they are compared with few others."""
+MIN_VISIBLE = 0.3
+"""Visible area of the surface, relative to the median frame's, below which a frame looks along the axis."""
+MIN_PART = 5
+"""Minimum number of consecutive frames with a view of the side that are compared as a whole."""
+RATE_STEPS = 4
+"""Number of steps from frame to frame before and after a gap that tell how fast the object spins there."""
 MAX_SLIP = 1.5
 """Largest distance of a track's observations from one surface point [pixels]."""
 
@@ -102,13 +113,16 @@ class Spin:
     """The same after the turn."""
     static_correlation: Float[Tensor, " t"]
     """The same if the object is turned so that it does not spin before the camera, as shading does not."""
+    joined: int
+    """Number of times that texture contradicts the given turn between the parts before and after frames that look along
+    the axis."""
 
     @property
     def is_better(self) -> bool:
-        """Whether texture, not shading, contradicts the given poses of several frames."""
+        """Whether texture, not shading, contradicts the given poses of several frames, or between two parts."""
         others = torch.maximum(self.given_correlation, self.static_correlation)
-        contradicted = (self.correlation > MIN_CORRELATION) & (others < CONTRADICTION * self.correlation)
-        return int(contradicted.sum()) >= MIN_CONTRADICTED
+        contradicted = _contradicts(self.correlation, others)
+        return self.joined > 0 or int(contradicted.sum()) >= MIN_CONTRADICTED
 
 
 def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
@@ -121,12 +135,28 @@ def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
     surface = surface_of_revolution(capture, trajectory)
     if surface is None or len(trajectory) < 2:
         return None
-    score = _correlations(*_unwrapped(capture, trajectory, surface))
-    shift = _best_shifts(score)
+    contrast, weight = _unwrapped(capture, trajectory, surface)
+    score = _correlations(contrast, weight)
     towards_camera = (trajectory.T_cam_obj.inverse().xyz - surface.centre) @ surface.axes.mT
     static = (torch.atan2(towards_camera[:, 1], towards_camera[:, 0]) / (2 * math.pi) * ANGLES).round().long()
-    correlations = [_correlations_near(score, s) for s in (0 * shift, shift, static)]
-    return Spin(surface, (shift - shift.median()) * (2 * math.pi / ANGLES), *correlations)
+    rotation = trajectory.T_cam_obj.rotation
+    given = (rotation[:-1].inverse() @ rotation[1:]).log() @ surface.axes[2] / (2 * math.pi) * ANGLES
+    shift, joined = _joined(score, _shifts_near(score), static, given, _parts(weight))
+    shift = _refined_shifts(score, shift)
+    angle = (shift - shift.median() + ANGLES // 2) % ANGLES - ANGLES // 2
+    return Spin(
+        surface,
+        angle * (2 * math.pi / ANGLES),
+        given_correlation=_correlations_near(score, 0 * shift),
+        correlation=_correlations_near(score, shift),
+        static_correlation=_correlations_near(score, static),
+        joined=joined,
+    )
+
+
+def _contradicts(found: Tensor, others: Tensor) -> Tensor:
+    """Whether texture with this correlation contradicts a spin that has the other correlation."""
+    return (found > MIN_CORRELATION) & (others < CONTRADICTION * found)
 
 
 def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOfRevolution | None:
@@ -211,31 +241,93 @@ def _correlations_near(score: Float[Tensor, "t t a"], shift: Int64[Tensor, " t"]
     return (correlation * near).sum(1) / near.sum(1)
 
 
-def _best_shifts(score: Float[Tensor, "t t a"]) -> Int64[Tensor, " t"]:
-    """Shift of every frame's map, so that all pairs of frames agree best [cells].
-
-    Frames are added one after the other, each compared with the ones just before it. Then all are compared with all.
-    """
-    n = len(score)
-    shift = torch.zeros(n, dtype=torch.long)
-    penalty = STEP_PENALTY * 360 / ANGLES
-
-    def choose(k: int, others: Tensor, neighbours: Tensor, middle: int, reach: float) -> int:
-        cells = round(reach / (2 * math.pi) * ANGLES)
-        options = middle + torch.arange(-cells, cells + 1)
-        total = score[others[:, None], k, (options - shift[others, None]) % ANGLES].mean(0)
-        total = total - penalty * (options - shift[neighbours, None]).abs().sum(0)
-        return int(options[total.argmax()])
-
-    for k in range(1, n):
+def _shifts_near(score: Float[Tensor, "t t a"]) -> Int64[Tensor, " t"]:
+    """Shift of every frame's map [cells]: frames are added one after the other, each compared with the ones before."""
+    shift = torch.zeros(len(score), dtype=torch.long)
+    for k in range(1, len(score)):
         before = torch.arange(max(0, k - NEAR), k)
-        shift[k] = choose(k, before, before[-1:], int(shift[k - 1]), MAX_STEP)
-    frames = torch.arange(n)
-    for _ in range(SWEEPS):
-        for k in range(n):
-            neighbours = frames[(frames - k).abs() == 1]
-            shift[k] = choose(k, frames[frames != k], neighbours, int(shift[k]), REFINED_STEP)
+        shift[k] = _best_shift(score, shift, k, before, before[-1:], int(shift[k - 1]), MAX_STEP)
     return shift
+
+
+def _refined_shifts(score: Float[Tensor, "t t a"], shift: Int64[Tensor, " t"]) -> Int64[Tensor, " t"]:
+    """Shift of every frame's map, so that all pairs of frames agree best [cells]: all are compared with all."""
+    shift, frames = shift.clone(), torch.arange(len(score))
+    for _ in range(SWEEPS):
+        for k in range(len(score)):
+            neighbours = frames[(frames - k).abs() == 1]
+            shift[k] = _best_shift(score, shift, k, frames[frames != k], neighbours, int(shift[k]), REFINED_STEP)
+    return shift
+
+
+def _best_shift(
+    score: Float[Tensor, "t t a"],
+    shift: Int64[Tensor, " t"],
+    k: int,
+    others: Int64[Tensor, " n"],
+    neighbours: Int64[Tensor, " m"],
+    middle: int,
+    reach: float,
+) -> int:
+    """Shift of frame k, at most `reach` [radians] from the middle [cells], with the best mean correlation with others,
+    less the penalty on its difference to its neighbours' shifts."""
+    cells = round(reach / (2 * math.pi) * ANGLES)
+    options = middle + torch.arange(-cells, cells + 1)
+    total = score[others[:, None], k, (options - shift[others, None]) % ANGLES].mean(0)
+    total = total - STEP_PENALTY * 360 / ANGLES * (options - shift[neighbours, None]).abs().sum(0)
+    return int(options[total.argmax()])
+
+
+def _parts(weight: Float[Tensor, "t a z"]) -> list[Int64[Tensor, " n"]]:
+    """Frames of every longer part of the capture in which no frame looks along the axis."""
+    visible = weight.sum((1, 2))
+    seen, lengths = torch.unique_consecutive(visible > MIN_VISIBLE * visible.median(), return_counts=True)
+    runs = torch.arange(len(weight)).split(lengths.tolist())
+    return [run for run, of_side in zip(runs, seen, strict=True) if of_side and len(run) >= MIN_PART]
+
+
+def _joined(
+    score: Float[Tensor, "t t a"],
+    shift: Int64[Tensor, " t"],
+    static: Int64[Tensor, " t"],
+    given: Float[Tensor, " s"],
+    parts: list[Int64[Tensor, " n"]],
+) -> tuple[Int64[Tensor, " t"], int]:
+    """Shifts after every part is turned as a whole where its texture contradicts the shift to the part before it.
+
+    Args:
+        score: Correlations of all pairs of frames.
+        shift: Shifts of all frames, right within the parts [cells].
+        static: Shifts with which the object does not spin before the camera [cells].
+        given: Spin of the given poses from each frame to the next [cells].
+        parts: Frames of the parts, in order.
+
+    Returns:
+        The shifts [cells], and the number of parts that were turned.
+    """
+    shift, joined = shift.clone(), 0
+    for before, after in pairwise(parts):
+        last, first = int(before[-1]), int(after[0])
+        spin = given + shift.diff()
+        rates = spin[max(0, last - RATE_STEPS) : last].median(), spin[first : first + RATE_STEPS].median()
+        smooth = (first - last) * (rates[0] + rates[1]) / 2 - spin[last:first].sum()
+
+        def correlation(turns: Tensor, shift: Tensor, before: Tensor = before, after: Tensor = after) -> Tensor:
+            between = shift[after] - shift[before, None]
+            return torch.stack([score[before[:, None], after, (between + turn) % ANGLES].mean() for turn in turns])
+
+        turns = torch.arange(ANGLES) - ANGLES // 2
+        off = (turns - smooth + ANGLES / 2) % ANGLES - ANGLES / 2
+        found = correlation(turns, shift)
+        best = int((found - STEP_PENALTY * 360 / ANGLES * off.abs()).argmax())
+        none = torch.zeros(1, dtype=torch.long)
+        others = torch.maximum(correlation(none, shift), correlation(none, static))
+        if bool(_contradicts(found[best], others)):
+            ramp = torch.arange(last + 1, first) - last
+            shift[last + 1 : first] += (turns[best] * ramp / (first - last)).round().long()
+            shift[first:] += turns[best]
+            joined += 1
+    return shift, joined
 
 
 def steady_observations(
