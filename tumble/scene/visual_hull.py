@@ -5,12 +5,13 @@ along silhouettes, which carve from their middle. What most frames show as unkno
 is left out where it protrudes from the rest.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d, normalize, pad
+from torch.nn.functional import grid_sample, normalize, pad
 
 from tumble.maths import gaussian_blur
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
@@ -22,6 +23,7 @@ doubtful whether the cell belongs to the object."""
 WIDE = 5
 """Width from which an unknown region counts as something before the object [pixels]; bands along silhouettes are
 narrower."""
+GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 HULL_MARGIN = 2.0
 """Distance up to which doubtful cells may lie outside the convex hull of the others [cells]."""
 
@@ -39,7 +41,7 @@ class OrientedPoints:
 
 
 def carve(
-    capture: Capture, trajectory: Trajectory, *, resolution: int, tolerance: float = 0.0
+    capture: Capture, trajectory: Trajectory, *, resolution: int, tolerance: float = 0.0, outside: float = 1.0
 ) -> Float[Tensor, "x y z"]:
     """Occupancy in [0, 1] of each cell of [-1, 1]^3: the minimum over all frames of the bilinearly sampled masks.
 
@@ -48,6 +50,7 @@ def carve(
     Args:
         tolerance: Fraction of the frames whose masks or poses may be wrong: as many of the smallest samples of each
             cell are ignored.
+        outside: Occupancy that a frame gives to cells outside its image: 1 if the object may reach beyond it, else 0.
     """
     like = {"dtype": trajectory.T_cam_obj.xyz.dtype, "device": trajectory.T_cam_obj.xyz.device}
     ticks = (torch.arange(resolution, **like) + 0.5) / resolution * 2 - 1
@@ -55,13 +58,14 @@ def carve(
     size = torch.tensor([capture.camera.width, capture.camera.height], **like)
     smallest = (x_obj.norm(dim=-1) <= 1).to(**like).repeat(1 + int(tolerance * len(trajectory)), 1)
     left, hidden = torch.where(smallest[-1] > 0)[0], _wide_unknown(capture)
-    for frame in range(len(trajectory)):
+    # Frames that are far apart in time come first: they differ most, and each sees only the cells left by those before.
+    for frame in sorted(range(len(trajectory)), key=lambda k: k * GOLDEN_RATIO % 1):
         uv = capture.camera.project(trajectory.T_cam_obj[frame] @ x_obj.index_select(0, left))
         mask = _foreground(capture.masks[frame], hidden[frame]).to(**like)
         at = (uv / size * 2 - 1)[None, None]
         sampled = grid_sample(mask[None, None], at, padding_mode="border", align_corners=False)[0, 0, 0]
         in_image = ((uv > 0) & (uv < size)).all(-1)
-        value = torch.where(in_image, sampled, 1.0)
+        value = torch.where(in_image, sampled, outside)
         for k in range(len(smallest)):
             old = smallest[k].index_select(0, left)
             smallest[k, left], value = torch.minimum(old, value), torch.maximum(old, value)
@@ -93,14 +97,6 @@ def _foreground(mask: UInt8[Tensor, "h w"], hidden: Bool[Tensor, "h w"]) -> Floa
     return torch.where(band, out / (out + inward).clamp_min(1), foreground)
 
 
-def padded(capture: Capture) -> Capture:
-    """Masks of twice the size with background around them, because `carve` keeps cells that no frame sees."""
-    top, left = (side // 2 for side in capture.masks.shape[1:])
-    masks = pad(capture.masks, (left, left, top, top), value=BACKGROUND)
-    camera = capture.camera.cropped(-top, -left, *masks.shape[1:])
-    return Capture(masks[..., None].expand(-1, -1, -1, 3), masks, camera, capture.names, capture.light)
-
-
 def view_cosine(
     camera_centre: Float[Tensor, "*k 3"], x: Float[Tensor, "*n 3"], normals: Float[Tensor, "*n 3"]
 ) -> Float[Tensor, "*b"]:
@@ -113,9 +109,11 @@ def _wide_unknown(capture: Capture) -> Bool[Tensor, "t h w"]:
     unknown = capture.masks == UNKNOWN
     if not bool(unknown.any()):
         return unknown
-    known = (~unknown).float()[:, None]
-    eroded = max_pool2d(known, WIDE, 1, WIDE // 2) == 0
-    return max_pool2d(eroded.float(), WIDE, 1, WIDE // 2)[:, 0] > 0
+    import cv2
+
+    window = cv2.getStructuringElement(cv2.MORPH_RECT, (WIDE, WIDE))
+    opened = [cv2.morphologyEx(each, cv2.MORPH_OPEN, window) for each in unknown.byte().cpu().numpy()]
+    return torch.stack([torch.from_numpy(each) for each in opened]).to(unknown.device) > 0
 
 
 def _sure_fraction(

@@ -164,7 +164,7 @@ def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOf
 
     The axis is the principal axis of the hull whose moment of inertia differs most from the other two.
     """
-    cells = visual_hull.carve(visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION)
+    cells = visual_hull.carve(capture, trajectory, resolution=HULL_RESOLUTION, outside=0.0)
     x = (torch.nonzero(cells > 0.5) + 0.5) / HULL_RESOLUTION * 2 - 1
     if len(x) < HEIGHTS:
         return None

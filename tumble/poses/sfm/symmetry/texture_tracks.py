@@ -131,9 +131,7 @@ def _surface_patches(
     Raises:
         ValueError: The poses contradict each other, so that there is no hull.
     """
-    cells = visual_hull.carve(
-        visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCE
-    )
+    cells = visual_hull.carve(capture, trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCE, outside=0.0)
     surface = visual_hull.sample_surface(cells, points, rng)
     return surface, _sampled(capture, trajectory, cells, surface)
 

@@ -188,7 +188,7 @@ def symmetric_hull(capture: Capture, trajectory: Trajectory) -> SymmetricHull | 
     All rotations are compared on a grid by the mean distance between the turned surface and the surface. The best are
     refined, each step along the axis that lowers the distance most.
     """
-    cells = visual_hull.carve(visual_hull.padded(capture), trajectory, resolution=HULL_RESOLUTION)
+    cells = visual_hull.carve(capture, trajectory, resolution=HULL_RESOLUTION, outside=0.0)
     inside = torch.nonzero(cells > 0.5)
     if len(inside) < HULL_RESOLUTION:
         return None
