@@ -260,9 +260,9 @@ def _poses_of(
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
     tracked, key = _track(opened, capture, where, content, 1, device)
     for number in range(2, mask_refinement.ROUNDS + 1):
-        if not mask_refinement.can_be_trimmed(capture, tracked):
+        trimmed = mask_refinement.trimmed_further(capture, tracked)
+        if trimmed is None:
             break
-        trimmed = mask_refinement.trim_masks(capture, tracked)
         new, new_key = _track(opened, trimmed, where, content_key(trimmed), number, device)
         if not mask_refinement.explains_more(new, tracked):
             break

@@ -58,13 +58,20 @@ def test_a_frame_without_pose_keeps_its_mask(scene: Tumble) -> None:
     assert (trimmed.masks[2:][arm[2:]] == BACKGROUND).float().mean() > 0.8
 
 
-def test_only_doubtful_masks_of_a_known_shape_are_trimmed(scene: Tumble) -> None:
+def test_only_doubtful_masks_of_a_known_shape_are_trimmed_further(scene: Tumble) -> None:
     capture, _ = with_arm(scene.capture)
-    assert mask_refinement.can_be_trimmed(capture, result(scene, lost=1))
-    assert not mask_refinement.can_be_trimmed(capture, result(scene, overlap=1.0))
-    assert not mask_refinement.can_be_trimmed(capture, result(scene, overlap=0.4))
+    assert mask_refinement.trimmed_further(capture, result(scene, lost=1)) is not None
+    assert mask_refinement.trimmed_further(capture, result(scene, overlap=1.0)) is None
+    assert mask_refinement.trimmed_further(capture, result(scene, overlap=0.4)) is None
     # Masks without unknown pixels were given, or made of an object that nothing covers.
-    assert not mask_refinement.can_be_trimmed(scene.capture, result(scene, lost=1))
+    assert mask_refinement.trimmed_further(scene.capture, result(scene, lost=1)) is None
+
+
+def test_masks_that_the_shape_hardly_contradicts_are_not_trimmed_further(scene: Tumble) -> None:
+    """A frame may be lost for other reasons, and stage 1 would only do the same again."""
+    masks = scene.capture.masks.clone()
+    masks[:, :1, :3] = UNKNOWN
+    assert mask_refinement.trimmed_further(replace(scene.capture, masks=masks), result(scene, lost=1)) is None
 
 
 def test_a_stored_result_is_that_of_the_best_round(scene: Tumble, tmp_path: Path) -> None:
