@@ -1,7 +1,7 @@
 """The visual hull of an ellipsoid recorded from all sides approximates that ellipsoid."""
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -84,7 +84,7 @@ def test_a_band_of_unknown_pixels_along_the_silhouette_does_not_enlarge_the_hull
     background, inside = ((capture.masks == label).float()[:, None] for label in (BACKGROUND, OBJECT))
     near = [max_pool2d(x, 2 * half + 1, 1, half)[:, 0] > 0 for x in (background, inside)]
     masks = torch.where(near[0] & near[1], UNKNOWN, capture.masks).to(torch.uint8)
-    found = visual_hull.carve(dataclasses.replace(capture, masks=masks), trajectory, resolution=64)
+    found = visual_hull.carve(replace(capture, masks=masks), trajectory, resolution=64)
     assert int((found > 0.5).sum()) == pytest.approx(int((carved > 0.5).sum()), rel=0.03)
 
 
@@ -98,7 +98,7 @@ def test_a_hand_that_never_lets_go_is_left_out_but_not_what_it_hides() -> None:
         hit = (d * o).sum(-1).square() > (d * d).sum(-1) * ((o * o).sum() - radius**2)
         in_front = trajectory.T_cam_obj.rotation[i].matrix()[2, 1] < 0
         mask[hit & ((mask == BACKGROUND) | in_front)] = UNKNOWN
-    cells = visual_hull.carve(dataclasses.replace(capture, masks=masks), trajectory, resolution=64) > 0.5
+    cells = visual_hull.carve(replace(capture, masks=masks), trajectory, resolution=64) > 0.5
     ticks = (torch.arange(64) + 0.5) / 64 * 2 - 1
     x = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1)
     level = ((x - CENTER) / AXES).norm(dim=-1)
@@ -106,6 +106,17 @@ def test_a_hand_that_never_lets_go_is_left_out_but_not_what_it_hides() -> None:
     assert cells[level < 0.85].all()
     protruding = in_ball & (level > 1.3)
     assert cells[protruding].float().mean() < 0.1
+
+
+def test_what_lies_outside_of_all_images_is_object_only_if_it_may_be() -> None:
+    """Every frame sees only the left half of its image: to its right there may be object, or none."""
+    capture, trajectory = silhouettes(1)
+    camera, images, masks = capture.camera.cropped(0, 0, 64, 32), capture.images[:, :, :32], capture.masks[:, :, :32]
+    half = replace(capture, camera=camera, images=images, masks=masks)
+    right = trajectory.T_cam_obj[0].inverse() @ torch.tensor([0.5, 0.0, DISTANCE])
+    cell = tuple(((right + 1) * 16).long().tolist())
+    assert visual_hull.carve(half, trajectory, resolution=32)[cell] == 1
+    assert visual_hull.carve(half, trajectory, resolution=32, outside=0.0)[cell] == 0
 
 
 def test_a_few_wrong_masks_are_tolerated() -> None:
