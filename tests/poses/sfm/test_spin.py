@@ -161,6 +161,21 @@ def test_parts_before_and_after_a_view_of_the_end_are_joined(pattern: Callable[[
     assert error(found.surface.turned(wrong, found.angle).T_cam_obj, truth) < 3
 
 
+def test_two_trajectories_differ_by_their_axes_whatever_the_spin(filmed: tuple[Capture, Trajectory]) -> None:
+    capture, truth = filmed
+    slip = symmetry.axis_deviation(capture, truth, slipped(truth))
+    assert slip is not None
+    assert math.degrees(float(slip.max())) < 3
+    # All about the image's x axis, while the object's axis stays near the vertical.
+    angle = torch.deg2rad(12 * (0.5 * torch.arange(FRAMES)).sin())
+    T = truth.T_cam_obj
+    tilt = SO3.exp(angle[:, None] * torch.tensor([1.0, 0.0, 0.0]))
+    tilted = replace(truth, T_cam_obj=SE3.from_rotation(tilt @ T.rotation, T.xyz))
+    found = symmetry.axis_deviation(capture, truth, tilted)
+    assert found is not None
+    torch.testing.assert_close(found, angle.abs(), atol=math.radians(2), rtol=0)
+
+
 def test_shading_alone_does_not_contradict_poses() -> None:
     capture, truth = film(painted=False)
     found = symmetry.estimate_spin(capture, slipped(truth))

@@ -77,7 +77,7 @@ from tumble.poses.sfm.schedule import (
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 29
+VERSION = 30
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -96,7 +96,8 @@ SETTLED_ANGLE = math.radians(1.0)
 """Largest change of a frame's rotation by a round of corrections below which no more rounds follow [radians]. A frame
 that is relocated or turned moves farther, one that is only adjusted less."""
 AGREEMENT = math.radians(3.0)
-"""Angle by which the rotations of two attempts that have found the same motion differ at most [radians]."""
+"""Angle by which the rotations of two attempts that have found the same motion differ at most [radians]; for a body of
+revolution that between its axes."""
 AGREEING_FRAMES = 0.9
 """Fraction of the frames in which they have to agree."""
 PERTURBATIONS = 10
@@ -350,8 +351,7 @@ def _turns(inputs: Inputs, poses: Poses) -> symmetry.Turns | None:
 
 def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
     """Rotations about the axis that the texture of a body of revolution shows, relative to the poses."""
-    silhouettes = inputs.mirror_symmetry
-    if not silhouettes.is_revolution or silhouettes.is_sphere:
+    if not _has_spin(inputs):
         return None
     return symmetry.estimate_spin(inputs.capture, in_unit_sphere(inputs, poses.R, poses.t))
 
@@ -363,10 +363,29 @@ def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_ot
         trial = State(0, state.params, None, torch.Generator().manual_seed(0))
         memory["first_loss"] = torch.as_tensor(adjust_all(cfg, inputs, trial, scale)[1]["loss"])
     if is_other:
-        memory["agreed"] = deviation(state.params.R, memory["R"]).quantile(AGREEING_FRAMES) < AGREEMENT
+        other = Poses(*(memory[name] for name in vars(state.params)))
+        memory["agreed"] = _difference(inputs, state.params, other).quantile(AGREEING_FRAMES) < AGREEMENT
     if found < memory["loss"]:
         memory |= {**vars(state.params), "loss": found}
     return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
+
+
+def _difference(inputs: Inputs, a: Poses, b: Poses) -> Float[Tensor, " t"]:
+    """Angle in every frame between the rotations of two attempts [radians].
+
+    For a body of revolution between its axes: texture tells its rotation about the axis afterwards (`AlignTexture`),
+    which matches of all attempts get wrong in different ways.
+    """
+    if _has_spin(inputs):
+        found = symmetry.axis_deviation(inputs.capture, *(in_unit_sphere(inputs, each.R, each.t) for each in (a, b)))
+        if found is not None:
+            return found.double()
+    return deviation(a.R, b.R)
+
+
+def _has_spin(inputs: Inputs) -> bool:
+    """Whether the object is a body of revolution, whose silhouettes show its rotation but for that about the axis."""
+    return inputs.mirror_symmetry.is_revolution and not inputs.mirror_symmetry.is_sphere
 
 
 def _try_circular_motion(inputs: Inputs, state: State) -> PhaseResult:

@@ -8,7 +8,7 @@ agree about them tells how a body of revolution turns on a turntable (`texture_t
 
 from tumble.poses.sfm.symmetry import texture_information
 from tumble.poses.sfm.symmetry.mirror import MirrorSymmetry, mirror_symmetry
-from tumble.poses.sfm.symmetry.spin import Spin, estimate_spin, steady_observations
+from tumble.poses.sfm.symmetry.spin import Spin, axis_deviation, estimate_spin, steady_observations
 from tumble.poses.sfm.symmetry.texture_tracks import Agreement, texture_agreement, texture_tracks
 from tumble.poses.sfm.symmetry.turns import Turns, estimate_turns
 
@@ -17,6 +17,7 @@ __all__ = [
     "MirrorSymmetry",
     "Spin",
     "Turns",
+    "axis_deviation",
     "estimate_spin",
     "estimate_turns",
     "mirror_symmetry",

@@ -185,6 +185,24 @@ def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOf
     )
 
 
+def axis_deviation(capture: Capture, a: Trajectory, b: Trajectory) -> Float[Tensor, " t"] | None:
+    """Angle in every frame between the axes of a body of revolution at two trajectories, whatever the spin [radians].
+
+    None if the poses and silhouettes of either contradict each other.
+    """
+    surfaces = [surface_of_revolution(capture, each) for each in (a, b)]
+    lines = [
+        each.T_cam_obj.rotation @ surface.axes[2]
+        for each, surface in zip((a, b), surfaces, strict=True)
+        if surface is not None
+    ]
+    if len(lines) < 2:
+        return None
+    cosine = (lines[0] * lines[1]).sum(-1)
+    # Both ends of an axis are alike.
+    return (cosine * cosine.sum().sign()).clamp(-1, 1).arccos()
+
+
 def _visible_cells(
     capture: Capture, trajectory: Trajectory, surface: SurfaceOfRevolution
 ) -> tuple[Float[Tensor, "t a z 2"], Float[Tensor, "t a z"]]:
