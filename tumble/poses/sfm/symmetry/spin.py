@@ -120,8 +120,7 @@ class Spin:
     @property
     def is_better(self) -> bool:
         """Whether texture, not shading, contradicts the given poses of several frames, or between two parts."""
-        others = torch.maximum(self.given_correlation, self.static_correlation)
-        contradicted = _contradicts(self.correlation, others)
+        contradicted = _contradicts(self.correlation, self.given_correlation, self.static_correlation)
         return self.joined > 0 or int(contradicted.sum()) >= MIN_CONTRADICTED
 
 
@@ -136,13 +135,18 @@ def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
     if surface is None or len(trajectory) < 2:
         return None
     contrast, weight = _unwrapped(capture, trajectory, surface)
-    score = _correlations(contrast, weight)
+    product, energy = _products(contrast, weight)
+    score = product / energy
     towards_camera = (trajectory.T_cam_obj.inverse().xyz - surface.centre) @ surface.axes.mT
     static = (torch.atan2(towards_camera[:, 1], towards_camera[:, 0]) / (2 * math.pi) * ANGLES).round().long()
     rotation = trajectory.T_cam_obj.rotation
     given = (rotation[:-1].inverse() @ rotation[1:]).log() @ surface.axes[2] / (2 * math.pi) * ANGLES
-    shift, joined = _joined(score, _shifts_near(score), static, given, _parts(weight))
-    shift = _refined_shifts(score, shift)
+    parts = list(pairwise(_parts(weight)))
+    shift = _refined_shifts(score, _joined(product, energy, _shifts_near(score), static, given, parts))
+    joined = [
+        _contradicts(*(_correlation_between(product, energy, s, *pair) for s in (shift, 0 * shift, static)))
+        for pair in parts
+    ]
     angle = (shift - shift.median() + ANGLES // 2) % ANGLES - ANGLES // 2
     return Spin(
         surface,
@@ -150,13 +154,19 @@ def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
         given_correlation=_correlations_near(score, 0 * shift),
         correlation=_correlations_near(score, shift),
         static_correlation=_correlations_near(score, static),
-        joined=joined,
+        joined=sum(map(bool, joined)),
     )
 
 
-def _contradicts(found: Tensor, others: Tensor) -> Tensor:
-    """Whether texture with this correlation contradicts a spin that has the other correlation."""
-    return (found > MIN_CORRELATION) & (others < CONTRADICTION * found)
+def _contradicts(found: Tensor, given: Tensor, static: Tensor) -> Tensor:
+    """Whether texture with this correlation contradicts the given poses, and shading does not explain it as well.
+
+    Args:
+        found: Correlation with the spin found.
+        given: Correlation with the given spin.
+        static: Correlation if the object does not spin before the camera.
+    """
+    return (found > MIN_CORRELATION) & (torch.maximum(given, static) < CONTRADICTION * found)
 
 
 def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOfRevolution | None:
@@ -234,20 +244,23 @@ def _unwrapped(
     return (grey - mean(grey * visible) / mean(visible).clamp_min(1e-6)) * visible, weight
 
 
-def _correlations(contrast: Float[Tensor, "t a z"], weight: Float[Tensor, "t a z"]) -> Float[Tensor, "t t a"]:
-    """Normalised cross-correlations of all pairs of maps for all shifts of the second one [cells].
+def _products(
+    contrast: Float[Tensor, "t a z"], weight: Float[Tensor, "t a z"]
+) -> tuple[Float[Tensor, "t t a"], Float[Tensor, "t t a"]]:
+    """Sums over the cells of the products of all pairs of maps for all shifts of the second one [cells], and their
+    energies, of which the former are the fraction that correlates.
 
-    They are smaller where the maps have little texture in common.
+    The energy is larger where the maps have little texture in common.
     """
-    product, energy, w = (torch.fft.rfft(x, dim=1) for x in (weight * contrast, weight * contrast.square(), weight))
+    products, energies, w = (torch.fft.rfft(x, dim=1) for x in (weight * contrast, weight * contrast.square(), weight))
 
     def correlate(a: Tensor, b: Tensor) -> Float[Tensor, "t t a"]:
         # One frame at a time, which limits memory.
         return torch.stack([torch.fft.irfft((row.conj() * b).sum(-1), n=ANGLES, dim=1) for row in a])
 
-    common = (correlate(energy, w).clamp_min(0) * correlate(w, energy).clamp_min(0)).sqrt()
+    common = (correlate(energies, w).clamp_min(0) * correlate(w, energies).clamp_min(0)).sqrt()
     typical = common[:, :, 0].diagonal().median()
-    return correlate(product, product) / (common + MIN_CONTRAST * typical).clamp_min(1e-6)
+    return correlate(products, products), (common + MIN_CONTRAST * typical).clamp_min(1e-6)
 
 
 def _correlations_near(score: Float[Tensor, "t t a"], shift: Int64[Tensor, " t"]) -> Float[Tensor, " t"]:
@@ -305,47 +318,54 @@ def _parts(weight: Float[Tensor, "t a z"]) -> list[Int64[Tensor, " n"]]:
 
 
 def _joined(
-    score: Float[Tensor, "t t a"],
+    product: Float[Tensor, "t t a"],
+    energy: Float[Tensor, "t t a"],
     shift: Int64[Tensor, " t"],
     static: Int64[Tensor, " t"],
     given: Float[Tensor, " s"],
-    parts: list[Int64[Tensor, " n"]],
-) -> tuple[Int64[Tensor, " t"], int]:
-    """Shifts after every part is turned as a whole where its texture contradicts the shift to the part before it.
+    parts: list[tuple[Int64[Tensor, " n"], Int64[Tensor, " m"]]],
+) -> Int64[Tensor, " t"]:
+    """Shifts [cells] after every part is turned as a whole where its texture contradicts the shift to the one before.
 
     Args:
-        score: Correlations of all pairs of frames.
+        product: Products of all pairs of frames (`_products`).
+        energy: Their energies.
         shift: Shifts of all frames, right within the parts [cells].
         static: Shifts with which the object does not spin before the camera [cells].
         given: Spin of the given poses from each frame to the next [cells].
-        parts: Frames of the parts, in order.
-
-    Returns:
-        The shifts [cells], and the number of parts that were turned.
+        parts: Frames of all consecutive pairs of parts, in order.
     """
-    shift, joined = shift.clone(), 0
-    for before, after in pairwise(parts):
+    shift = shift.clone()
+    for before, after in parts:
         last, first = int(before[-1]), int(after[0])
         spin = given + shift.diff()
         rates = spin[max(0, last - RATE_STEPS) : last].median(), spin[first : first + RATE_STEPS].median()
         smooth = (first - last) * (rates[0] + rates[1]) / 2 - spin[last:first].sum()
 
-        def correlation(turns: Tensor, shift: Tensor, before: Tensor = before, after: Tensor = after) -> Tensor:
-            between = shift[after] - shift[before, None]
-            return torch.stack([score[before[:, None], after, (between + turn) % ANGLES].mean() for turn in turns])
-
         turns = torch.arange(ANGLES) - ANGLES // 2
         off = (turns - smooth + ANGLES / 2) % ANGLES - ANGLES / 2
-        found = correlation(turns, shift)
+        found = torch.stack([_correlation_between(product, energy, shift, before, after, turn) for turn in turns])
         best = int((found - STEP_PENALTY * 360 / ANGLES * off.abs()).argmax())
-        none = torch.zeros(1, dtype=torch.long)
-        others = torch.maximum(correlation(none, shift), correlation(none, static))
-        if bool(_contradicts(found[best], others)):
+        others = (_correlation_between(product, energy, s, before, after) for s in (shift, static))
+        if bool(_contradicts(found[best], *others)):
             ramp = torch.arange(last + 1, first) - last
             shift[last + 1 : first] += (turns[best] * ramp / (first - last)).round().long()
             shift[first:] += turns[best]
-            joined += 1
-    return shift, joined
+    return shift
+
+
+def _correlation_between(
+    product: Float[Tensor, "t t a"],
+    energy: Float[Tensor, "t t a"],
+    shift: Int64[Tensor, " t"],
+    before: Int64[Tensor, " n"],
+    after: Int64[Tensor, " m"],
+    turn: Int64[Tensor, ""] | int = 0,
+) -> Float[Tensor, ""]:
+    """Correlation of all frames of one part with all of another that is turned in addition [cells], most of all of
+    those that have much texture in common."""
+    pairs = before[:, None], after, (shift[after] - shift[before, None] + turn) % ANGLES
+    return product[pairs].sum() / energy[pairs].sum()
 
 
 def steady_observations(
