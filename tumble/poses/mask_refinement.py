@@ -46,8 +46,9 @@ def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Captu
     best = run.output(out, folder(1), PoseResult)
     for number in range(2, ROUNDS + 1):
         new = run.output(out, folder(number), PoseResult)
-        trimmed = None if best is None or new is None else trimmed_further(capture, best)
-        if best is None or new is None or trimmed is None or not explains_more(new, best):
+        if best is None or new is None or not explains_more(new, best):
+            break
+        if (trimmed := trimmed_further(capture, best)) is None:
             break
         capture, best = trimmed, new
     return best, capture

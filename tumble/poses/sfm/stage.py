@@ -362,12 +362,13 @@ def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_ot
     if bool(memory["first_loss"].isinf()):
         trial = State(0, state.params, None, torch.Generator().manual_seed(0))
         memory["first_loss"] = torch.as_tensor(adjust_all(cfg, inputs, trial, scale)[1]["loss"])
+    best = Poses(**{name: memory[name] for name in vars(state.params)})
     if is_other:
-        other = Poses(*(memory[name] for name in vars(state.params)))
-        memory["agreed"] = _difference(inputs, state.params, other).quantile(AGREEING_FRAMES) < AGREEMENT
+        memory["agreed"] = _difference(inputs, state.params, best).quantile(AGREEING_FRAMES) < AGREEMENT
     if found < memory["loss"]:
         memory |= {**vars(state.params), "loss": found}
-    return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
+        best = state.params
+    return best, {"loss": memory["loss"]}
 
 
 def _difference(inputs: Inputs, a: Poses, b: Poses) -> Float[Tensor, " t"]:

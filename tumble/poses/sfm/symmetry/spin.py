@@ -147,15 +147,19 @@ def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
         _contradicts(*(_correlation_between(product, energy, s, *pair) for s in (shift, 0 * shift, static)))
         for pair in parts
     ]
-    angle = (shift - shift.median() + ANGLES // 2) % ANGLES - ANGLES // 2
     return Spin(
         surface,
-        angle * (2 * math.pi / ANGLES),
+        _least_turn(shift - shift.median()) * (2 * math.pi / ANGLES),
         given_correlation=_correlations_near(score, 0 * shift),
         correlation=_correlations_near(score, shift),
         static_correlation=_correlations_near(score, static),
         joined=sum(map(bool, joined)),
     )
+
+
+def _least_turn(cells: Tensor) -> Tensor:
+    """Turns of at most half a revolution that are the same [cells]."""
+    return (cells + ANGLES // 2) % ANGLES - ANGLES // 2
 
 
 def _contradicts(found: Tensor, given: Tensor, static: Tensor) -> Tensor:
@@ -200,14 +204,12 @@ def axis_deviation(capture: Capture, a: Trajectory, b: Trajectory) -> Float[Tens
 
     None if the poses and silhouettes of either contradict each other.
     """
-    surfaces = [surface_of_revolution(capture, each) for each in (a, b)]
-    lines = [
-        each.T_cam_obj.rotation @ surface.axes[2]
-        for each, surface in zip((a, b), surfaces, strict=True)
-        if surface is not None
-    ]
-    if len(lines) < 2:
-        return None
+    lines = []
+    for each in (a, b):
+        surface = surface_of_revolution(capture, each)
+        if surface is None:
+            return None
+        lines.append(each.T_cam_obj.rotation @ surface.axes[2])
     cosine = (lines[0] * lines[1]).sum(-1)
     # Both ends of an axis are alike.
     return (cosine * cosine.sum().sign()).clamp(-1, 1).arccos()
@@ -341,11 +343,9 @@ def _joined(
         spin = given + shift.diff()
         rates = spin[max(0, last - RATE_STEPS) : last].median(), spin[first : first + RATE_STEPS].median()
         smooth = (first - last) * (rates[0] + rates[1]) / 2 - spin[last:first].sum()
-
         turns = torch.arange(ANGLES) - ANGLES // 2
-        off = (turns - smooth + ANGLES / 2) % ANGLES - ANGLES / 2
         found = torch.stack([_correlation_between(product, energy, shift, before, after, turn) for turn in turns])
-        best = int((found - STEP_PENALTY * 360 / ANGLES * off.abs()).argmax())
+        best = int((found - STEP_PENALTY * 360 / ANGLES * _least_turn(turns - smooth).abs()).argmax())
         others = (_correlation_between(product, energy, s, before, after) for s in (shift, static))
         if bool(_contradicts(found[best], *others)):
             ramp = torch.arange(last + 1, first) - last
