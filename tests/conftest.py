@@ -1,19 +1,18 @@
 """Shapes and types of every function of the package are checked while the tests run."""
 
+import gc
 import os
 import signal
 from pathlib import Path
 
-from jaxtyping import install_import_hook
-
-import tests.typechecker  # noqa: F401 (the hook finds it by name)
+from tests import typechecker
 
 # Two test processes share two cores: one thread each, and the same floating-point sums on every machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # A shell starts jobs in the background deaf to Ctrl-C, which some tests press.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-install_import_hook("tumble", "tests.typechecker.check")
+typechecker.install("tumble")
 
 import pytest  # noqa: E402
 import torch  # noqa: E402
@@ -21,6 +20,12 @@ import torch  # noqa: E402
 torch.set_num_threads(1)
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays until the end: no garbage collection during the tests looks at it again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,133 @@
-"""The type checker of the tests: beartype, with an int allowed where a float is asked for (PEP 484)."""
+"""Beartype checks every call of a function of the package while the tests run, and jaxtyping what it says of shapes.
+
+`install` is jaxtyping's import hook in short. That one checks arguments twice, once more together with the result, and
+binds them by name on every call, which took a quarter of the time of the tests; here beartype checks a call once.
+"""
+
+import ast
+import dataclasses
+import functools
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 from beartype import BeartypeConf, beartype
+from jaxtyping import jaxtyped
 
-check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+DECORATOR = "__checked__"
+VERSION = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
+"""Compiled modules of another version of this file are not used."""
+
+typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
+"""An int is allowed where a float is asked for (PEP 484)."""
+
+
+def install(package: str) -> None:
+    """Check all modules of `package` that are imported from now on."""
+    sys.meta_path.insert(0, Finder(package))
+
+
+def checked(target: Any) -> Any:
+    """A function that checks its arguments and its result; a dataclass that checks its fields.
+
+    A name in the shapes means the same size within one call.
+    """
+    if inspect.isclass(target):
+        if dataclasses.is_dataclass(target) and "__init__" in vars(target):
+            target.__init__ = checked(target.__init__)
+        return target
+    if hasattr(target, DECORATOR):
+        return target
+    inner: Callable[..., Any] | None = None
+
+    @functools.wraps(target)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        nonlocal inner
+        if inner is None:  # most functions are never called within one process
+            inner = typed(resolved(target))
+            # Only a shape such as "{height} {width}" needs to know the values of arguments by name.
+            if any("{" in str(annotation) for annotation in target.__annotations__.values()):
+                inner = jaxtyped(inner, typechecker=None)
+        with jaxtyped("context"):
+            return inner(*args, **kwargs)
+
+    setattr(call, DECORATOR, True)
+    return call
+
+
+def resolved(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with the types that its annotations in quotes name; any, if only type checkers import the name."""
+    for name, annotation in function.__annotations__.items():
+        if isinstance(annotation, str):
+            try:
+                function.__annotations__[name] = eval(annotation, function.__globals__)
+            except NameError:
+                function.__annotations__[name] = Any
+    return function
+
+
+class Decorate(ast.NodeTransformer):
+    """Put `checked` around every function, under all other decorators, and around every class, above them."""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        return node if unchecked(node) else self.decorated(node, len(node.decorator_list))
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> ast.AST:
+        return node if unchecked(node) else self.decorated(node, 0)
+
+    def decorated(self, node: ast.FunctionDef | ast.ClassDef, position: int) -> ast.AST:
+        """The function or class with one more decorator, from the top; all within it are visited too."""
+        self.generic_visit(node)
+        node.decorator_list.insert(position, ast.copy_location(ast.Name(DECORATOR, ast.Load()), node))
+        return node
+
+
+def unchecked(node: ast.FunctionDef | ast.ClassDef) -> bool:
+    """Whether Warp compiles this, which reads the annotations in its own way."""
+    return any(ast.unparse(decorator).endswith("no_type_check") for decorator in node.decorator_list)
+
+
+class Loader(SourceFileLoader):
+    """Loads a module whose functions are checked, and keeps the compiled code beside that of the plain module."""
+
+    def source_to_code(self, data: Any, path: Any, *, _optimize: int = -1) -> Any:
+        tree = Decorate().visit(ast.parse(data, path))
+        return compile(tree, path, "exec", dont_inherit=True, optimize=_optimize)
+
+    def exec_module(self, module: ModuleType) -> None:
+        vars(module)[DECORATOR] = checked
+        super().exec_module(module)
+
+    def get_data(self, path: str) -> bytes:
+        return super().get_data(compiled(path))
+
+    def set_data(self, path: str, data: Any, **settings: Any) -> None:
+        super().set_data(compiled(path), data, **settings)
+
+
+def compiled(path: str) -> str:
+    """Path of a compiled module; that of the source stays."""
+    return f"{path.removesuffix('.pyc')}.checked-{VERSION}.pyc" if path.endswith(".pyc") else path
+
+
+class Finder(MetaPathFinder):
+    """Finds the modules of one package."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname.partition(".")[0] != self.package:
+            return None
+        spec = PathFinder.find_spec(fullname, path, target)
+        if spec is not None and isinstance(spec.loader, SourceFileLoader):
+            spec.loader = Loader(spec.loader.name, spec.loader.path)
+        return spec
