@@ -24,11 +24,15 @@ pytestmark = pytest.mark.usefixtures("no_turntable")
 
 
 def untextured_capture(T_cam_obj: SE3, half_height: float | None) -> Capture:
-    """A grey sphere, or a can of that half height along the object's y axis, lit from above; without texture."""
+    """A grey sphere, or a can of that half height along the object's y axis, lit from above; without texture.
+
+    All frames of the sphere are the same, and only the first one is drawn.
+    """
     camera = Camera.from_fov(math.radians(30), SIZE, SIZE)
     directions = torch.nn.functional.normalize(camera.directions().double(), dim=-1).flatten(0, 1)
     images, masks = [], []
-    for k in range(len(T_cam_obj.xyz)):
+    n = len(T_cam_obj.xyz)
+    for k in range(1 if half_height is None else n):
         T_obj_cam = T_cam_obj[k].inverse()
         o, d = T_obj_cam.xyz, T_obj_cam.rotation @ directions
         depth = torch.linspace(DISTANCE - 1, DISTANCE + 1, 400, dtype=torch.float64)
@@ -49,8 +53,9 @@ def untextured_capture(T_cam_obj: SE3, half_height: float | None) -> Capture:
         code = torch.where(hit, 60 + 150 * up.clamp_min(0), 0.0).reshape(SIZE, SIZE)
         images.append(code.round().to(torch.uint8)[..., None].expand(-1, -1, 3))
         masks.append(torch.where(hit, OBJECT, BACKGROUND).to(torch.uint8).reshape(SIZE, SIZE))
-    names = tuple(f"{k}.png" for k in range(len(images)))
-    return Capture(torch.stack(images), torch.stack(masks), camera, names, "camera")
+    names = tuple(f"{k}.png" for k in range(n))
+    same = n // len(images)
+    return Capture(torch.stack(images * same), torch.stack(masks * same), camera, names, "camera")
 
 
 def rotating(n: int, rock: float) -> SE3:
@@ -108,20 +113,21 @@ def test_another_object_in_half_of_the_frames_is_bad(scene: Tumble) -> None:
     assert quality.rating == "bad"
 
 
-def test_single_wrong_masks_do_not_affect_other_frames(scene: Tumble) -> None:
-    """Two silhouettes of 24 are cut in half, together with their matches."""
+def test_single_wrong_masks_do_not_affect_other_frames() -> None:
+    """Two silhouettes of 16 are cut in half, together with their matches."""
+    scene = tumbling(16, points=200)
     masks = scene.capture.masks.clone()
-    for k in (5, 15):
+    for k in (4, 10):
         masks[k, :, 64:] = BACKGROUND
     kept = []
     for m in matches(scene):
         here = torch.ones(len(m), dtype=torch.bool)
         for k, uv in ((m.i, m.uv_i), (m.j, m.uv_j)):
-            if k in (5, 15):
+            if k in (4, 10):
                 here &= uv[:, 0] < 62
         kept.append(m.select(here))
     found = drive(stage, QUICK, stage.gather(replace(scene.capture, masks=masks), kept), seed=0)
-    others = [k for k in range(24) if k not in (5, 15)]
+    others = [k for k in range(16) if k not in (4, 10)]
     scores = metrics.rotation_scores(found.trajectory.select(others), truth(scene).select(others))
     assert scores["rotation_median_degrees"] < 2
     assert scores["rotation_below_10_percent"] > 99
