@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -252,21 +253,28 @@ def test_a_ray_through_hundreds_of_faint_gaussians_is_exact(backend: backends.Ba
     assert z[hits.hit.item()] == z.max()
 
 
+@cache
+def _true_visibility(name: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Visibility bits and blockers by brute force, with which every backend is compared."""
+    bvh = reference.build(*(x.float().double() for x in _gaussians(name)))
+    rays = [x.double() for x in (*_rays(100), cases.fibonacci(75).float())]
+    bits = reference.visible(bvh, *rays)
+    return bits, reference.blockers(bvh, *rays, bits)
+
+
 @pytest.mark.parametrize("name", ["shell", "hard"])
 def test_visibility_bits_and_blockers_are_those_of_brute_force(backend: backends.Backend, name: str) -> None:
-    cloud = _gaussians(name)
-    points, normals = _rays(150)
+    points, normals = _rays(100)
     directions = cases.fibonacci(75).float()
-    tree, bvh = backend.build(*(x.float() for x in cloud)), reference.build(*(x.float().double() for x in cloud))
+    tree = backend.build(*(x.float() for x in _gaussians(name)))
     bits = backend.visible(tree, points, normals, directions)
-    truth = reference.visible(bvh, points.double(), normals.double(), directions.double())
+    truth, true_blockers = _true_visibility(name)
     visible, truly_visible = _brute.unpack(bits, 75), _brute.unpack(truth, 75)
     # A transmittance may lie within rounding of one half.
     assert (visible != truly_visible).float().mean() < 1e-3
     assert not visible[normals @ directions.T <= 0].any()
     assert 0.1 < truly_visible.double().mean() < 0.49
     blockers = backend.blockers(tree, points, normals, directions, truth)
-    true_blockers = reference.blockers(bvh, points.double(), normals.double(), directions.double(), truth)
     assert (blockers != true_blockers).float().mean() < 1e-3
     assert torch.equal(true_blockers >= 0, (normals @ directions.T > 0) & ~truly_visible)
 
