@@ -21,10 +21,14 @@ $(STAMP): pyproject.toml
 demo: install
 	$(BIN)/tumble demo -o runs/demo
 
+# Types are checked on one core while the tests run, and what they say is printed at the end.
 test: install
 	$(BIN)/ruff check .
-	$(BIN)/basedpyright
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	@said=$$(mktemp) || exit 1; $(BIN)/basedpyright >"$$said" 2>&1 & types=$$!; \
+	echo "$(BIN)/basedpyright & $(BIN)/python -m pytest -n 2 --dist worksteal"; \
+	$(BIN)/python -m pytest -n 2 --dist worksteal; tested=$$?; \
+	wait $$types; typed=$$?; echo "basedpyright:"; cat "$$said"; rm -f "$$said"; \
+	exit $$((tested | typed))
 
 test-slow: install
 	$(BIN)/python -m pytest -m slow
