@@ -325,8 +325,9 @@ def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch:
         return dataclasses.replace(tracked, quality=quality), key
 
     monkeypatch.setattr(runs, "stage", loses_one)
+    quick = dataclasses.replace(RECIPE, track=QUICK)
     with pytest.raises(BadFile, match="could not be tracked: 1 of 8 frames"):
-        pipeline.reconstruct(capture, tmp_path / "lost", RECIPE, poses="estimate")
+        pipeline.reconstruct(capture, tmp_path / "lost", quick, poses="estimate")
     with pytest.raises(BadFile, match="finish the run first"):
         actions.evaluate_run(tmp_path / "nowhere", capture)
 
