@@ -28,6 +28,11 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_runtest_setup() -> None:
+    """The calls of every test are checked, not those of the first alone."""
+    typechecker.calls.clear()
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of real meshes, light maps and clips that lies beside the repository on some machines."""
