@@ -230,10 +230,10 @@ def test_sigterm_saves_a_checkpoint_and_ends_the_stage_like_ctrl_c(tmp_path: Pat
     assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path, every=100)) == uninterrupted()
 
 
-def test_every_stage_is_a_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_has_a_line_for_the_start_of_a_stage_and_one_for_its_steps(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "tumble")
     drive(THIS, Config(), Inputs(), seed=3, name="refine")
-    assert caplog.messages == ["refine (30 steps)"]
+    assert caplog.messages == ["refine: start", "refine (30 steps)"]
 
 
 def test_without_a_checkpoint_the_message_of_ctrl_c_is_that_nothing_was_saved() -> None:

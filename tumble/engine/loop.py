@@ -158,9 +158,11 @@ def drive(
     started = time.perf_counter()
     key = fingerprint(key, stage.VERSION, cfg, seed)
     total = stage.length(cfg, inputs)
-    with progress.task(name or "training", total) as update:
+    # Apart from the steps, since what has no known end shows that it goes on: some stages try out several starts.
+    with progress.task(f"{name or 'training'}: start"):
         state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
         seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
+    with progress.task(name or "training", total) as update:
 
         def save() -> None:
             _check(state, checkpoint)
