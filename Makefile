@@ -6,7 +6,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: install demo test test-slow test-gpu gpu check fmt bench docs clean
+.PHONY: install demo test types pytest test-slow test-gpu gpu check fmt bench docs clean
 
 install: $(STAMP)
 
@@ -21,14 +21,15 @@ $(STAMP): pyproject.toml
 demo: install
 	$(BIN)/tumble demo -o runs/demo
 
-# Types are checked on one core while the tests run, and what they say is printed at the end.
 test: install
 	$(BIN)/ruff check .
-	@said=$$(mktemp) || exit 1; $(BIN)/basedpyright >"$$said" 2>&1 & types=$$!; \
-	echo "$(BIN)/basedpyright & $(BIN)/python -m pytest -n 2 --dist worksteal"; \
-	$(BIN)/python -m pytest -n 2 --dist worksteal; tested=$$?; \
-	wait $$types; typed=$$?; echo "basedpyright:"; cat "$$said"; rm -f "$$said"; \
-	exit $$((tested | typed))
+	@$(MAKE) --no-print-directory -j 2 types pytest
+
+types:
+	$(BIN)/basedpyright
+
+pytest:
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-slow: install
 	$(BIN)/python -m pytest -m slow
