@@ -48,6 +48,14 @@ def test_a_name_that_only_type_checkers_import_stands_for_anything() -> None:
         typechecker.checked(told)(1, "2")
 
 
+def test_the_first_calls_in_a_test_are_checked_and_no_more() -> None:
+    wrong = typechecker.checked(widened)
+    for _ in range(typechecker.MAX_CALLS):
+        with pytest.raises(BeartypeCallHintReturnViolation):
+            wrong(torch.zeros(2, 3))
+    assert wrong(torch.zeros(2, 3)).shape == (2, 6)
+
+
 def widened(x: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     return torch.cat([x, x], 1)
 

@@ -1,7 +1,8 @@
-"""Beartype checks every call of a function of the package while the tests run, and jaxtyping what it says of shapes.
+"""Beartype checks calls of the package's functions while the tests run, and jaxtyping what it says of shapes.
 
 `install` is jaxtyping's import hook in short. That one checks arguments twice, once more together with the result, and
-binds them by name on every call, which took a quarter of the time of the tests; here beartype checks a call once.
+binds them by name, on every call: 52 of 126 s of processor time in the tests of stages 1 and 3. Here beartype checks a
+call once, and the first `MAX_CALLS` of a function in every test: 19 s.
 """
 
 import ast
@@ -29,8 +30,6 @@ VERSION = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
 
 typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """An int is allowed where a float is asked for (PEP 484)."""
-
-
 calls: Counter[Callable[..., Any]] = Counter()
 """Number of checked calls of every function; cleared before every test."""
 
