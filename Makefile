@@ -25,10 +25,10 @@ test: install
 	$(BIN)/ruff check .
 	@$(MAKE) --no-print-directory -j 2 types pytest
 
-types:
+types: install
 	$(BIN)/basedpyright
 
-pytest:
+pytest: install
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-slow: install

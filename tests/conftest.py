@@ -29,7 +29,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_runtest_setup() -> None:
-    """The calls of every test are checked, not those of the first alone."""
+    """The first calls of a function in every test are checked, not those of the first test alone."""
     typechecker.calls.clear()
 
 

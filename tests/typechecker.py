@@ -8,15 +8,13 @@ call once, and the first `MAX_CALLS` of a function in every test: 19 s.
 import ast
 import dataclasses
 import functools
-import hashlib
 import inspect
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 from beartype import BeartypeConf, beartype
@@ -25,8 +23,6 @@ from jaxtyping import jaxtyped
 DECORATOR = "__checked__"
 MAX_CALLS = 20
 """Number of calls of a function that are checked in one test; those of a loop are alike."""
-VERSION = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
-"""Compiled modules of another version of this file are not used."""
 
 typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """An int is allowed where a float is asked for (PEP 484)."""
@@ -103,26 +99,19 @@ def unchecked(node: ast.FunctionDef | ast.ClassDef) -> bool:
 
 
 class Loader(SourceFileLoader):
-    """Loads a module whose functions are checked, and keeps the compiled code beside that of the plain module."""
+    """Loads a module whose functions are checked; never its compiled code, in which they are not."""
 
-    def source_to_code(self, data: Any, path: Any, *, _optimize: int = -1) -> Any:
+    def get_code(self, fullname: str) -> CodeType:
+        path = self.get_filename(fullname)
+        return self.source_to_code(self.get_data(path), path)
+
+    def source_to_code(self, data: Any, path: Any, *, _optimize: int = -1) -> CodeType:
         tree = Decorate().visit(ast.parse(data, path))
         return compile(tree, path, "exec", dont_inherit=True, optimize=_optimize)
 
     def exec_module(self, module: ModuleType) -> None:
         vars(module)[DECORATOR] = checked
         super().exec_module(module)
-
-    def get_data(self, path: str) -> bytes:
-        return super().get_data(compiled(path))
-
-    def set_data(self, path: str, data: Any, **settings: Any) -> None:
-        super().set_data(compiled(path), data, **settings)
-
-
-def compiled(path: str) -> str:
-    """Path of a compiled module; that of the source stays."""
-    return f"{path.removesuffix('.pyc')}.checked-{VERSION}.pyc" if path.endswith(".pyc") else path
 
 
 class Finder(MetaPathFinder):

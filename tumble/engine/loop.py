@@ -158,7 +158,7 @@ def drive(
     started = time.perf_counter()
     key = fingerprint(key, stage.VERSION, cfg, seed)
     total = stage.length(cfg, inputs)
-    # Apart from the steps, since what has no known end shows that it goes on: some stages try out several starts.
+    # A task of its own, which shows that it goes on without a number of steps: stage 3 tries out several starts here.
     with progress.task(f"{name or 'training'}: start"):
         state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
         seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
