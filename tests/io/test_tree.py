@@ -103,6 +103,13 @@ def test_plain_values_of_another_type_are_rejected(tmp_path: Path) -> None:
         tree.load(Asset, tmp_path / "asset")
 
 
+def test_a_single_value_with_a_stride_of_zero_is_written(tmp_path: Path) -> None:
+    single = torch.tensor(2.5).expand(1)
+    assert single.stride() == (0,)
+    write_tensors(tmp_path / "one", {"x": single}, {})
+    assert torch.equal(read_tensors(tmp_path / "one", "fix")[0]["x"], single)
+
+
 def test_map_changes_every_tensor_and_no_plain_value() -> None:
     doubled = tree.map(lambda x: 2 * x, make_asset())
     assert torch.equal(doubled.gaussians.means, 2 * make_asset().gaussians.means)

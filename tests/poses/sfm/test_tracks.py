@@ -141,7 +141,9 @@ def test_matches_join_tracks_where_they_agree_with_the_poses() -> None:
         Match(1, 3, uv[1], uv[3].roll(1, 0), torch.ones(20)),
     ]
     keypoints = tracks.gather_keypoints(matches, found, camera, 5)
-    right = keypoints.consistent((0, 4), (R[0], t[0]), (R[4], t[4]), 1.0)
+    index, places, right = keypoints.consistent((0, 2, 4), R[[0, 2, 4]], t[[0, 2, 4]], 1.0)
+    assert index.tolist() == [*range(20)]
+    assert places.tolist() == [[0, 2]] * 20
     assert right.tolist() == [False] * 2 + [True] * 18
     frames = (0, 1, 3, 4)
     joined, keypoint = keypoints.tracks(frames, R[list(frames)], t[list(frames)], 1.0)

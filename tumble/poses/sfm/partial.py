@@ -141,15 +141,8 @@ def consistent_matches(
     observed: Observed, part: Partial, tolerance: float
 ) -> tuple[Int64[np.ndarray, " f"], Int64[np.ndarray, " f"]]:
     """Per frame, the matches with other frames of the part that agree with the epipolar lines, and all matches."""
-    place = {frame: k for k, frame in enumerate(part.frames)}
-    agreeing, of = np.zeros(len(part), np.int64), np.zeros(len(part), np.int64)
-    for i, j in observed.keypoints.pairs:
-        if i in place and j in place:
-            a, b = place[i], place[j]
-            poses = (part.R[a], part.t[a]), (part.R[b], part.t[b])
-            consistent = observed.keypoints.consistent((i, j), *poses, tolerance)
-            agreeing[[a, b]] += consistent.sum()
-            of[[a, b]] += len(consistent)
+    _, places, right = observed.keypoints.consistent(part.frames, part.R, part.t, tolerance)
+    agreeing, of = (np.bincount(each.ravel(), minlength=len(part)) for each in (places[right], places))
     return agreeing, of
 
 

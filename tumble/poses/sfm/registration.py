@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import bundle_adjustment
@@ -160,9 +160,15 @@ def _errors(
     observed: Observed, solution: Solution, uv: Float[np.ndarray, "c 2"], X: Float[np.ndarray, "c 3"]
 ) -> Float[np.ndarray, " c"]:
     """Reprojection errors [pixels]."""
-    x = X @ solution[0].T + solution[1]
-    x[:, 2] = x[:, 2].clip(bundle_adjustment.MIN_DEPTH)
-    return np.linalg.norm(observed.keypoints.camera.project(torch.from_numpy(x)).numpy() - uv, axis=1)
+    return _distances(observed, X @ solution[0].T + solution[1], uv)
+
+
+def _distances(
+    observed: Observed, x: Float[np.ndarray, "c 3"], uv: Float[np.ndarray, "c 2"]
+) -> Float[np.ndarray, " c"]:
+    """Distances between the projections of points in the camera frame and positions [pixels]."""
+    in_front = np.column_stack([x[:, :2], x[:, 2].clip(bundle_adjustment.MIN_DEPTH)])
+    return np.linalg.norm(observed.keypoints.camera.project(torch.from_numpy(in_front)).numpy() - uv, axis=1)
 
 
 def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | None:
@@ -172,10 +178,11 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
     many agreeing keypoints the contours decide.
     """
     X = surface_points(observed, other, TOLERANCE)
-    seen = {frame: observed.keypoints.correspondences(frame, other.frames, X) for frame in part.frames}
+    seen = [observed.keypoints.correspondences(frame, other.frames, X) for frame in part.frames]
+    keypoints, all_points = (np.concatenate(each) for each in zip(*seen, strict=True))
     rated = []
     for place, frame in enumerate(part.frames):
-        keypoint, points = seen[frame]
+        keypoint, points = seen[place]
         found = [solution for solution, _ in solutions(observed, observed.keypoints.uv[keypoint], points)]
         if frame in other.frames:
             k = other.frames.index(frame)
@@ -186,8 +193,8 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
                 R_new_obj = R.T @ part.R[place].numpy()
                 shift = torch.from_numpy(R.T @ (scale * part.t[place].numpy() - t))
                 moved = part.moved(torch.from_numpy(R_new_obj), scale, shift)
-                counts = [_agreeing(observed, moved, k, seen[each]) for k, each in enumerate(part.frames)]
-                rated.append((sum(counts), sum(n >= MIN_CORRESPONDENCES for n in counts), moved))
+                counts = _agreeing(observed, moved, keypoints, all_points, JOINT_ERROR)
+                rated.append((int(counts.sum()), int((counts >= MIN_CORRESPONDENCES).sum()), moved))
     rated.sort(key=lambda each: -each[0])
     joints = [
         Joint(moved, count, frames, *contour_cost(observed, other, moved))
@@ -198,12 +205,25 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
 
 
 def _agreeing(
-    observed: Observed, part: Partial, place: int, seen: tuple[np.ndarray, np.ndarray], error: float = JOINT_ERROR
-) -> int:
-    """Number of keypoints of a frame that agree with a surface point."""
-    keypoint, X = seen
-    pose = part.R[place].numpy(), part.t[place].numpy()
-    return len(np.unique(keypoint[_errors(observed, pose, observed.keypoints.uv[keypoint], X) < error]))
+    observed: Observed,
+    part: Partial,
+    keypoint: Int64[np.ndarray, " c"],
+    X: Float[np.ndarray, "c 3"],
+    error: float = TOLERANCE,
+) -> Int64[np.ndarray, " f"]:
+    """Number of keypoints of each frame of a part that agree with a surface point.
+
+    Args:
+        keypoint: Keypoints of the part's frames; one may have several surface points.
+        X: Their surface points, object frame.
+        error: Reprojection error up to which they agree [pixels].
+    """
+    place = np.searchsorted(part.frames, observed.keypoints.frame[keypoint])
+    x = np.einsum("cij,cj->ci", part.R.numpy()[place], X) + part.t.numpy()[place]
+    agrees = _distances(observed, x, observed.keypoints.uv[keypoint]) < error
+    once = np.zeros(len(observed.keypoints.frame), bool)
+    once[keypoint[agrees]] = True
+    return np.bincount(np.searchsorted(part.frames, observed.keypoints.frame[once]), minlength=len(part))
 
 
 def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> list[Partial]:
@@ -262,7 +282,7 @@ def _registered(observed: Observed, part: Partial, frame: int, X: Float[np.ndarr
     confirmed = []
     for (R, t), _ in solutions(observed, observed.keypoints.uv[keypoint], seen[1]):
         one = Partial((frame,), torch.from_numpy(R)[None], torch.from_numpy(t)[None])
-        count = _agreeing(observed, one, 0, seen, TOLERANCE)
+        count = int(_agreeing(observed, one, *seen)[0])
         cost, gaps = contour_cost(observed, part, one)
         cost = cost if gaps >= MIN_FRAME_GAPS else 0.0
         step = float(angle_between(SO3.from_matrix(one.R[0]), SO3.from_matrix(part.R[near]))) / distance

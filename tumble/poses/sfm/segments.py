@@ -63,7 +63,7 @@ or where a hand hides nearly all, the frames on either side agree among themselv
 MIN_AGREEMENT = 0.5
 """Fraction of the object's matches in a segment that agree with a frame's pose, below which it is left out."""
 MIN_NEW_FRAMES = 3
-"""Number of frames that are in no better segment below which a segment is not used."""
+"""Number of frames that are in no better or larger segment below which a segment is not used."""
 MAX_GROWN = 3
 """Number of segments, the largest first, to which single frames are added."""
 NEAR = 6
@@ -127,7 +127,7 @@ def _understood(
     known: Hypotheses = {}
     found = [part for each in (sure, _observed(cfg, inputs, tracks, on_it)) for part in _segments(each, R, rng)]
     parts = join(sure, _supported(sure, found), known)
-    parts = join(sure, [grow(sure, part) for part in parts[:MAX_GROWN]] + parts[MAX_GROWN:], known)
+    parts = join(sure, _grown(sure, parts), known)
     if not parts:
         return None, inputs.tracks
     tracks = thinned(joined_tracks(sure, parts[0], TOLERANCE)[0])
@@ -171,6 +171,16 @@ def _supported(sure: Observed, parts: Sequence[Partial]) -> list[Partial]:
             kept.append(part)
             covered |= set(part.frames)
     return kept
+
+
+def _grown(sure: Observed, parts: Sequence[Partial]) -> list[Partial]:
+    """Parts, the largest first, with single frames added; without those that then add too few frames to the others."""
+    grown, covered = [], set()
+    for part in parts:
+        if len(set(part.frames) - covered) >= MIN_NEW_FRAMES:
+            grown.append(grow(sure, part) if len(grown) < MAX_GROWN else part)
+            covered |= set(grown[-1].frames)
+    return grown
 
 
 def _segments(observed: Observed, R: Float[Tensor, "t 3 3"], rng: torch.Generator) -> list[Partial]:

@@ -10,6 +10,7 @@ them, but a few wrong ones would join tracks of different points. Which matches 
 both frames are known, by their distance from the epipolar line: `Keypoints` joins tracks for given poses.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -185,26 +186,47 @@ class Keypoints:
     frame: Int64[np.ndarray, " k"]
     uv: Float[np.ndarray, "k 2"]
     """Position [pixels]."""
-    pairs: dict[tuple[int, int], Int64[np.ndarray, "m 2"]] = field(repr=False)
-    """Keypoints that were matched, for every pair of frames i < j."""
+    matched: Int64[np.ndarray, "m 2"] = field(repr=False)
+    """Keypoints of every match, the one in the earlier frame first."""
     observations: Int64[np.ndarray, "o 2"] = field(repr=False)
     """Keypoint and track of every observation of a feature track, in ascending order of tracks."""
     camera: Camera
     n_frames: int
 
-    def consistent(
-        self, pair: tuple[int, int], pose_i: tuple[Tensor, Tensor], pose_j: tuple[Tensor, Tensor], tolerance: float
-    ) -> Bool[np.ndarray, " m"]:
-        """Which matches of a pair lie within `tolerance` [pixels] of the epipolar lines of its poses."""
-        matched = self.pairs[pair]
-        (R_i, t_i), (R_j, t_j) = ((R.numpy(), t.numpy()) for R, t in (pose_i, pose_j))
-        R = R_j @ R_i.T
-        x, y, z = t_j - R @ t_i
+    @functools.cached_property
+    def _matched_frames(self) -> Int64[np.ndarray, "m 2"]:
+        """Frames of the keypoints of every match."""
+        return self.frame[self.matched]
+
+    @functools.cached_property
+    def _rays(self) -> Float[np.ndarray, "k 3"]:
+        """Direction of every keypoint, camera frame; z is 1."""
         focal, principal = self.camera.fx_fy_cx_cy.double().numpy().reshape(2, 2)
-        rays = np.pad((self.uv[matched] - principal) / focal, ((0, 0), (0, 0), (0, 1)), constant_values=1.0)
-        line = rays[:, 0] @ (np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R).T
-        distance = np.abs((line * rays[:, 1]).sum(1)) / np.linalg.norm(line[:, :2] / focal, axis=1).clip(1e-12)
-        return distance < tolerance
+        return np.pad((self.uv - principal) / focal, ((0, 0), (0, 1)), constant_values=1.0)
+
+    def consistent(
+        self, frames: Sequence[int], R: Float[Tensor, "f 3 3"], t: Float[Tensor, "f 3"], tolerance: float
+    ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, "c 2"], Bool[np.ndarray, " c"]]:
+        """Matches between some frames: their indices, the places of both frames in `frames`, and which are consistent.
+
+        Args:
+            frames: Frames with a pose.
+            R: `R_cam_obj` of these frames.
+            t: Object origin in their camera frames.
+            tolerance: Distance from the epipolar line up to which a match is consistent [pixels].
+        """
+        place = _places(frames, self.n_frames)
+        places = place[self._matched_frames]
+        index = np.flatnonzero((places >= 0).all(1))
+        places = places[index]
+        (i, j), (a, b) = self.matched[index].T, places.T
+        rotation, centre = R.numpy(), -torch.einsum("fij,fi->fj", R, t).numpy()
+        direction = np.einsum("cij,ci->cj", rotation[a], self._rays[i])
+        # Normal of the epipolar plane, which is the epipolar line in the frame of the second camera.
+        line = np.einsum("cij,cj->ci", rotation[b], np.cross(centre[a] - centre[b], direction))
+        focal = self.camera.fx_fy_cx_cy[:2].double().numpy()
+        distance = np.abs((line * self._rays[j]).sum(1)) / np.linalg.norm(line[:, :2] / focal, axis=1).clip(1e-12)
+        return index, places, distance < tolerance
 
     def tracks(
         self, frames: Sequence[int], R: Float[Tensor, "f 3 3"], t: Float[Tensor, "f 3"], tolerance: float
@@ -220,17 +242,13 @@ class Keypoints:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        place = {frame: k for k, frame in enumerate(frames)}
-        n = len(self.frame)
+        place, n = _places(frames, self.n_frames), len(self.frame)
         # Tracks are nodes of the graph too, so that they go on beyond frames that have no pose.
-        edges = [self.observations[np.isin(self.frame[self.observations[:, 0]], frames)] + (0, n)]
-        for (i, j), matched in self.pairs.items():
-            if i in place and j in place:
-                a, b = place[i], place[j]
-                right = self.consistent((i, j), (R[a], t[a]), (R[b], t[b]), tolerance)
-                if right.sum() >= MIN_CONSISTENT:
-                    edges.append(matched[right])
-        edge = np.concatenate(edges)
+        seen = self.observations[place[self.frame[self.observations[:, 0]]] >= 0] + (0, n)
+        index, places, right = self.consistent(frames, R, t, tolerance)
+        pair = places[:, 0] * len(frames) + places[:, 1]
+        right &= np.bincount(pair[right], minlength=len(frames) ** 2)[pair] >= MIN_CONSISTENT
+        edge = np.concatenate([seen, self.matched[index[right]]])
         nodes = n + int(self.observations[:, 1].max(initial=-1)) + 1
         graph = coo_array((np.ones(len(edge), np.int8), (edge[:, 0], edge[:, 1])), shape=(nodes, nodes))
         point: np.ndarray = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -240,7 +258,7 @@ class Keypoints:
         used = used[first]
         used = used[np.bincount(point[used], minlength=1)[point[used]] > 1]
         number = np.unique(point[used], return_inverse=True)[1]
-        frame = np.array([place[k] for k in self.frame[used].tolist()], dtype=np.int64)
+        frame = place[self.frame[used]]
         return Tracks(torch.from_numpy(frame), torch.from_numpy(number), torch.from_numpy(self.uv[used])), used
 
     def correspondences(
@@ -253,14 +271,11 @@ class Keypoints:
             frames: Frames with a pose.
             X: Surface point of every keypoint, object frame; NaN where none is known.
         """
-        keypoint, source = [], []
-        for other in frames:
-            pair = (min(frame, other), max(frame, other))
-            if other != frame and pair in self.pairs:
-                matched = self.pairs[pair]
-                own = int(frame > other)
-                keypoint.append(matched[:, own])
-                source.append(matched[:, 1 - own])
+        place, ends = _places(frames, self.n_frames), self._matched_frames
+        # Every match from its first end and from its second one.
+        found = [(ends[:, own] == frame) & (place[ends[:, 1 - own]] >= 0) for own in (0, 1)]
+        keypoint = [self.matched[found[own], own] for own in (0, 1)]
+        source = [self.matched[found[own], 1 - own] for own in (0, 1)]
         at, track = self.observations.T
         here = self.frame[at] == frame
         own_keypoint = np.full(int(track.max(initial=-1)) + 1, -1)
@@ -270,9 +285,16 @@ class Keypoints:
         _, first = np.unique(track[known], return_index=True)
         keypoint.append(own_keypoint[track[known][first]])
         source.append(at[known][first])
-        keypoint, points = np.concatenate(keypoint), X[np.concatenate(source)]
-        found = ~np.isnan(points[:, 0])
-        return keypoint[found], points[found]
+        points = X[np.concatenate(source)]
+        known = ~np.isnan(points[:, 0])
+        return np.concatenate(keypoint)[known], points[known]
+
+
+def _places(frames: Sequence[int], n: int) -> Int64[np.ndarray, " n"]:
+    """Place of each of `n` frames in `frames`; -1 where it has none."""
+    place = np.full(n, -1)
+    place[list(frames)] = np.arange(len(frames))
+    return place
 
 
 def gather_keypoints(matches: Sequence[Match], tracks: Tracks, camera: Camera, n_frames: int) -> Keypoints:
@@ -290,10 +312,10 @@ def gather_keypoints(matches: Sequence[Match], tracks: Tracks, camera: Camera, n
     key = np.column_stack([frame, np.round(uv / KEYPOINT_RESOLUTION).astype(np.int64)])
     _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
     number = number.reshape(-1)
-    pairs, start = {}, 0
+    start, matched = 0, [np.zeros((0, 2), np.int64)]
     for m in matches:
-        pairs[m.i, m.j] = np.column_stack([number[start : start + len(m)], number[start + len(m) :][: len(m)]])
+        matched.append(number[start : start + 2 * len(m)].reshape(2, -1).T)
         start += 2 * len(m)
     observations = np.column_stack([number[start:], tracks.point.numpy()])
     observations = observations[np.argsort(observations[:, 1], kind="stable")]
-    return Keypoints(frame[first], uv[first], pairs, observations, camera, n_frames)
+    return Keypoints(frame[first], uv[first], np.concatenate(matched), observations, camera, n_frames)
