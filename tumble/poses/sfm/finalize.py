@@ -298,18 +298,18 @@ def _reject_by_overlap(
 ) -> tuple[Bool[Tensor, " t"], Float[Tensor, " t"]]:
     """Lost frames, extended by those whose silhouette contradicts the visual hull of the others; also all overlaps.
 
-    Several wrong frames distort the visual hull of all, which is therefore carved again without the rejected frames.
+    Several wrong frames distort the visual hull of all, which is therefore carved again without the rejected frames, for
+    as long as it contradicts others.
     """
-    for _ in range(3):
+    while True:
         overlaps = [_hull_overlap(capture, trajectory, lost, tolerance) for tolerance in HULL_TOLERANCES]
         overlap = max(overlaps, key=lambda each: float(each[~lost].sum()))
         if bool(lost.all()):
-            break
-        contradicted = overlap < overlap[~lost].median() - MAX_OVERLAP_DEFICIT
-        if not bool((contradicted & ~lost).any()):
-            break
+            return lost, overlap
+        contradicted = (overlap < overlap[~lost].median() - MAX_OVERLAP_DEFICIT) & ~lost
+        if not bool(contradicted.any()):
+            return lost, overlap
         lost = lost | contradicted
-    return lost, overlap
 
 
 def _hull_overlap(
