@@ -78,6 +78,20 @@ def test_frames_without_observations_are_lost_and_interpolated(result: PoseResul
     assert result.quality.residual[12].isnan()
 
 
+def test_a_long_run_of_wrong_frames_is_rejected_from_its_middle_to_its_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the frames are turned away, smoothly to 103 degrees and back; they carve the hull of all at first."""
+    monkeypatch.setattr(finalize, "HULL_RESOLUTION", 24)  # for speed
+    scene, n = tumbling(48), 48
+    angle = torch.zeros(n, dtype=torch.float64)
+    angle[12:36] = 1.8 * torch.sin(torch.linspace(0, math.pi, 26, dtype=torch.float64)[1:-1])
+    turn = SO3.exp(angle[:, None] * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64))
+    T_cam_obj = SE3.from_rotation(turn @ scene.T_cam_obj.rotation, scene.T_cam_obj.xyz)
+    trajectory = finalize._trajectory(T_cam_obj, scene.capture)
+    lost, _ = finalize._reject_by_overlap(scene.capture, trajectory, torch.zeros(n, dtype=torch.bool))
+    assert bool(lost[angle > math.radians(30)].all())
+    assert not bool(lost[angle == 0].any())
+
+
 def test_up_is_up_in_the_first_frame_that_is_not_lost(result: PoseResult) -> None:
     """Its camera is at +z, with +y up in the image; points move with the frame."""
     opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0]))

@@ -298,8 +298,8 @@ def _reject_by_overlap(
 ) -> tuple[Bool[Tensor, " t"], Float[Tensor, " t"]]:
     """Lost frames, extended by those whose silhouette contradicts the visual hull of the others; also all overlaps.
 
-    Several wrong frames distort the visual hull of all, which is therefore carved again without the rejected frames, for
-    as long as it contradicts others.
+    Several wrong frames distort the visual hull of all, which is therefore carved again without rejected frames, for as
+    long as it contradicts others.
     """
     while True:
         overlaps = [_hull_overlap(capture, trajectory, lost, tolerance) for tolerance in HULL_TOLERANCES]
