@@ -26,10 +26,12 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
     Raises:
         WriteError: See `files.write_atomically`.
     """
-    # Tensors may share storage (views of one parameter); safetensors requires each to own its bytes. A single value may
-    # be contiguous and have a stride of 0, with which its bytes cannot be viewed.
-    contiguous = torch.contiguous_format
-    owned = {name: value.detach().cpu().clone(memory_format=contiguous) for name, value in tensors.items()}
+    # Tensors may share storage (views of one parameter); safetensors requires each to own its bytes. The memory format
+    # also gives a single value, which is contiguous with any stride, the stride of 1 that a view of its bytes needs.
+    owned = {
+        name: value.detach().to("cpu", copy=True, memory_format=torch.contiguous_format)
+        for name, value in tensors.items()
+    }
     metadata = {**header, CHECKSUM: _checksum(owned, header)}
     files.write_atomically(path, lambda partial: safetensors.torch.save_file(owned, partial, metadata=metadata))
 

@@ -220,10 +220,8 @@ def _agreeing(
     """
     place = np.searchsorted(part.frames, observed.keypoints.frame[keypoint])
     x = np.einsum("cij,cj->ci", part.R.numpy()[place], X) + part.t.numpy()[place]
-    agrees = _distances(observed, x, observed.keypoints.uv[keypoint]) < error
-    once = np.zeros(len(observed.keypoints.frame), bool)
-    once[keypoint[agrees]] = True
-    return np.bincount(np.searchsorted(part.frames, observed.keypoints.frame[once]), minlength=len(part))
+    agreeing = np.unique(keypoint[_distances(observed, x, observed.keypoints.uv[keypoint]) < error])
+    return np.bincount(np.searchsorted(part.frames, observed.keypoints.frame[agreeing]), minlength=len(part))
 
 
 def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> list[Partial]:

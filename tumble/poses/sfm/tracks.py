@@ -215,8 +215,7 @@ class Keypoints:
             t: Object origin in their camera frames.
             tolerance: Distance from the epipolar line up to which a match is consistent [pixels].
         """
-        place = _places(frames, self.n_frames)
-        places = place[self._matched_frames]
+        places = _places(frames, self.n_frames)[self._matched_frames]
         index = np.flatnonzero((places >= 0).all(1))
         places = places[index]
         (i, j), (a, b) = self.matched[index].T, places.T
@@ -273,9 +272,9 @@ class Keypoints:
         """
         place, ends = _places(frames, self.n_frames), self._matched_frames
         # Every match from its first end and from its second one.
-        found = [(ends[:, own] == frame) & (place[ends[:, 1 - own]] >= 0) for own in (0, 1)]
-        keypoint = [self.matched[found[own], own] for own in (0, 1)]
-        source = [self.matched[found[own], 1 - own] for own in (0, 1)]
+        rows = [(ends[:, own] == frame) & (place[ends[:, 1 - own]] >= 0) for own in (0, 1)]
+        keypoint = [self.matched[rows[own], own] for own in (0, 1)]
+        source = [self.matched[rows[own], 1 - own] for own in (0, 1)]
         at, track = self.observations.T
         here = self.frame[at] == frame
         own_keypoint = np.full(int(track.max(initial=-1)) + 1, -1)
@@ -286,8 +285,8 @@ class Keypoints:
         keypoint.append(own_keypoint[track[known][first]])
         source.append(at[known][first])
         points = X[np.concatenate(source)]
-        known = ~np.isnan(points[:, 0])
-        return np.concatenate(keypoint)[known], points[known]
+        found = ~np.isnan(points[:, 0])
+        return np.concatenate(keypoint)[found], points[found]
 
 
 def _places(frames: Sequence[int], n: int) -> Int64[np.ndarray, " n"]:
