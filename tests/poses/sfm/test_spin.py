@@ -227,3 +227,14 @@ def test_nothing_contradicts_the_observations_of_a_frame_that_looks_along_the_ax
     assert bool((tracks.frame == 3).any())
     assert bool(steady[tracks.frame == 3].all())
     assert 0.5 < float(steady[tracks.frame != 3].float().mean()) < 1
+
+
+@pytest.mark.parametrize("thickness", [0.35, 0.5])
+def test_contours_show_the_spin_of_a_body_that_is_not_round(thickness: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All silhouettes of an ellipsoid are symmetric, also where its three axes differ; it has no texture here."""
+    monkeypatch.setitem(globals(), "RADII", torch.tensor([0.35, thickness, 0.8]))
+    capture, truth = film(painted=False)
+    inputs = consistent_inputs(capture, truth)
+    assert inputs.mirror_symmetry.is_revolution
+    observability = stage.assess(inputs, truth).quality.observability
+    assert observability.axis_unobservable == (thickness == 0.35)

@@ -14,8 +14,8 @@ from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
 from tumble.maths import SO3
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import schedule, stage
-from tumble.poses.sfm.adjustment import deviation
+from tumble.poses.sfm import stage
+from tumble.poses.sfm.adjustment import adjust_windows, averaged_windows, deviation, grow_windows
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
 
@@ -24,9 +24,10 @@ QUICK = stage.Config(
     window_sizes=(6,),
     window_scales=(3.0, 1.0, 0.5),
     global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
-    fallbacks=(),
+    growing=(),
     relocalizations=0,
     perturbations=0,
+    early_perturbations=0,
     max_corrections=0,
     texture_rounds=1,
 )
@@ -101,11 +102,10 @@ def test_a_frame_without_the_object_is_lost_and_the_others_are_not_affected(scen
 
 
 def test_a_capture_that_has_not_converged_is_attempted_again_and_the_best_result_is_kept(scene: Tumble) -> None:
-    """The second attempt has smaller windows, and starts from more rotations."""
+    """The second attempt starts from more rotations."""
     inputs = stage.gather(scene.capture, matches(scene))
-    fallbacks = (schedule.Fallback((4,), 1.0),)
     state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))
-    cfg = replace(QUICK, fallbacks=fallbacks, converged_loss=0.0)
+    cfg = replace(QUICK, growing=(4,), converged_loss=0.0)
     kept = []
     for state.step, now in enumerate(stage.schedule(cfg)):
         found = stage.step(cfg, inputs, state)
@@ -122,9 +122,25 @@ def test_a_capture_that_has_not_converged_is_attempted_again_and_the_best_result
     assert stage.step(cfg, inputs, state) == {}
 
 
+def test_a_motion_that_matches_hardly_show_is_found_by_windows_that_grow() -> None:
+    """Six matches of ten are wrong: from windows of a few frames alone the motion is found only roughly."""
+    scene = tumbling(28, points=100)
+    inputs = stage.gather(scene.capture, matches(scene, wrong=0.6))
+    true_R, cfg = truth(scene).T_cam_obj.rotation.matrix().double(), stage.Config()
+    still, rng = torch.eye(3, dtype=torch.float64).repeat(28, 1, 1), torch.Generator().manual_seed(0)
+    R = still
+    for size in cfg.window_sizes:
+        windows = adjust_windows(cfg, inputs, R, rng, size=size)
+        R = averaged_windows(windows.frames, windows.consistent, n_frames=28)
+    assert deviation(R, true_R).median() > math.radians(8)
+    grown = grow_windows(cfg, inputs, still, rng, size=6, directions=cfg.directions)
+    assert grown.frames.tolist() == [list(range(28))]
+    assert deviation(grown.best[0], true_R).median() < math.radians(3)
+
+
 def test_an_attempt_is_mended_before_it_is_compared_unless_it_has_converged(scene: Tumble) -> None:
     """A frame turned by 20 degrees costs more than the others and is relocalized; a good capture is left alone."""
-    cfg = replace(QUICK, fallbacks=(), relocalizations=1, relocalized_scales=(0.5,), converged_loss=0.0)
+    cfg = replace(QUICK, growing=(), relocalizations=1, relocalized_scales=(0.5,), converged_loss=0.0)
     steps = stage.schedule(cfg)
     mending = [k for k, now in enumerate(steps) if now.mends]
     assert [type(steps[k].phase) for k in mending] == [stage.Relocalize, stage.AdjustAll, stage.KeepBest]
@@ -183,7 +199,7 @@ def test_corrections_that_raise_the_loss_are_undone(scene: Tumble) -> None:
 
 def test_two_attempts_that_agree_are_enough(scene: Tumble) -> None:
     """A third attempt is skipped after two that found the same, and is not after two that differ by ten degrees."""
-    cfg = replace(QUICK, converged_loss=0.0, fallbacks=(schedule.Fallback((6,), 1.0),) * 2)
+    cfg = replace(QUICK, converged_loss=0.0, growing=(6, 6))
     steps = stage.schedule(cfg)
     keep = [k for k, step in enumerate(steps) if isinstance(step.phase, stage.KeepBest)]
     inputs = stage.gather(scene.capture, matches(scene))
@@ -211,7 +227,7 @@ def rotated(state: State, degrees: float) -> Tensor:
 def test_a_part_of_the_motion_that_is_joined_wrongly_is_found_by_perturbation(scene: Tumble) -> None:
     """All frames from the eleventh on are turned by 50 degrees, from which bundle adjustment alone does not return."""
     inputs = stage.gather(scene.capture, matches(scene))
-    cfg = replace(QUICK, converged_loss=0.0, perturbations=5, fallbacks=stage.Config().fallbacks[:1])
+    cfg = replace(QUICK, converged_loss=0.0, perturbations=5, growing=(6,))
     state = stage.init(cfg, inputs, torch.Generator().manual_seed(1))
     good = turned(scene, 3, 0.0)
     behind = torch.arange(20)[:, None, None] >= 10

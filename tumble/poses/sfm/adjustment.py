@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int64
@@ -14,6 +13,7 @@ from tumble.poses.sfm import bundle_adjustment, frontier_points
 from tumble.poses.sfm.bundle_adjustment import BundleState, Problem
 from tumble.poses.sfm.observations import Inputs, focal_length, silhouette_centres
 from tumble.poses.sfm.perturbation import mirrored
+from tumble.poses.sfm.schedule import BaseConfig
 from tumble.poses.sfm.tracks import Tracks, concatenate
 
 CONTRADICTION_COST = 3.0
@@ -21,6 +21,9 @@ CONTRADICTION_COST = 3.0
 As a motion does not reverse its depth from one frame to the next, it is more than what wrong windows gain in loss."""
 SMALL_DEVIATION = math.radians(15)
 """Mean angle up to which rotations of neighbouring windows differ by their noise alone [radians]."""
+DISTINCT = math.radians(5)
+"""Mean angle by which two motions of a window differ at least to be kept both: what motions of six frames are off at
+best where an object has little texture [radians]."""
 START_STEP = math.radians(8)
 """Rotation per frame of the constant rotations from which windows start: the middle of the 5 to 12
 degrees of hand-held captures [radians]."""
@@ -28,28 +31,6 @@ SCREENING_ROUNDS = 2
 """Rounds after which only the starts with the smallest losses are continued."""
 KEPT_STARTS = 4
 """Number of starts of a window that are continued."""
-
-
-@runtime_checkable
-class Settings(Protocol):
-    """Settings of bundle adjustment: those of `stage.Config`, where they are explained."""
-
-    @property
-    def frontier_weight(self) -> float: ...
-    @property
-    def iterations(self) -> int: ...
-    @property
-    def centre_sigma(self) -> float: ...
-    @property
-    def depth_sigma(self) -> float: ...
-    @property
-    def max_frontier_pairs(self) -> int: ...
-    @property
-    def max_window_tracks(self) -> int: ...
-    @property
-    def window_scales(self) -> tuple[float, ...]: ...
-    @property
-    def global_scales(self) -> tuple[float, ...]: ...
 
 
 @dataclass(frozen=True)
@@ -86,6 +67,37 @@ class Windows:
             chosen.append(int(index[chosen[-1]]))
         return self.R[torch.arange(len(self.R)), torch.tensor(chosen[::-1])]
 
+    def promising(self, k: int) -> Int64[Tensor, "g k"]:
+        """Starts with the smallest losses among those that differ from each other (`DISTINCT`), then any others."""
+        every, rank, chosen = torch.arange(len(self.R)), self.loss.clone(), []
+        for _ in range(min(k, self.R.shape[1])):
+            chosen.append(rank.argmin(1))
+            best = self.R[every, chosen[-1]].transpose(0, 1)[:, :, None]
+            R = self.R.movedim(2, 0)
+            similar = deviation(R, best.expand_as(R)).mean(0) < DISTINCT
+            rank = torch.where(similar, rank + self.loss.amax() + 1, rank)
+            rank[every, chosen[-1]] = torch.inf
+        return torch.stack(chosen, 1)
+
+    def joined(self, frames: Int64[Tensor, "h e"]) -> Float[Tensor, "h p e 3 3"]:
+        """Rotations in larger windows, from all pairs of starts of two windows that cover each of them."""
+        first, last = self.frames[:, 0], self.frames[:, -1]
+        a = (first <= frames[:, :1]).sum(1) - 1
+        b = (last < frames[:, -1:]).sum(1)
+        return torch.stack([self._joined(*ends) for ends in zip(a.tolist(), b.tolist(), frames, strict=True)])
+
+    def _joined(self, a: int, b: int, frames: Int64[Tensor, " e"]) -> Float[Tensor, "p e 3 3"]:
+        """All starts of window a continued by all of window b, which are turned to agree where both overlap."""
+        shift, starts = int(self.frames[b, 0] - self.frames[a, 0]), self.R.shape[1]
+        common = self.frames.shape[1] - shift
+        R_a = self.R[a].repeat_interleave(starts, 0)
+        R_b = self.R[b].repeat(starts, 1, 1, 1)
+        between = R_b[:, :common].mT @ R_a[:, shift:]
+        R_b = R_b @ mean_rotation(SO3.from_matrix(between.transpose(0, 1))).matrix()[:, None]
+        whole = torch.cat([R_a[:, : shift + common // 2], R_b[:, common // 2 :]], 1)
+        offset = int(frames[0] - self.frames[a, 0])
+        return whole[:, offset : offset + len(frames)]
+
     def _contradiction(self, a: int, b: int) -> Float[Tensor, "s s"]:
         """How much every start of one window contradicts every start of a later one, 0 to 1."""
         shift, starts = int(self.frames[b, 0] - self.frames[a, 0]), self.R.shape[1]
@@ -105,41 +117,100 @@ def deviation(R_a: Float[Tensor, "f *b 3 3"], R_b: Float[Tensor, "f *b 3 3"]) ->
 
 
 def adjust_windows(
-    cfg: Settings,
+    cfg: BaseConfig,
     inputs: Inputs,
     R: Float[Tensor, "t 3 3"],
     rng: torch.Generator,
     *,
     size: int,
-    stride: int,
-    directions: int = 0,
+    stride: int | None = None,
 ) -> Windows:
     """Adjust windows of `size` frames, one every `stride` frames, from rotations and from their mirror image.
 
     Args:
         R: Rotations to start from, `R_cam_obj`.
-        directions: Number of axes, spread over the sphere, about which a constant rotation is one more start of every
-            window, for rotations that may be far off. The `KEPT_STARTS` most promising starts are continued.
+        stride: None: a quarter of the size.
     """
-    n, size = len(inputs.capture), min(size, len(inputs.capture))
-    first = sorted({*range(0, n - size + 1, stride), n - size})
-    frames = torch.tensor(first)[:, None] + torch.arange(size)
+    frames = _overlapping(len(R), size, stride or _stride(size))
     chosen = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
-    starts = [R[frames], mirrored(R[frames])]
-    if not directions:
-        return _adjust_starts(cfg, inputs, frames, *chosen, torch.stack(starts, 1), cfg.window_scales)
+    starts = torch.stack([R[frames], mirrored(R[frames])], 1)
+    return _adjust_starts(cfg, inputs, frames, *chosen, starts, cfg.window_scales)
+
+
+def grow_windows(
+    cfg: BaseConfig,
+    inputs: Inputs,
+    R: Float[Tensor, "t 3 3"],
+    rng: torch.Generator,
+    *,
+    size: int,
+    directions: int,
+) -> Windows:
+    """One window of all frames, joined from windows of `size` frames through larger and larger ones (beam search).
+
+    Where an object has little texture, wrong motions explain a few frames as well as the right one, and many frames do
+    not, but there adjustment finds it from near starts only. So the best `KEPT_STARTS` motions of every window are
+    kept, and a larger window starts from all pairs of motions of two smaller ones that cover it.
+
+    Args:
+        R: Rotations to start from, `R_cam_obj`; the smallest windows also start from their mirror image.
+        directions: Number of axes, spread over the sphere, about which a constant rotation is one more start of the
+            smallest windows.
+    """
     turns = START_STEP * (torch.arange(size, dtype=R.dtype) - size // 2)
     axes = fibonacci_sphere(directions, dtype=R.dtype)
-    starts += SO3.exp(axes[:, None] * turns[:, None]).matrix()[:, None].expand(-1, len(frames), -1, -1, -1)
+    constant = SO3.exp(axes[:, None] * turns[:, None]).matrix()
+    frames = _overlapping(len(R), size, _stride(size))
+    starts = constant[:, : frames.shape[1]].expand(len(frames), -1, -1, -1, -1)
+    windows = _best_starts(cfg, inputs, R, frames, starts, rng)
+    while frames.shape[1] < len(R):
+        # Two windows that cover a larger one then have at least two frames in common.
+        size = 2 * (size - _stride(size))
+        frames = _overlapping(len(R), size, _stride(size))
+        R = averaged_windows(windows.frames, windows.consistent, n_frames=len(R))
+        windows = _best_starts(cfg, inputs, R, frames, windows.joined(frames), rng)
+    return windows
+
+
+def _stride(size: int) -> int:
+    """Number of frames from one window to the next."""
+    return max(1, size // 4)
+
+
+def _overlapping(n: int, size: int, stride: int) -> Int64[Tensor, "g f"]:
+    """Frames of windows of a size, or of all n frames if they are fewer, that cover all n frames."""
+    size = min(size, n)
+    first = sorted({*range(0, n - size + 1, stride), n - size})
+    return torch.tensor(first)[:, None] + torch.arange(size)
+
+
+def _best_starts(
+    cfg: BaseConfig,
+    inputs: Inputs,
+    R: Float[Tensor, "t 3 3"],
+    frames: Int64[Tensor, "g f"],
+    starts: Float[Tensor, "g s f 3 3"],
+    rng: torch.Generator,
+) -> Windows:
+    """Windows adjusted from the best of several starts, and of rotations of all frames and their mirror image.
+
+    Starts are compared by losses in which every observation counts once, as whole captures are.
+    """
+    tracks = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
+    starts = torch.cat([starts, R[frames][:, None], mirrored(R[frames])[:, None]], 1)
     screening, rest = cfg.window_scales[:SCREENING_ROUNDS], cfg.window_scales[SCREENING_ROUNDS:]
-    screened = _adjust_starts(cfg, inputs, frames, *chosen, torch.stack(starts, 1), screening)
-    promising = screened.loss.topk(KEPT_STARTS, dim=1, largest=False).indices
-    kept = screened.R[torch.arange(len(frames))[:, None], promising]
-    return _adjust_starts(cfg, inputs, frames, *chosen, kept, rest)
+
+    def adjusted(starts: Float[Tensor, "g s f 3 3"], scales: Sequence[float]) -> Windows:
+        windows = _adjust_starts(cfg, inputs, frames, *tracks, starts, scales)
+        even = replace(cfg, frontier_weight=1.0, iterations=1)
+        return replace(windows, loss=_adjust_starts(even, inputs, frames, *tracks, windows.R, scales[-1:]).loss)
+
+    screened = adjusted(starts, screening)
+    return adjusted(screened.R[torch.arange(len(frames))[:, None], screened.promising(KEPT_STARTS)], rest)
 
 
 def _adjust_starts(
-    cfg: Settings,
+    cfg: BaseConfig,
     inputs: Inputs,
     frames: Int64[Tensor, "g f"],
     tracks: Tracks,
@@ -171,7 +242,7 @@ def averaged_windows(
 
 
 def adjust_round(
-    cfg: Settings,
+    cfg: BaseConfig,
     inputs: Inputs,
     scene: BundleState,
     tracks: Tracks,

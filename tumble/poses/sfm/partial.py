@@ -10,9 +10,10 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from tumble.poses.sfm import bundle_adjustment, frontier_points
-from tumble.poses.sfm.adjustment import Settings, adjust_round
+from tumble.poses.sfm.adjustment import adjust_round
 from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.observations import Inputs
+from tumble.poses.sfm.schedule import BaseConfig
 from tumble.poses.sfm.tracks import Keypoints, Tracks
 
 TRACKS_PER_FRAME = 120
@@ -35,7 +36,7 @@ GAP_SCALE = 3.0
 class Observed:
     """What is known of all frames."""
 
-    cfg: Settings
+    cfg: BaseConfig
     inputs: Inputs
     keypoints: Keypoints
 

@@ -7,37 +7,16 @@ RELOCALIZATION_SCALE = 0.7
 
 
 @dataclass(frozen=True)
-class Fallback:
-    """Settings of another attempt at a capture that has not converged."""
-
-    window_sizes: tuple[int, ...]
-    """Sizes of the windows, in ascending order [frames]."""
-    stretch: float
-    """Factor on the rotations between consecutive frames before all frames are adjusted.
-
-    Shading and highlights stay where they are while a surface turns below them, so that matches of an object with
-    little texture show too small a rotation: 0.7 of it where all is shading.
-    """
-
-
-@dataclass(frozen=True)
 class BaseConfig:
     """Settings of stage 1 by structure from motion, found by experiment; the paper's method is `progressive`."""
 
     window_sizes: tuple[int, ...] = (6, 12)
     """Sizes of the windows, in ascending order [frames]."""
-    fallbacks: tuple[Fallback, ...] = (
-        Fallback((12, 24), 1.0),
-        Fallback((6, 12), 1.2),
-        Fallback((6, 12, 24), 1.2),
-        Fallback((12, 24), 1.2),
-        Fallback((6, 12), 1.0),
-        Fallback((6, 12, 24), 1.0),
-        Fallback((12, 24), 1.4),
-    )
-    """Settings of further attempts, for captures that have not converged."""
+    growing: tuple[int, ...] = (6, 8, 12)
+    """Size of the smallest windows in each further attempt at a capture that has not converged, which grow until one
+    holds all frames; at least 3 [frames]."""
     directions: int = 16
-    """Number of constant rotations from which windows of further attempts start as well."""
+    """Number of constant rotations from which these smallest windows start as well."""
     converged_loss: float = 0.06
     """Loss per observation of the first attempt below which it has converged [pixels^2].
 
@@ -55,6 +34,14 @@ class BaseConfig:
     """Scale of the Cauchy loss in each round of the two fits that rely mainly on tracks or on contours [pixels]."""
     perturbations: int = 10
     """Number of times that `PERTURBATIONS` random changes of the best attempt's poses are tried."""
+    early_perturbations: int = 3
+    """The same for every further attempt before it is compared with the best."""
+    stretch: float = 1.2
+    """Factor on the rotations between consecutive frames of the best attempt, with which all frames are adjusted again.
+
+    Shading and highlights stay where they are while a surface turns below them, so that matches of an object with
+    little texture show too small a rotation: 0.7 of it where all is shading.
+    """
     perturbation_scales: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5)
     """Scale of the Cauchy loss in each round of adjusting the whole capture after such a change [pixels]."""
     relocalizations: int = 1
@@ -99,10 +86,14 @@ class AdjustWindows:
 
     size: int
     """Number of frames per window."""
-    widely: bool = False
-    """Whether windows start from constant rotations as well (`BaseConfig.directions`)."""
-    stretch: float = 1.0
-    """Factor on the averaged rotations between consecutive frames (`Fallback.stretch`)."""
+
+
+@dataclass(frozen=True)
+class GrowWindows:
+    """Adjust windows from many starts, and join them to larger and larger ones (`adjustment.grow_windows`)."""
+
+    size: int
+    """Number of frames of the smallest windows."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +123,11 @@ class Perturb:
 
     scale: float
     """Scale of the Cauchy loss by which poses are compared [pixels]."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Enlarge the rotations between consecutive frames (`BaseConfig.stretch`)."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +173,12 @@ class JoinSegments:
 Phase = (
     AverageRotations
     | AdjustWindows
+    | GrowWindows
     | AdjustAll
     | KeepBest
     | TryCircularMotion
     | Perturb
+    | Stretch
     | AlignTexture
     | CheckSettled
     | AlignColours
@@ -196,7 +194,7 @@ class Step:
 
     phase: Phase
     attempt: int = 0
-    """Attempt that the step belongs to: 0 is the first; the others are those of `BaseConfig.fallbacks`."""
+    """Attempt that the step belongs to: 0 is the first; the others are those of `BaseConfig.growing`."""
     mends: bool = False
     """Whether the step corrects poses that have not converged; it is skipped otherwise."""
 
@@ -214,24 +212,19 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
     relocalization = [Relocalize(RELOCALIZATION_SCALE), *map(AdjustAll, cfg.relocalized_scales)]
     steps: list[Step] = []
     first = [TryCircularMotion(), AverageRotations(), *map(AdjustWindows, cfg.window_sizes)]
-    others = [
-        [
-            AverageRotations(),
-            *(AdjustWindows(size, widely=True) for size in other.window_sizes[:-1]),
-            AdjustWindows(other.window_sizes[-1], widely=True, stretch=other.stretch),
-        ]
-        for other in cfg.fallbacks
-    ]
     mending = [*relocalization * cfg.relocalizations, keep]
     # The loss of the first attempt decides whether any more steps follow.
     steps += map(Step, (*first, *map(AdjustAll, cfg.global_scales), keep))
     steps += [Step(phase, mends=True) for phase in mending]
-    for attempt, phases in enumerate(others, 1):
-        steps += [Step(phase, attempt) for phase in (*phases, *map(AdjustAll, cfg.global_scales), keep)]
-    if others:
+    for attempt, size in enumerate(cfg.growing, 1):
+        again = (AverageRotations(), GrowWindows(size), *map(AdjustAll, cfg.global_scales))
+        early = [Perturb(keep.scale)] * cfg.early_perturbations
+        steps += [Step(phase, attempt) for phase in (*again, *early, keep)]
+    if cfg.growing:
         # Relocalization fits contours alone, so the best attempt is changed after it and compared by matches as well.
-        mending = [*mending, *[Perturb(keep.scale)] * cfg.perturbations, *mending]
-        steps += [Step(phase, len(others), mends=True) for phase in mending]
+        stretched = [Stretch(), *map(AdjustAll, cfg.global_scales), keep]
+        mending = [*stretched, *mending, *[Perturb(keep.scale)] * cfg.perturbations, keep, *mending]
+        steps += [Step(phase, len(cfg.growing), mends=True) for phase in mending]
     steps.append(Step(AlignTexture()))
     for _ in range(cfg.max_corrections):
         steps += map(Step, (CheckSettled(keep.scale), AlignColours(), TrackTexture(), *relocalization))

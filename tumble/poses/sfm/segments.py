@@ -22,7 +22,7 @@ from torch import Tensor
 
 from tumble import matching
 from tumble.poses.frame_pairs import neighbours
-from tumble.poses.sfm.adjustment import Settings, Windows, adjust_windows, averaged_windows, deviation
+from tumble.poses.sfm.adjustment import Windows, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.observations import Inputs, gather, on_object, shown, silhouette_centres, tracks_of
 from tumble.poses.sfm.partial import (
     Observed,
@@ -35,6 +35,7 @@ from tumble.poses.sfm.partial import (
     thinned,
 )
 from tumble.poses.sfm.registration import TOLERANCE, Hypotheses, grow, join
+from tumble.poses.sfm.schedule import BaseConfig
 from tumble.poses.sfm.tracks import Tracks, gather_keypoints
 from tumble.scene import Match
 
@@ -87,12 +88,12 @@ FINISHING_SCALES = (1.5, 1.0, 0.7)
 
 
 def segmented_poses(
-    cfg: Settings, inputs: Inputs, R: Float[Tensor, "t 3 3"], rng: torch.Generator
+    cfg: BaseConfig, inputs: Inputs, R: Float[Tensor, "t 3 3"], rng: torch.Generator
 ) -> tuple[Partial | None, Tracks]:
     """Poses of all frames that can be understood, and their tracks; None if no segment was found.
 
     Args:
-        cfg: Settings of bundle adjustment.
+        cfg: BaseConfig of bundle adjustment.
         R: Approximate rotations of all frames, `R_cam_obj`.
         rng: Source of random numbers.
     """
@@ -114,7 +115,7 @@ def segmented_poses(
 
 
 def _understood(
-    cfg: Settings, inputs: Inputs, wide: Sequence[Match], R: Float[Tensor, "t 3 3"], rng: torch.Generator
+    cfg: BaseConfig, inputs: Inputs, wide: Sequence[Match], R: Float[Tensor, "t 3 3"], rng: torch.Generator
 ) -> tuple[Partial | None, Tracks]:
     """The largest part of the capture that matches explain, and its tracks; None if there is no segment.
 
@@ -147,7 +148,7 @@ def _merged(*parts: Sequence[Match]) -> list[Match]:
     return [matching.joined(matches) for matches in of_pair.values()]
 
 
-def _observed(cfg: Settings, inputs: Inputs, tracks: Tracks, wide: Sequence[Match]) -> Observed:
+def _observed(cfg: BaseConfig, inputs: Inputs, tracks: Tracks, wide: Sequence[Match]) -> Observed:
     keypoints = gather_keypoints(wide, tracks, inputs.capture.camera, len(inputs.capture))
     return Observed(cfg, replace(inputs, tracks=tracks), keypoints)
 

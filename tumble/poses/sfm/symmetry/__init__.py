@@ -8,7 +8,13 @@ agree about them tells how a body of revolution turns on a turntable (`texture_t
 
 from tumble.poses.sfm.symmetry import texture_information
 from tumble.poses.sfm.symmetry.mirror import MirrorSymmetry, mirror_symmetry
-from tumble.poses.sfm.symmetry.spin import Spin, axis_deviation, estimate_spin, steady_observations
+from tumble.poses.sfm.symmetry.spin import (
+    Spin,
+    axis_deviation,
+    estimate_spin,
+    steady_observations,
+    turned_to_and_fro,
+)
 from tumble.poses.sfm.symmetry.texture_tracks import Agreement, texture_agreement, texture_tracks
 from tumble.poses.sfm.symmetry.turns import Turns, estimate_turns
 
@@ -25,4 +31,5 @@ __all__ = [
     "texture_agreement",
     "texture_information",
     "texture_tracks",
+    "turned_to_and_fro",
 ]

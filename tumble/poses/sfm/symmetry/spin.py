@@ -199,6 +199,19 @@ def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOf
     )
 
 
+def turned_to_and_fro(capture: Capture, trajectory: Trajectory, angle: float) -> Trajectory | None:
+    """Poses whose object is turned about its axis of revolution, one way in even frames, the other way in odd ones.
+
+    None if the poses and silhouettes contradict each other.
+    """
+    surface = surface_of_revolution(capture, trajectory)
+    if surface is None:
+        return None
+    sign = torch.ones(len(trajectory))
+    sign[1::2] = -1
+    return surface.turned(trajectory, angle * sign)
+
+
 def axis_deviation(capture: Capture, a: Trajectory, b: Trajectory) -> Float[Tensor, " t"] | None:
     """Angle in every frame between the axes of a body of revolution at two trajectories, whatever the spin [radians].
 
