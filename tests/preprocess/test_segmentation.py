@@ -165,3 +165,20 @@ def test_a_small_hole_is_unknown_and_a_large_one_is_background() -> None:
     assert labels[49, 61] == BACKGROUND
     assert labels[86, 49] == BACKGROUND
     assert labels[0, 0] == labels[99, 50] == BACKGROUND
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_static_part_of_a_colour_of_its_own_is_not_background_though_it_reaches_the_wall(elsewhere: bool) -> None:
+    """A plain ball rotates in place before a dark wall: its right half never changes, its left edge does. A patch of
+    its colour on the wall, beside the box, means that the part may be wall as well."""
+    row, column = np.mgrid[:96, :96]
+    ball = (np.hypot(row - 48, column - 48) < 25)[..., None]
+    image = np.where(ball, np.array([73, 61, 26]), 0).astype(np.uint8)
+    image[:12, :40] = (73, 61, 26) if elsewhere else 0
+    before = image.copy()
+    before[:, :40] = np.where(ball[:, :40], 120, before[:, :40])
+    background = Background(before, np.full((96, 96), 1.5, np.float32), np.ones((96, 96), bool))
+    found = segmentation.exclude_possible_object(background, image, Seed(0, (20, 20, 56, 56)))
+    right = ball[..., 0] & (column > 50)
+    assert found.known[right].mean() == (1 if elsewhere else 0)
+    assert found.known[~ball[..., 0]].mean() > 0.95

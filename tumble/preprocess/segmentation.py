@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 
 from tumble.maths import iou
-from tumble.preprocess.background import Background
+from tumble.preprocess.background import MIN_DIFFERENCE, Background, channel_max
 from tumble.preprocess.colour_model import (
     SEED_WEIGHT,
     ColourModel,
@@ -60,6 +60,12 @@ more."""
 MIN_MOVING_FRACTION = 0.1
 """Minimum fraction of the box that differs from the background; with less, the background inside the box is not
 used."""
+MIN_STATIC_PART = 0.02
+"""Minimum area of a static part that may be the object, as a fraction of the box; smaller ones are closed as holes."""
+MAX_ALIKE = 0.01
+"""Fraction of the surroundings of the box with the colour of a static part, below which that part may be the object."""
+EDGE_MARGIN = 2
+"""Width of the edge around such a part [pixels]."""
 MIN_PART_FRACTION = 0.15
 """Minimum area of further components of the object (behind a finger), as a fraction of the largest one."""
 MAX_HOLE_FRACTION = 0.03
@@ -127,14 +133,36 @@ def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h 
     """The background for the seed frame, without the pixels that may be the object itself.
 
     An object of one colour that rotates in place looks static. So inside the box, pixels that match the background are
-    accepted as background only if they are connected to the border of the box.
+    accepted as background only if they are connected to the border of the box. Where the silhouette keeps its place,
+    such an object is connected to it, too; then an edge separates both, and nothing around the box has its colour.
     """
     static, moving = opened(background.same(image), 1), opened(background.differs(image), 1)
     inside = box_mask(moving.shape, seed.box or box_around(seed.click, moving))
-    _, ids = components(static & inside)
-    enclosed = static & inside & ~np.isin(ids, np.unique(ids[inside & ~eroded(inside, 1)]))
+    rim = inside & ~eroded(inside, 1)
+    enclosed = _enclosed(static & inside, rim)
+    count, ids = components(_enclosed(static & inside & ~_edges(image), rim))
+    around = image[~inside]
+    for part in (ids == k for k in range(1, count)):
+        if part.sum() > MIN_STATIC_PART * inside.sum():
+            distance = channel_max(
+                cv2.absdiff(around, np.broadcast_to(np.median(image[part], 0).astype(np.uint8), around.shape))
+            )
+            if (distance < MIN_DIFFERENCE).mean() < MAX_ALIKE:
+                enclosed |= dilated(part, EDGE_MARGIN) & static & inside
     mostly_static = (moving & inside).sum() < MIN_MOVING_FRACTION * inside.sum()
     return replace(background, known=background.known & ~(inside if mostly_static else enclosed))
+
+
+def _enclosed(mask: Bool[np.ndarray, "h w"], rim: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The connected components of a mask that do not reach the rim."""
+    _, ids = components(mask)
+    return mask & ~np.isin(ids, np.unique(ids[rim]))
+
+
+def _edges(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose neighbours differ by more than shadows and codec artefacts do."""
+    square = np.ones((3, 3), np.uint8)
+    return channel_max(cv2.subtract(cv2.dilate(image, square), cv2.erode(image, square))) > MIN_DIFFERENCE
 
 
 def moving_skin(image: UInt8[np.ndarray, "h w 3"], background: Background) -> Bool[np.ndarray, "h w"]:

@@ -25,6 +25,7 @@ QUICK = stage.Config(
     window_scales=(3.0, 1.0, 0.5),
     global_scales=(3.0, 2.0, 1.0, 0.7, 0.5),
     growing=(),
+    fallbacks=(),
     relocalizations=0,
     perturbations=0,
     early_perturbations=0,

@@ -124,17 +124,27 @@ def adjust_windows(
     *,
     size: int,
     stride: int | None = None,
+    directions: int = 0,
 ) -> Windows:
     """Adjust windows of `size` frames, one every `stride` frames, from rotations and from their mirror image.
 
     Args:
         R: Rotations to start from, `R_cam_obj`.
         stride: None: a quarter of the size.
+        directions: Number of axes, spread over the sphere, about which a constant rotation is one more start of every
+            window, for rotations that may be far off. The `KEPT_STARTS` most promising starts are continued.
     """
     frames = _overlapping(len(R), size, stride or _stride(size))
     chosen = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
     starts = torch.stack([R[frames], mirrored(R[frames])], 1)
-    return _adjust_starts(cfg, inputs, frames, *chosen, starts, cfg.window_scales)
+    if not directions:
+        return _adjust_starts(cfg, inputs, frames, *chosen, starts, cfg.window_scales)
+    starts = torch.cat([starts, _constant_rotations(directions, frames, R)], 1)
+    screening, rest = cfg.window_scales[:SCREENING_ROUNDS], cfg.window_scales[SCREENING_ROUNDS:]
+    screened = _adjust_starts(cfg, inputs, frames, *chosen, starts, screening)
+    promising = screened.loss.topk(KEPT_STARTS, dim=1, largest=False).indices
+    kept = screened.R[torch.arange(len(frames))[:, None], promising]
+    return _adjust_starts(cfg, inputs, frames, *chosen, kept, rest)
 
 
 def grow_windows(
@@ -153,23 +163,28 @@ def grow_windows(
     kept, and a larger window starts from all pairs of motions of two smaller ones that cover it.
 
     Args:
-        R: Rotations to start from, `R_cam_obj`; the smallest windows also start from their mirror image.
-        directions: Number of axes, spread over the sphere, about which a constant rotation is one more start of the
-            smallest windows.
+        R: Rotations to start from, `R_cam_obj`.
+        directions: As in `adjust_windows`, for the smallest windows.
     """
-    turns = START_STEP * (torch.arange(size, dtype=R.dtype) - size // 2)
-    axes = fibonacci_sphere(directions, dtype=R.dtype)
-    constant = SO3.exp(axes[:, None] * turns[:, None]).matrix()
     frames = _overlapping(len(R), size, _stride(size))
-    starts = constant[:, : frames.shape[1]].expand(len(frames), -1, -1, -1, -1)
-    windows = _best_starts(cfg, inputs, R, frames, starts, rng)
-    while frames.shape[1] < len(R):
+    windows = _best_starts(cfg, inputs, R, frames, _constant_rotations(directions, frames, R), rng)
+    while windows.frames.shape[1] < len(R):
         # Two windows that cover a larger one then have at least two frames in common.
         size = 2 * (size - _stride(size))
         frames = _overlapping(len(R), size, _stride(size))
         R = averaged_windows(windows.frames, windows.consistent, n_frames=len(R))
         windows = _best_starts(cfg, inputs, R, frames, windows.joined(frames), rng)
     return windows
+
+
+def _constant_rotations(
+    directions: int, frames: Int64[Tensor, "g f"], R: Float[Tensor, "t 3 3"]
+) -> Float[Tensor, "g s f 3 3"]:
+    """The same constant rotations, about axes spread over the sphere, for every window."""
+    size = frames.shape[1]
+    turns = START_STEP * (torch.arange(size, dtype=R.dtype) - size // 2)
+    axes = fibonacci_sphere(directions, dtype=R.dtype)
+    return SO3.exp(axes[:, None] * turns[:, None]).matrix().expand(len(frames), -1, -1, -1, -1)
 
 
 def _stride(size: int) -> int:
@@ -201,9 +216,9 @@ def _best_starts(
     screening, rest = cfg.window_scales[:SCREENING_ROUNDS], cfg.window_scales[SCREENING_ROUNDS:]
 
     def adjusted(starts: Float[Tensor, "g s f 3 3"], scales: Sequence[float]) -> Windows:
-        windows = _adjust_starts(cfg, inputs, frames, *tracks, starts, scales)
+        windows = _adjust_starts(cfg, inputs, frames, *tracks, starts, scales, rng)
         even = replace(cfg, frontier_weight=1.0, iterations=1)
-        return replace(windows, loss=_adjust_starts(even, inputs, frames, *tracks, windows.R, scales[-1:]).loss)
+        return replace(windows, loss=_adjust_starts(even, inputs, frames, *tracks, windows.R, scales[-1:], rng).loss)
 
     screened = adjusted(starts, screening)
     return adjusted(screened.R[torch.arange(len(frames))[:, None], screened.promising(KEPT_STARTS)], rest)
@@ -217,8 +232,13 @@ def _adjust_starts(
     group: Int64[Tensor, " n"],
     starts: Float[Tensor, "g s f 3 3"],
     scales: Sequence[float],
+    rng: torch.Generator | None = None,
 ) -> Windows:
-    """Adjust windows from several rotations each, in one round for every scale of the Cauchy loss [pixels]."""
+    """Adjust windows from several rotations each, in one round for every scale of the Cauchy loss [pixels].
+
+    Args:
+        rng: As in `adjust_round`.
+    """
     g, s = starts.shape[:2]
     shifted = [replace(tracks, frame=tracks.frame + k * frames.numel()) for k in range(s)]
     group = torch.cat([group + k * g for k in range(s)])
@@ -227,7 +247,7 @@ def _adjust_starts(
     scene = BundleState(starts.transpose(0, 1).flatten(0, 1), t, torch.zeros(0, 3, dtype=starts.dtype))
     loss, every = torch.zeros(s * g), concatenate(*shifted)
     for scale in scales:
-        scene, loss = adjust_round(cfg, inputs, scene, every, group, repeated, scale)
+        scene, loss = adjust_round(cfg, inputs, scene, every, group, repeated, scale, rng)
     return Windows(frames, torch.stack(scene.R.split(g), 1), torch.stack(loss.split(g), 1))
 
 

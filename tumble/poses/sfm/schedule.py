@@ -7,6 +7,20 @@ RELOCALIZATION_SCALE = 0.7
 
 
 @dataclass(frozen=True)
+class Fallback:
+    """Settings of another attempt at a capture that has not converged."""
+
+    window_sizes: tuple[int, ...]
+    """Sizes of the windows, in ascending order [frames]."""
+    stretch: float
+    """Factor on the rotations between consecutive frames before all frames are adjusted.
+
+    Shading and highlights stay where they are while a surface turns below them, so that matches of an object with
+    little texture show too small a rotation: 0.7 of it where all is shading.
+    """
+
+
+@dataclass(frozen=True)
 class BaseConfig:
     """Settings of stage 1 by structure from motion, found by experiment; the paper's method is `progressive`."""
 
@@ -15,8 +29,19 @@ class BaseConfig:
     growing: tuple[int, ...] = (6, 8, 12)
     """Size of the smallest windows in each further attempt at a capture that has not converged, which grow until one
     holds all frames; at least 3 [frames]."""
+    fallbacks: tuple[Fallback, ...] = (
+        Fallback((12, 24), 1.0),
+        Fallback((6, 12), 1.2),
+        Fallback((6, 12, 24), 1.2),
+        Fallback((12, 24), 1.2),
+        Fallback((6, 12), 1.0),
+        Fallback((6, 12, 24), 1.0),
+        Fallback((12, 24), 1.4),
+    )
+    """Settings of attempts after these."""
     directions: int = 16
-    """Number of constant rotations from which these smallest windows start as well."""
+    """Number of constant rotations from which windows of further attempts start as well; of windows that grow, the
+    smallest ones."""
     converged_loss: float = 0.06
     """Loss per observation of the first attempt below which it has converged [pixels^2].
 
@@ -35,13 +60,7 @@ class BaseConfig:
     perturbations: int = 10
     """Number of times that `PERTURBATIONS` random changes of the best attempt's poses are tried."""
     early_perturbations: int = 3
-    """The same for every further attempt before it is compared with the best."""
-    stretch: float = 1.2
-    """Factor on the rotations between consecutive frames of the best attempt, with which all frames are adjusted again.
-
-    Shading and highlights stay where they are while a surface turns below them, so that matches of an object with
-    little texture show too small a rotation: 0.7 of it where all is shading.
-    """
+    """The same for every attempt with windows that grow, before it is compared with the best."""
     perturbation_scales: tuple[float, ...] = (3.0, 1.5, 1.0, 0.7, 0.5)
     """Scale of the Cauchy loss in each round of adjusting the whole capture after such a change [pixels]."""
     relocalizations: int = 1
@@ -86,6 +105,10 @@ class AdjustWindows:
 
     size: int
     """Number of frames per window."""
+    widely: bool = False
+    """Whether windows start from constant rotations as well (`BaseConfig.directions`)."""
+    stretch: float = 1.0
+    """Factor on the averaged rotations between consecutive frames (`Fallback.stretch`)."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +149,14 @@ class Perturb:
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Enlarge the rotations between consecutive frames (`BaseConfig.stretch`)."""
+class SetAside:
+    """Set the best poses aside, so that attempts of another kind compete among themselves: while motions are wrong, a
+    lower loss does not say which is nearer to the right one."""
+
+
+@dataclass(frozen=True)
+class TakeBetter:
+    """Take the poses with the lower loss: those set aside or those found since."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +207,8 @@ Phase = (
     | KeepBest
     | TryCircularMotion
     | Perturb
-    | Stretch
+    | SetAside
+    | TakeBetter
     | AlignTexture
     | CheckSettled
     | AlignColours
@@ -194,7 +224,8 @@ class Step:
 
     phase: Phase
     attempt: int = 0
-    """Attempt that the step belongs to: 0 is the first; the others are those of `BaseConfig.growing`."""
+    """Attempt that the step belongs to: 0 is the first; the others are those of `BaseConfig.growing` and
+    `BaseConfig.fallbacks`."""
     mends: bool = False
     """Whether the step corrects poses that have not converged; it is skipped otherwise."""
 
@@ -216,15 +247,26 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
     # The loss of the first attempt decides whether any more steps follow.
     steps += map(Step, (*first, *map(AdjustAll, cfg.global_scales), keep))
     steps += [Step(phase, mends=True) for phase in mending]
-    for attempt, size in enumerate(cfg.growing, 1):
-        again = (AverageRotations(), GrowWindows(size), *map(AdjustAll, cfg.global_scales))
-        early = [Perturb(keep.scale)] * cfg.early_perturbations
-        steps += [Step(phase, attempt) for phase in (*again, *early, keep)]
-    if cfg.growing:
-        # Relocalization fits contours alone, so the best attempt is changed after it and compared by matches as well.
-        stretched = [Stretch(), *map(AdjustAll, cfg.global_scales), keep]
-        mending = [*stretched, *mending, *[Perturb(keep.scale)] * cfg.perturbations, keep, *mending]
-        steps += [Step(phase, len(cfg.growing), mends=True) for phase in mending]
+    again = list(map(AdjustAll, cfg.global_scales))
+    early = [Perturb(keep.scale)] * cfg.early_perturbations
+    growing: list[list[Phase]] = [[GrowWindows(size), *again, *early, keep] for size in cfg.growing]
+    others: list[list[Phase]] = []
+    for other in cfg.fallbacks:
+        *shorter, longest = other.window_sizes
+        windows = [*(AdjustWindows(size, widely=True) for size in shorter)]
+        others.append([*windows, AdjustWindows(longest, widely=True, stretch=other.stretch), *again, keep])
+    # Relocalization fits contours alone, so the best attempt is changed after it and compared by matches as well.
+    mending = [*mending, *[Perturb(keep.scale)] * cfg.perturbations, keep, *mending]
+    attempt = 0
+    for attempts in filter(None, (growing, others)):
+        if attempt:
+            steps.append(Step(SetAside(), attempt, mends=True))
+        for phases in attempts:
+            attempt += 1
+            steps += [Step(phase, attempt) for phase in (AverageRotations(), *phases)]
+        steps += [Step(phase, attempt, mends=True) for phase in mending]
+    if growing and others:
+        steps.append(Step(TakeBetter(), attempt, mends=True))
     steps.append(Step(AlignTexture()))
     for _ in range(cfg.max_corrections):
         steps += map(Step, (CheckSettled(keep.scale), AlignColours(), TrackTexture(), *relocalization))
