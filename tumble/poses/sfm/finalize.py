@@ -92,7 +92,7 @@ class Solution:
 
 
 def pose_result(
-    capture: Capture, tracks: Tracks, contours: Contours, mirror_symmetry: MirrorSymmetry | None, solution: Solution
+    capture: Capture, tracks: Tracks, contours: Contours, mirror_symmetry: MirrorSymmetry, solution: Solution
 ) -> PoseResult:
     """Result of stage 1 for estimated poses: lost frames, poses in the object's frame and unit, points and quality.
 
@@ -100,7 +100,7 @@ def pose_result(
         capture: Images and masks of all frames.
         tracks: Feature tracks.
         contours: Convex contours of all silhouettes.
-        mirror_symmetry: Mirror symmetry of all silhouettes; None if contours show every rotation.
+        mirror_symmetry: Mirror symmetry of all silhouettes.
         solution: The estimated poses.
     """
     R, t, camera = solution.R, solution.t, capture.camera
@@ -138,7 +138,7 @@ def pose_result(
     points = ((X[reliable] - centre) / scale) @ R_first.mT
     colours = _point_colours(capture, tracks, residual, reliable)
     observability, textured = _observability(capture, contours, solution, problem, scene, residual < INLIER_THRESHOLD)
-    if not textured and mirror_symmetry is not None:
+    if not textured:
         observability = _observability_from_symmetry(observability, mirror_symmetry)
     disagreement = solution.rotation_disagreement.float()
     rotation_range = angle_between(T.rotation[:, None], T.rotation).max().float()

@@ -572,13 +572,10 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
     solution = Solution(
         state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None, parts
     )
-    mirror = inputs.mirror_symmetry
-    if not inputs.hidden and not mirror.is_sphere and not _has_spin(inputs, state.params):
-        mirror = None
     tracks = _steady_tracks(inputs, state)
     contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])
     tracks = tracks.select(posed[tracks.frame])
-    return pose_result(inputs.capture, tracks, contours, mirror, solution)
+    return pose_result(inputs.capture, tracks, contours, inputs.mirror_symmetry, solution)
 
 
 def _rotation_disagreement(cfg: Config, inputs: Inputs, state: State) -> Float[Tensor, " t"]:
