@@ -182,3 +182,15 @@ def test_a_static_part_of_a_colour_of_its_own_is_not_background_though_it_reache
     right = ball[..., 0] & (column > 50)
     assert found.known[right].mean() == (1 if elsewhere else 0)
     assert found.known[~ball[..., 0]].mean() > 0.95
+
+
+def test_in_a_box_as_large_as_the_image_all_that_is_static_may_be_the_object() -> None:
+    """Nothing around it shows a background to compare with."""
+    image = np.zeros((96, 96, 3), np.uint8)
+    image[30:60, 30:60] = (73, 61, 26)
+    before = image.copy()
+    before[:20] = 200
+    background = Background(before, np.full((96, 96), 1.5, np.float32), np.ones((96, 96), bool))
+    found = segmentation.exclude_possible_object(background, image, Seed(0, (0, 0, 96, 96)))
+    assert found.known[:20].all()
+    assert not found.known[22:].any()

@@ -141,14 +141,11 @@ def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h 
     rim = inside & ~eroded(inside, 1)
     enclosed = _enclosed(static & inside, rim)
     count, ids = components(_enclosed(static & inside & ~_edges(image), rim))
-    around = image[~inside]
-    for part in (ids == k for k in range(1, count)):
-        if part.sum() > MIN_STATIC_PART * inside.sum():
-            distance = channel_max(
-                cv2.absdiff(around, np.broadcast_to(np.median(image[part], 0).astype(np.uint8), around.shape))
-            )
-            if (distance < MIN_DIFFERENCE).mean() < MAX_ALIKE:
-                enclosed |= dilated(part, EDGE_MARGIN) & static & inside
+    for k in 1 + np.flatnonzero(np.bincount(ids.ravel(), minlength=count)[1:] > MIN_STATIC_PART * inside.sum()):
+        colour = np.median(image[ids == k], 0).astype(np.int16)
+        alike = channel_max(np.abs(image.astype(np.int16) - colour)) < MIN_DIFFERENCE
+        if alike[~inside].sum() < MAX_ALIKE * (~inside).sum():
+            enclosed |= dilated(ids == k, EDGE_MARGIN) & static & inside
     mostly_static = (moving & inside).sum() < MIN_MOVING_FRACTION * inside.sum()
     return replace(background, known=background.known & ~(inside if mostly_static else enclosed))
 
