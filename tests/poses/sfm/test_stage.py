@@ -14,7 +14,7 @@ from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
 from tumble.maths import SO3
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import stage
+from tumble.poses.sfm import schedule, stage
 from tumble.poses.sfm.adjustment import adjust_windows, averaged_windows, deviation, grow_windows
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
@@ -223,6 +223,29 @@ def test_two_attempts_that_agree_are_enough(scene: Tumble) -> None:
 def rotated(state: State, degrees: float) -> Tensor:
     """The rotations of a state, all turned about the object's x axis."""
     return state.params.R @ SO3.exp(torch.tensor([math.radians(degrees), 0.0, 0.0], dtype=torch.float64)).matrix()
+
+
+@pytest.mark.parametrize("degrees", [(0.0, 20.0), (20.0, 0.0)])
+def test_attempts_of_both_kinds_compete_apart_and_the_better_result_is_taken(
+    scene: Tumble, degrees: tuple[float, float]
+) -> None:
+    """The best poses of each kind differ from the truth in one frame, by these angles."""
+    cfg = replace(QUICK, converged_loss=0.0, growing=(6,), fallbacks=(schedule.Fallback((6,), 1.0),))
+    steps, kinds = stage.schedule(cfg), (stage.KeepBest, stage.SetAside, stage.KeepBest, stage.TakeBetter)
+    inputs = stage.gather(scene.capture, matches(scene))
+    state = stage.init(cfg, inputs, torch.Generator().manual_seed(0))
+    found = iter(degrees)
+    for kind in kinds:
+        if kind is stage.KeepBest:
+            state.params = turned(scene, 3, next(found))
+        ahead = range(state.step + 1, len(steps))
+        state.step = next(
+            k for k in ahead if isinstance(steps[k].phase, kind) and (steps[k].attempt or kind is stage.TakeBetter)
+        )
+        stage.step(cfg, inputs, state)
+        if kind is stage.SetAside:
+            assert state.memory["loss"].isinf()
+    assert torch.equal(state.params.R, turned(scene, 3, 0.0).R)
 
 
 def test_a_part_of_the_motion_that_is_joined_wrongly_is_found_by_perturbation(scene: Tumble) -> None:

@@ -135,16 +135,12 @@ def adjust_windows(
             window, for rotations that may be far off. The `KEPT_STARTS` most promising starts are continued.
     """
     frames = _overlapping(len(R), size, stride or _stride(size))
+    starts = _given(R, frames)
+    if directions:
+        starts = torch.cat([starts, _constant_rotations(directions, frames, R)], 1)
+        return _best_starts(cfg, inputs, frames, starts, rng, evenly=False)
     chosen = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
-    starts = torch.stack([R[frames], mirrored(R[frames])], 1)
-    if not directions:
-        return _adjust_starts(cfg, inputs, frames, *chosen, starts, cfg.window_scales)
-    starts = torch.cat([starts, _constant_rotations(directions, frames, R)], 1)
-    screening, rest = cfg.window_scales[:SCREENING_ROUNDS], cfg.window_scales[SCREENING_ROUNDS:]
-    screened = _adjust_starts(cfg, inputs, frames, *chosen, starts, screening)
-    promising = screened.loss.topk(KEPT_STARTS, dim=1, largest=False).indices
-    kept = screened.R[torch.arange(len(frames))[:, None], promising]
-    return _adjust_starts(cfg, inputs, frames, *chosen, kept, rest)
+    return _adjust_starts(cfg, inputs, frames, *chosen, starts, cfg.window_scales)
 
 
 def grow_windows(
@@ -167,14 +163,21 @@ def grow_windows(
         directions: As in `adjust_windows`, for the smallest windows.
     """
     frames = _overlapping(len(R), size, _stride(size))
-    windows = _best_starts(cfg, inputs, R, frames, _constant_rotations(directions, frames, R), rng)
+    starts = _constant_rotations(directions, frames, R)
+    windows = _best_starts(cfg, inputs, frames, torch.cat([starts, _given(R, frames)], 1), rng, evenly=True)
     while windows.frames.shape[1] < len(R):
         # Two windows that cover a larger one then have at least two frames in common.
         size = 2 * (size - _stride(size))
         frames = _overlapping(len(R), size, _stride(size))
         R = averaged_windows(windows.frames, windows.consistent, n_frames=len(R))
-        windows = _best_starts(cfg, inputs, R, frames, windows.joined(frames), rng)
+        starts = torch.cat([windows.joined(frames), _given(R, frames)], 1)
+        windows = _best_starts(cfg, inputs, frames, starts, rng, evenly=True)
     return windows
+
+
+def _given(R: Float[Tensor, "t 3 3"], frames: Int64[Tensor, "g f"]) -> Float[Tensor, "g 2 f 3 3"]:
+    """The rotations of all frames within every window, and their mirror image."""
+    return torch.stack([R[frames], mirrored(R[frames])], 1)
 
 
 def _constant_rotations(
@@ -202,26 +205,31 @@ def _overlapping(n: int, size: int, stride: int) -> Int64[Tensor, "g f"]:
 def _best_starts(
     cfg: BaseConfig,
     inputs: Inputs,
-    R: Float[Tensor, "t 3 3"],
     frames: Int64[Tensor, "g f"],
     starts: Float[Tensor, "g s f 3 3"],
     rng: torch.Generator,
+    *,
+    evenly: bool,
 ) -> Windows:
-    """Windows adjusted from the best of several starts, and of rotations of all frames and their mirror image.
+    """Windows adjusted from the most promising of several starts.
 
-    Starts are compared by losses in which every observation counts once, as whole captures are.
+    Args:
+        evenly: Whether starts are compared by losses in which every observation counts once, as whole captures are, and
+            the promising ones differ from each other (`Windows.promising`).
     """
     tracks = window_tracks(inputs.tracks, frames, cfg.max_window_tracks, rng)
-    starts = torch.cat([starts, R[frames][:, None], mirrored(R[frames])[:, None]], 1)
     screening, rest = cfg.window_scales[:SCREENING_ROUNDS], cfg.window_scales[SCREENING_ROUNDS:]
 
     def adjusted(starts: Float[Tensor, "g s f 3 3"], scales: Sequence[float]) -> Windows:
         windows = _adjust_starts(cfg, inputs, frames, *tracks, starts, scales, rng)
+        if not evenly:
+            return windows
         even = replace(cfg, frontier_weight=1.0, iterations=1)
         return replace(windows, loss=_adjust_starts(even, inputs, frames, *tracks, windows.R, scales[-1:], rng).loss)
 
     screened = adjusted(starts, screening)
-    return adjusted(screened.R[torch.arange(len(frames))[:, None], screened.promising(KEPT_STARTS)], rest)
+    kept = screened.promising(KEPT_STARTS) if evenly else screened.loss.topk(KEPT_STARTS, dim=1, largest=False).indices
+    return adjusted(screened.R[torch.arange(len(frames))[:, None], kept], rest)
 
 
 def _adjust_starts(

@@ -244,17 +244,17 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
     steps: list[Step] = []
     first = [TryCircularMotion(), AverageRotations(), *map(AdjustWindows, cfg.window_sizes)]
     mending = [*relocalization * cfg.relocalizations, keep]
+    adjusting = list(map(AdjustAll, cfg.global_scales))
     # The loss of the first attempt decides whether any more steps follow.
-    steps += map(Step, (*first, *map(AdjustAll, cfg.global_scales), keep))
+    steps += map(Step, (*first, *adjusting, keep))
     steps += [Step(phase, mends=True) for phase in mending]
-    again = list(map(AdjustAll, cfg.global_scales))
     early = [Perturb(keep.scale)] * cfg.early_perturbations
-    growing: list[list[Phase]] = [[GrowWindows(size), *again, *early, keep] for size in cfg.growing]
+    growing: list[list[Phase]] = [[GrowWindows(size), *adjusting, *early, keep] for size in cfg.growing]
     others: list[list[Phase]] = []
     for other in cfg.fallbacks:
         *shorter, longest = other.window_sizes
         windows = [*(AdjustWindows(size, widely=True) for size in shorter)]
-        others.append([*windows, AdjustWindows(longest, widely=True, stretch=other.stretch), *again, keep])
+        others.append([*windows, AdjustWindows(longest, widely=True, stretch=other.stretch), *adjusting, keep])
     # Relocalization fits contours alone, so the best attempt is changed after it and compared by matches as well.
     mending = [*mending, *[Perturb(keep.scale)] * cfg.perturbations, keep, *mending]
     attempt = 0
@@ -266,7 +266,8 @@ def schedule(cfg: BaseConfig, *, hidden: bool = False) -> list[Step]:
             steps += [Step(phase, attempt) for phase in (AverageRotations(), *phases)]
         steps += [Step(phase, attempt, mends=True) for phase in mending]
     if growing and others:
-        steps.append(Step(TakeBetter(), attempt, mends=True))
+        # Also where the last attempt agreed with the poses set aside: it may differ from them in some frames.
+        steps.append(Step(TakeBetter()))
     steps.append(Step(AlignTexture()))
     for _ in range(cfg.max_corrections):
         steps += map(Step, (CheckSettled(keep.scale), AlignColours(), TrackTexture(), *relocalization))

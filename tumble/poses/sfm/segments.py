@@ -93,7 +93,7 @@ def segmented_poses(
     """Poses of all frames that can be understood, and their tracks; None if no segment was found.
 
     Args:
-        cfg: BaseConfig of bundle adjustment.
+        cfg: Settings of bundle adjustment.
         R: Approximate rotations of all frames, `R_cam_obj`.
         rng: Source of random numbers.
     """

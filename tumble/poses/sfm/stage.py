@@ -15,9 +15,10 @@ The motion of a turntable is found before all that, from contours or from the te
 nothing else is done (`circular_motion`).
 
 A capture that has not converged is attempted again, until two attempts agree: windows are adjusted from many starts,
-and joined to larger and larger ones (`adjustment.grow_windows`). Otherwise parts of the best attempt are changed at
-random, and what lowers the loss is kept (`perturbation`). A focal length that is only assumed is estimated as well
-whenever all frames are adjusted together.
+and joined to larger and larger ones (`adjustment.grow_windows`). If none agree, parts of the best attempt are changed
+at random, and what lowers the loss is kept (`perturbation`); the same follows with windows of fixed sizes, and the
+better result is taken. A focal length that is only assumed is estimated as well whenever all frames are adjusted
+together.
 
 Unit of length until `finish`: the mean distance between camera and object.
 """
@@ -87,7 +88,7 @@ from tumble.poses.sfm.schedule import (
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 34
+VERSION = 35
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -367,9 +368,10 @@ def _turns(inputs: Inputs, poses: Poses) -> symmetry.Turns | None:
 
 def _spin(inputs: Inputs, poses: Poses) -> symmetry.Spin | None:
     """Rotations about the axis that the texture of a body of revolution shows, relative to the poses."""
-    if not _has_spin(inputs, poses):
+    surface = _surface_of_revolution(inputs, poses)
+    if surface is None:
         return None
-    return symmetry.estimate_spin(inputs.capture, in_unit_sphere(inputs, poses.R, poses.t))
+    return symmetry.estimate_spin(inputs.capture, in_unit_sphere(inputs, poses.R, poses.t), surface)
 
 
 def _keep_best(cfg: Config, inputs: Inputs, state: State, scale: float, *, is_other: bool) -> PhaseResult:
@@ -396,8 +398,10 @@ def _set_aside(_: Inputs, state: State) -> PhaseResult:
 
 
 def _take_better(_: Inputs, state: State) -> PhaseResult:
-    """The best poses of all: those set aside or those found since."""
+    """The best poses of all, if some were set aside: these or those found since."""
     memory = state.memory
+    if "aside_loss" not in memory:
+        return state.params, {}
     if memory["aside_loss"] <= memory["loss"]:
         memory |= {name: memory[f"aside_{name}"] for name in (*vars(state.params), "loss")}
     return Poses(**{name: memory[name] for name in vars(state.params)}), {"loss": memory["loss"]}
@@ -409,29 +413,31 @@ def _difference(inputs: Inputs, a: Poses, b: Poses) -> Float[Tensor, " t"]:
     For a body of revolution between its axes: texture tells its rotation about the axis afterwards (`AlignTexture`),
     which matches of all attempts get wrong in different ways.
     """
-    if _has_spin(inputs, b):
+    if _surface_of_revolution(inputs, b) is not None:
         found = symmetry.axis_deviation(inputs.capture, *(in_unit_sphere(inputs, each.R, each.t) for each in (a, b)))
         if found is not None:
             return found.double()
     return deviation(a.R, b.R)
 
 
-def _has_spin(inputs: Inputs, poses: Poses) -> bool:
-    """Whether the object is a body of revolution, whose silhouettes show its rotation but for that about the axis.
+def _surface_of_revolution(inputs: Inputs, poses: Poses) -> symmetry.SurfaceOfRevolution | None:
+    """The surface of a body of revolution, whose silhouettes show its rotation but for that about the axis; None if the
+    object is none.
 
     Silhouettes that are nearly symmetric, each on its own, also belong to other bodies (a bell pepper), but at their
-    poses contours contradict a turn about the axis.
+    poses contours contradict a turn about the axis: to one side in even frames, to the other in odd ones.
     """
     if not inputs.mirror_symmetry.is_revolution or inputs.mirror_symmetry.is_sphere:
-        return False
-    turned = symmetry.turned_to_and_fro(inputs.capture, in_unit_sphere(inputs, poses.R, poses.t), PROBED_TURN)
-    if turned is None:
-        return True
-    before, after = (
-        _contour_costs(inputs, each, RELOCALIZATION_SCALE).median()
-        for each in (poses, _from_unit_sphere(inputs, poses, turned))
-    )
-    return bool(after <= max(PROBED_COST_RATIO * float(before), TOLERATED_COST))
+        return None
+    trajectory = in_unit_sphere(inputs, poses.R, poses.t)
+    surface = symmetry.surface_of_revolution(inputs.capture, trajectory)
+    if surface is None:
+        return None
+    angle = torch.full((len(trajectory),), PROBED_TURN)
+    angle[1::2] *= -1
+    turned = _from_unit_sphere(inputs, poses, surface.turned(trajectory, angle))
+    before, after = (_contour_costs(inputs, each, RELOCALIZATION_SCALE).median() for each in (poses, turned))
+    return surface if after <= max(PROBED_COST_RATIO * float(before), TOLERATED_COST) else None
 
 
 def _try_circular_motion(inputs: Inputs, state: State) -> PhaseResult:

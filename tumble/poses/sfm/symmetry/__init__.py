@@ -10,10 +10,11 @@ from tumble.poses.sfm.symmetry import texture_information
 from tumble.poses.sfm.symmetry.mirror import MirrorSymmetry, mirror_symmetry
 from tumble.poses.sfm.symmetry.spin import (
     Spin,
+    SurfaceOfRevolution,
     axis_deviation,
     estimate_spin,
     steady_observations,
-    turned_to_and_fro,
+    surface_of_revolution,
 )
 from tumble.poses.sfm.symmetry.texture_tracks import Agreement, texture_agreement, texture_tracks
 from tumble.poses.sfm.symmetry.turns import Turns, estimate_turns
@@ -22,14 +23,15 @@ __all__ = [
     "Agreement",
     "MirrorSymmetry",
     "Spin",
+    "SurfaceOfRevolution",
     "Turns",
     "axis_deviation",
     "estimate_spin",
     "estimate_turns",
     "mirror_symmetry",
     "steady_observations",
+    "surface_of_revolution",
     "texture_agreement",
     "texture_information",
     "texture_tracks",
-    "turned_to_and_fro",
 ]

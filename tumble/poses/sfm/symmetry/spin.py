@@ -124,14 +124,15 @@ class Spin:
         return self.joined > 0 or int(contradicted.sum()) >= MIN_CONTRADICTED
 
 
-def estimate_spin(capture: Capture, trajectory: Trajectory) -> Spin | None:
+def estimate_spin(capture: Capture, trajectory: Trajectory, surface: SurfaceOfRevolution | None = None) -> Spin | None:
     """Spin of a body of revolution in every frame; None if the poses and silhouettes contradict each other.
 
     Args:
         capture: Images and masks of all frames.
         trajectory: Poses that are right but for the spin; the object lies in the unit sphere.
+        surface: The body's surface at these poses; None: that of the visual hull.
     """
-    surface = surface_of_revolution(capture, trajectory)
+    surface = surface or surface_of_revolution(capture, trajectory)
     if surface is None or len(trajectory) < 2:
         return None
     contrast, weight = _unwrapped(capture, trajectory, surface)
@@ -197,19 +198,6 @@ def surface_of_revolution(capture: Capture, trajectory: Trajectory) -> SurfaceOf
     return SurfaceOfRevolution(
         centre, torch.stack([across, torch.linalg.cross(axis, across), axis]), height, (area / math.pi).sqrt()
     )
-
-
-def turned_to_and_fro(capture: Capture, trajectory: Trajectory, angle: float) -> Trajectory | None:
-    """Poses whose object is turned about its axis of revolution, one way in even frames, the other way in odd ones.
-
-    None if the poses and silhouettes contradict each other.
-    """
-    surface = surface_of_revolution(capture, trajectory)
-    if surface is None:
-        return None
-    sign = torch.ones(len(trajectory))
-    sign[1::2] = -1
-    return surface.turned(trajectory, angle * sign)
 
 
 def axis_deviation(capture: Capture, a: Trajectory, b: Trajectory) -> Float[Tensor, " t"] | None:
