@@ -20,12 +20,12 @@ def test_a_part_that_fails_keeps_what_it_measured(tmp_path: Path, monkeypatch: p
         raise RuntimeError("out of memory")
 
     monkeypatch.setitem(gpu.PARTS, "draft", part)
-    assert not gpu.run_part(gpu.Plan(tmp_path, None, dry=True), "draft")
+    assert not gpu.run_part(gpu.Plan(tmp_path, (), dry=True), "draft")
     assert json.loads((tmp_path / "draft.json").read_text()) == {"seconds": 3, "failed": "RuntimeError: out of memory"}
 
 
 def test_a_part_is_stopped_at_its_limit(tmp_path: Path) -> None:
-    row = gpu.result_of_process(gpu.Plan(tmp_path, None, dry=True), "standard", 0.1)
+    row = gpu.result_of_process(gpu.Plan(tmp_path, (), dry=True), "standard", 0.1)
     assert row["failed"] == "stopped at its limit of 0 s"
     assert row["wall_seconds"] < gpu.GRACE
 

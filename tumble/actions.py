@@ -17,7 +17,7 @@ from typing import Any, Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble import backends, pipeline
+from tumble import pipeline
 from tumble.engine import run
 from tumble.evaluation import (
     SHEET,
@@ -202,7 +202,6 @@ def run_capture(
     white: tuple[int, int, str] | None = None,
     pick: bool = False,
     device: str = "cpu",
-    graph: bool = False,
 ) -> Path:
     """Reconstruct a capture or footage in a run directory and write the report; returns the path of the report.
 
@@ -212,21 +211,18 @@ def run_capture(
         up: See `pipeline.reconstruct`.
         white: See `pipeline.reconstruct`.
         pick: Let the user draw a box around the object in the browser.
-        graph: See `pipeline.reconstruct`.
 
     Raises:
-        ValueError: There is no such matcher, device, up direction or white pixel, or the device cannot record steps.
+        ValueError: There is no such matcher, device, up direction or white pixel.
         BadFile: See `pipeline.capture_of` and `pipeline.reconstruct`.
     """
     from tumble.report import write_report
 
     place = usable_device(device)
     load_plugin("matching", recipe.matcher)  # fail before the video is converted
-    if graph:
-        backends.recorder(place)
     options = pick_box(path, options, out / run.CAPTURE) if pick else options
     capture = pipeline.capture_of(path, out, options)
-    pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, white=white, device=place, graph=graph)
+    pipeline.reconstruct(capture, out, recipe, poses=poses, up=up, white=white, device=place)
     return write_report(out, capture=capture, device=place)
 
 

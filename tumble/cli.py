@@ -179,7 +179,6 @@ def run(
     size: Size = None,
     pick: bool = False,
     device: Device = "cpu",
-    graph: bool = False,
     seed: int = 0,
 ) -> None:
     """Reconstruct an object from a video: its motion, geometry, albedo and roughness, and the light of the room.
@@ -193,7 +192,8 @@ def run(
         quality: How much is computed, and from how many frames of which size if the input is footage.
             draft: 3,000 and 1,000 steps. 23 seconds on two CPU cores for 64 frames of 128 x 128 pixels with known
             poses, where it reaches 23 to 35 dB of albedo. All measured runs are of this quality.
-            standard: 20,000 and 10,000 steps, for a GPU. No measured run yet.
+            standard: 20,000 and 10,000 steps, for a GPU. 75 seconds on an H200 for 100 frames of 512 x 512 pixels with
+            known poses (benchmarks/gpu.md).
             full: 150,000 steps each, for a GPU. Never run.
             paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
             (docs/method.md), where it is far behind draft.
@@ -201,8 +201,6 @@ def run(
         adjustment: Orientation and colour of the results.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`; then, if you
             like, look at the masks and correct them by clicks on any frame.
-        graph: Record a step of the optimisation on the GPU and replay it as a whole, as a CUDA graph. Needs
-            `--device cuda`. No GPU has run it yet.
         seed: Seed of all random numbers.
     """
     from dataclasses import replace
@@ -215,8 +213,8 @@ def run(
     if tracking.route:
         recipe = progressive_poses(recipe) if tracking.route == "progressive" else replace(recipe, track=DRAFT.track)
     options = at_quality(options, quality, frames=frames, size=size)
-    place = {"device": device, "graph": graph}
-    print(run_capture(capture, out, recipe, options, poses=tracking.poses, pick=pick, **place, **vars(adjustment)))
+    given = {"poses": tracking.poses, "pick": pick, "device": device, **vars(adjustment)}
+    print(run_capture(capture, out, recipe, options, **given))
 
 
 def batch(

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import torch
 
-from tumble import backends, matching, recipes
+from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import absolute_colour, albedo_solve, decompose, refine
@@ -131,7 +131,6 @@ def reconstruct(
     up: str = "auto",
     white: tuple[int, int, str] | None = None,
     device: torch.device | str = "cpu",
-    graph: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Asset:
     """Reconstruct an object's motion, geometry, albedo and roughness, and the light. Ground truth is never read.
@@ -152,8 +151,6 @@ def reconstruct(
         white: Column and row of a pixel and the name of its frame, which shows a neutral white or grey, on the object
             or on a card beside it that faces the camera. It determines the colour of the light. No stage depends on it.
         device: Where stages 2 and 3 and the network of a matcher run.
-        graph: Whether stages 2 and 3 record a step on the GPU and replay it as a whole, as a CUDA graph. No stage
-            depends on it, but for rounding. No GPU has run it yet.
         progress: Called every few seconds.
 
     Returns:
@@ -161,12 +158,9 @@ def reconstruct(
 
     Raises:
         BadFile: The capture breaks a rule or cannot be tracked, or `out` holds another run.
-        ValueError: There is no such direction, frame or pixel, or the capture's own poses define its frame, or the
-            device cannot record steps.
+        ValueError: There is no such direction, frame or pixel, or the capture's own poses define its frame.
         NotFinite: A NaN occurred in training; the message names the tensor, the step and the saved state.
     """
-    if graph:
-        backends.recorder(torch.device(device))  # fails before stage 1 runs
     where = IN_MEMORY if isinstance(capture, Capture) else Path(capture)
     capture = capture if isinstance(capture, Capture) else read_capture(capture)
     if poses == "estimate" or isinstance(poses, PoseResult):
@@ -178,11 +172,11 @@ def reconstruct(
     _check_up(up, capture, where)
     _check_white(white, capture)
     if out is None:
-        opened = run.Run(None, recipe, progress, graph)
+        opened = run.Run(None, recipe, progress)
         return _upright(*_reconstruct(opened, capture, where, found, white, device), up)
     out = Path(out)
     with run.exclusive_access(out):
-        opened = replace(run.open(out, where, recipe, content=content_key(capture), report=progress), graph=graph)
+        opened = run.open(out, where, recipe, content=content_key(capture), report=progress)
         asset, names = _reconstruct(opened, capture, where, found, white, device)
         asset = _upright(asset, names, up)
         _keep(asset, names, out)

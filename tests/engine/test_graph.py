@@ -108,7 +108,7 @@ def recorder() -> Iterator[SimulatedRecorder]:
 
 
 def is_same(cfg: Config) -> bool:
-    usual, replayed = drive(THIS, cfg, None, seed=3), drive(THIS, cfg, None, seed=3, graph=True)
+    usual, replayed = (drive(THIS, cfg, None, seed=3, graph=graph) for graph in (False, True))
     return all(torch.equal(usual[name], replayed[name]) for name in usual)
 
 
@@ -130,12 +130,12 @@ def test_a_number_that_is_not_sent_stays_as_it_was_recorded(recorder: SimulatedR
 @pytest.mark.parametrize("broken", ["asks", "copies"])
 def test_what_a_gpu_cannot_capture_is_an_error_in_the_simulation(recorder: SimulatedRecorder, broken: str) -> None:
     with pytest.raises(Forbidden):
-        drive(THIS, Config(broken=broken), None, seed=3, graph=True)
+        drive(THIS, Config(broken=broken), None, seed=3)
 
 
 def test_a_recorded_step_must_not_replace_a_tensor_of_the_state(recorder: SimulatedRecorder) -> None:
     with pytest.raises(AssertionError, match="must not replace"):
-        drive(THIS, Config(broken="replaces"), None, seed=3, graph=True)
+        drive(THIS, Config(broken="replaces"), None, seed=3)
 
 
 def test_a_recording_whose_memory_became_too_small_is_made_again(
@@ -150,7 +150,7 @@ def test_a_recording_whose_memory_became_too_small_is_made_again(
         longest.fill_(3 if state.step > 8 else 2)
         return replace(prepare(cfg, inputs, state), late=False)
 
-    drive(stage_with(prepare=fuller), Config(steps=24), None, seed=3, graph=True)
+    drive(stage_with(prepare=fuller), Config(steps=24), None, seed=3)
     assert len(recorder.tapes) == 2
     assert (limit.capacity, recorder.replays) == (8, 20)
 
@@ -173,18 +173,32 @@ def test_a_gradient_that_is_not_finite_in_replayed_steps_stops_them(recorder: Si
         return replace(numbers, weight=float("nan") if state.step == 30 else 1.0, late=False)
 
     with pytest.raises(optim.NotFinite, match="in one of the last 50 steps is not finite at step 49"):
-        drive(stage_with(prepare=poisoned), Config(steps=60), None, seed=3, graph=True)
+        drive(stage_with(prepare=poisoned), Config(steps=60), None, seed=3)
 
 
-def test_a_stage_that_cannot_be_recorded_ignores_the_option(recorder: SimulatedRecorder) -> None:
+def test_a_stage_that_cannot_be_recorded_runs_as_usual(recorder: SimulatedRecorder) -> None:
     assert is_same(Config(broken="always"))
     assert recorder.sent == 0
 
 
-def test_a_stage_in_one_part_ignores_the_option_and_the_cpu_refuses_it() -> None:
-    assert drive(stage_with(), Config(), None, seed=3, graph=True)["sum"] == drive(THIS, Config(), None, seed=3)["sum"]
-    with pytest.raises(ValueError, match=r"--graph: only an NVIDIA GPU can record steps, .* add --device cuda"):
-        drive(THIS, Config(), None, seed=3, graph=True)
+def test_a_stage_in_one_part_and_the_cpu_record_nothing() -> None:
+    assert backends.recorder(torch.device("cpu")) is None
+    with simulated_graphs() as recorder:
+        drive(stage_with(), Config(), None, seed=3)
+        assert recorder.sent == 0
+
+
+def test_steps_that_a_device_refuses_to_record_run_as_usual_after_a_warning(
+    recorder: SimulatedRecorder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refused(work: Any) -> Any:
+        raise backends.CannotRecord("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(recorder, "record", refused)
+    assert is_same(Config(grow=8))
+    assert [x.getMessage() for x in caplog.records] == [
+        "steps are not replayed as a CUDA graph, and are slower: operation not permitted when stream is capturing"
+    ]
 
 
 # The calls of CUDA ----------------------------------------------------------------------------------------------------
@@ -230,7 +244,7 @@ def test_a_cuda_graph_is_captured_on_the_stream_of_the_session_and_known_to_warp
     def refused() -> None:
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    with pytest.raises(RuntimeError, match=r"cannot be captured as a CUDA graph \(operation not .* leave --graph out"):
+    with pytest.raises(backends.CannotRecord, match="operation not permitted"):
         recorder.record(refused)
 
 

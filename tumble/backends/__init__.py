@@ -57,7 +57,7 @@ from tumble.backends._geometry.contract import (
     FuseKernel,
     ReducedBundle,
 )
-from tumble.backends._graphs import Recorder, Recording, as_recording, recording
+from tumble.backends._graphs import CannotRecord, Recorder, Recording, as_recording, recording
 
 __all__ = [
     "ALPHA_MAX",
@@ -86,6 +86,7 @@ __all__ = [
     "OBJECT",
     "RATIO_MAX",
     "ROUGHNESS_MIN",
+    "CannotRecord",
     "Recorder",
     "Recording",
     "ReducedBundle",
@@ -273,19 +274,10 @@ def bundle_kernel() -> BundleKernel | None:
     return None if backend.ready(torch.device("cpu"), torch.float32) else cast(BundleKernel, backend)
 
 
-def recorder(device: torch.device) -> Recorder:
-    """What records steps on a device, to replay them as a whole. No GPU has run it yet.
-
-    Raises:
-        ValueError: The device has none, as the CPU, or its kernels are not ready.
-    """
+def recorder(device: torch.device) -> Recorder | None:
+    """What records steps on a device, to replay them as a whole; None if the device has none, as the CPU."""
     make = getattr(load(device.type), "recorder", None) if device.type in names() else None
-    if make is None:
-        fix = "add --device cuda, or leave --graph out"
-        raise ValueError(f"--graph: only an NVIDIA GPU can record steps, not the device {device.type}; {fix}")
-    if reason := load(device.type).ready(device, torch.float32):
-        raise ValueError(f"--graph: {reason}")
-    return make(device)
+    return None if make is None or load(device.type).ready(device, torch.float32) else make(device)
 
 
 @cache

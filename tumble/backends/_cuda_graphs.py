@@ -1,4 +1,4 @@
-"""Recordings as CUDA graphs. No GPU has run them yet; the rules below are those of torch 2.13 and Warp 1.19.
+"""Recordings as CUDA graphs.
 
 torch captures everything that is launched on its current stream, in memory of its own (a private pool). Warp's kernels
 go to the same stream. Warp is told about the capture: it then keeps the modules of its kernels loaded for as long as
@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tumble.backends._graphs import Recording, as_recording
+from tumble.backends._graphs import CannotRecord, Recording, as_recording
 from tumble.backends._pairs import PairLimit
 
 
@@ -56,7 +56,7 @@ class CudaRecorder:
         except torch.OutOfMemoryError:
             raise
         except RuntimeError as error:
-            raise RuntimeError(f"a step cannot be captured as a CUDA graph ({error}); leave --graph out") from error
+            raise CannotRecord(str(error)) from error
 
         def replay() -> None:
             assert of_warp, "the capture has ended"  # Warp's part of the graph lives as long as this function

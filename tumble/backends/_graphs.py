@@ -30,6 +30,10 @@ def as_recording() -> Iterator[None]:
         _recording.reset(token)
 
 
+class CannotRecord(RuntimeError):
+    """Error for work that cannot be recorded; nothing of it was done."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """Recorded operations of a function."""
@@ -58,5 +62,8 @@ class Recorder(Protocol):
         """Record a function, whose operations are not executed: `Recording.replay` does that, also the first time.
 
         The function was called a few times before, so that everything that is kept between calls exists.
+
+        Raises:
+            CannotRecord: The function does what cannot be recorded.
         """
         ...

@@ -268,7 +268,8 @@ def build(
     with runtime.stream(means.device):
         gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
         runtime.launch(tracing.enclose, len(means), *gaussians, record, low, high)
-        boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3))
+        # Of Warp's constructors on a GPU that whose trees are traced fastest (docs/method.md).
+        boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3), constructor="cubql")
     return WarpBvh(boxes, record, low, high)
 
 
@@ -304,7 +305,7 @@ def visible(
     bits = _int32(points, len(points), words)
     with runtime.stream(points.device):
         inputs = [x.contiguous() for x in (points, normals, directions)]
-        runtime.launch(tracing.trace_visibility, (words, len(points)), bvh.boxes.id, bvh.record, *inputs, bits)
+        runtime.launch(tracing.trace_visibility, (len(points), 32 * words), bvh.boxes.id, bvh.record, *inputs, bits)
     return bits
 
 

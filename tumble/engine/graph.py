@@ -1,4 +1,4 @@
-"""Steps that are recorded on a GPU and replayed as a whole, as a CUDA graph. No GPU has run this yet.
+"""Steps that are recorded on a GPU and replayed as a whole, as a CUDA graph.
 
 The host then asks the device once for a whole step, instead of for every operation of it. A stage that offers this
 splits its step in two. `prepare` is what runs on the host: whatever changes shapes, replaces tensors or asks the device
@@ -6,9 +6,11 @@ for a value, and the *numbers* of this step, such as the index of its frame. `ad
 tensors it asks the device for nothing and replaces no tensor of the state, so that it can be recorded.
 
 Numbers and learning rates lie in one buffer on the device, which the host writes before each replay. A recording is
-valid as long as the state consists of the same tensors; afterwards some steps run as usual, and a new one is made.
+valid as long as the state consists of the same tensors; afterwards some steps run as usual, and a new one is made. If a
+step cannot be recorded, a warning says so, and all steps run as usual.
 """
 
+import logging
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
@@ -22,6 +24,8 @@ from torch import Tensor
 from tumble import backends
 from tumble.engine import optim
 from tumble.io import tree
+
+logger = logging.getLogger(__name__)
 
 WARMUP = 3
 """Steps before a recording, in which kernels are compiled and everything is made that is kept between steps."""
@@ -54,17 +58,13 @@ class SplitStage(Protocol):
 
 @contextmanager
 def steps(stage: Any, cfg: Any, inputs: Any, state: Any) -> Iterator[Step]:
-    """The step of a stage, which is recorded and replayed if the stage is a `SplitStage` that allows it.
-
-    Raises:
-        ValueError: The state's device cannot record steps.
-    """
+    """The step of a stage: recorded and replayed if it is a `SplitStage` that allows it and the device can do so."""
     usual: Step = stage.step
-    if not (isinstance(stage, SplitStage) and stage.can_be_recorded(cfg)):
+    splits = isinstance(stage, SplitStage) and stage.can_be_recorded(cfg)
+    recorder = backends.recorder(next(iter(tree.named_tensors(state.params).values())).device) if splits else None
+    if recorder is None:
         yield usual
         return
-    device = next(iter(tree.named_tensors(state.params).values())).device
-    recorder = backends.recorder(device)
     with recorder.session():
         try:
             yield Replayed(stage, recorder).step
@@ -97,6 +97,8 @@ class Replayed:
     """Of the recording, or of the next one."""
     usual: int = 0
     """Steps without a recording since the last change."""
+    refused: bool = False
+    """Whether a recording failed, so that none is tried again."""
     recording: backends.Recording | None = None
     replays: int = 0
     """Replays of the recording."""
@@ -110,7 +112,7 @@ class Replayed:
         now = validity(numbers, state)
         if not now.equals(self.validity):
             self.validity, self.usual, self.recording = now, 0, None
-        if self.recording is None and self.usual < WARMUP:
+        if self.recording is None and (self.usual < WARMUP or self.refused):
             self.usual += 1
             scalars = advance()
         else:
@@ -123,7 +125,12 @@ class Replayed:
     def replayed(self, advance: Callable[[], Mapping[str, Tensor | float]]) -> Mapping[str, Tensor | float]:
         """Replay the recording of `advance`, which is made if there is none."""
         if self.recording is None:
-            self.recording, self.replays = self.recorder.record(advance), 0
+            try:
+                self.recording, self.replays = self.recorder.record(advance), 0
+            except backends.CannotRecord as error:
+                logger.warning("steps are not replayed as a CUDA graph, and are slower: %s", error)
+                self.refused = True
+                return advance()
         scalars: Mapping[str, Tensor | float] = self.recording.result
         self.recording.replay()
         self.replays += 1

@@ -127,7 +127,7 @@ def drive(
     report: Callable[[Progress], None] | None = None,
     name: str = "",
     key: str = "",
-    graph: bool = False,
+    graph: bool = True,
 ) -> Any:
     """Train a stage from its start or its checkpoint to the end, and return its output.
 
@@ -145,11 +145,10 @@ def drive(
             `REPORT_SECONDS`.
         name: Name of the stage for messages.
         key: Hash of the inputs. A checkpoint with another key, version, configuration or seed is ignored.
-        graph: Whether the steps of a stage that offers it are recorded on the GPU and replayed as a whole (`graph`);
-            other stages ignore it. No GPU has run it yet.
+        graph: Whether the steps of a stage that offers it are recorded and replayed as a whole (`graph`) on a device
+            that can do so.
 
     Raises:
-        ValueError: There is no GPU that can record the stage's steps.
         NotFinite: A tensor became NaN or infinite; the last valid checkpoint is kept.
         BadFile: The checkpoint does not match the stage.
         OSError: The checkpoint cannot be written; the previous one is kept.

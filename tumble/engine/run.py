@@ -126,8 +126,6 @@ class Run:
     """A frozen dataclass with the settings of the stages and a `seed`."""
     report: Callable[[Progress], None] | None = None
     """Called with the progress of the stages."""
-    graph: bool = False
-    """Whether stages that offer it record their steps on the GPU and replay them (`loop.drive`)."""
 
 
 @contextlib.contextmanager
@@ -344,7 +342,7 @@ def stage(
     kind = _device(inputs).type
     own_key = key(name, stage, cfg, [*input_keys, f"seed {seed}", *([] if kind == "cpu" else [kind])])
     if run.path is None:
-        return loop.drive(stage, cfg, inputs, seed=seed, report=run.report, name=name, graph=run.graph), own_key
+        return loop.drive(stage, cfg, inputs, seed=seed, report=run.report, name=name), own_key
     stage_path = run.path / folder
     if not _is_done(stage_path, own_key):
         log(run, {"name": name, "event": "start", "key": own_key})
@@ -367,7 +365,6 @@ def stage(
             report=report,
             name=name,
             key=own_key,
-            graph=run.graph,
         )
         about = {"stage": name, "version": stage.VERSION, "seed": seed, "inputs": list(input_keys)}
         _store(result, stage_path, {"key": own_key, **about, "config": _plain(cfg)})

@@ -7,6 +7,7 @@ several rotated sets of directions that all Gaussians share, or traced from the 
 """
 
 import math
+import sys
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -15,7 +16,7 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from tumble.engine import CACHE, State, optim
+from tumble.engine import CACHE, State, graph, optim
 from tumble.inverse_rendering import losses, pose_network, sh_lighting, specular_fit
 from tumble.inverse_rendering.material_params import (
     ALBEDO_RANGE,
@@ -299,8 +300,9 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
     rng.set_state(before.rng.get_state())
     state = State(0, params, optim.adam(params, learning_rates(cfg, params.material)), rng, dict(before.memory))
     errors = []
-    for state.step in range(steps):
-        errors.append(step(cfg, inputs, state)["render"])
+    with graph.steps(sys.modules[__name__], cfg, inputs, state) as steps_on:
+        for state.step in range(steps):  # a replay overwrites what the last one returned
+            errors.append(torch.as_tensor(steps_on(cfg, inputs, state)["render"]).clone())
     state.step = steps
     return state, float(torch.stack(errors[steps // 2 :]).mean())
 

@@ -75,13 +75,19 @@ def prefilter(environment: Environment) -> Prefiltered:
     """Convolve an environment map with the lobes of all levels; linear in its radiance and differentiable."""
     unfiltered = radiance = environment.radiance
     if radiance.shape[0] > ROWS:
-        size, weight = (ROWS, 2 * ROWS), texel_solid_angles(*radiance.shape[:2]).to(radiance)
+        size, weight = (ROWS, 2 * ROWS), _weight_on(*radiance.shape[:2], radiance.dtype, radiance.device)
         total = adaptive_avg_pool2d((radiance * weight[..., None]).movedim(-1, 0), size)
         radiance = (total / adaptive_avg_pool2d(weight[None], size)).movedim(0, -1)
     h, w, _ = radiance.shape
     lobes = _lobes_on(h, w, radiance.dtype, radiance.device)
     stack = backends.choose(radiance.device, radiance.dtype).prefilter(radiance, lobes)
     return Prefiltered(environment, stack.view(LEVELS, h, w, 3), unfiltered)
+
+
+@cache
+def _weight_on(h: int, w: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "h w"]:
+    """Solid angles of texels, copied to a device once: a step that is recorded must not copy."""
+    return texel_solid_angles(h, w).to(device, dtype)
 
 
 @cache

@@ -168,6 +168,26 @@ def count_lanes(out: wp.array[int], i: int, x: bool):
 
 @wp.func_native(
     """
+    int* to = out.data + (size_t)row * out.shape[1] + (column >> 5);
+#if defined(__CUDA_ARCH__)
+    int word = __ballot_sync(0xffffffffu, x);
+    if ((threadIdx.x & 31) == 0) *to = word;
+#else
+    *to = (column & 31 ? *to : 0) | (int)((unsigned)x << (column & 31));
+#endif
+"""
+)
+@no_type_check
+def write_lanes(out: wp.array2d[int], row: int, column: int, x: bool):  # type: ignore
+    """Write x as bit `column % 32` of out[row, column // 32]; lanes have 32 columns of a word in their order.
+
+    All lanes must call this function, with the same row.
+    """
+    ...
+
+
+@wp.func_native(
+    """
     float* to = out.data + (size_t)row * out.shape[1] + column;
 #if defined(__CUDA_ARCH__)
     // Butterfly reduction: lanes 16 apart exchange halves of x, lanes 8 apart exchange quarters, and so on, so that
