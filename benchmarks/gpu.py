@@ -1,16 +1,17 @@
 """All measurements that need an NVIDIA GPU, in one command of at most nine minutes: tests, speed, scores and memory.
 
-`make gpu`, which is `python -m benchmarks.gpu [--capture CAPTURE] [--only PART...]`, writes `gpu.json`, images and the
-output of the tests into `$OUT`, or `build/gpu`. It needs no network, only the packages on Python's path: those of the
-package, its extra `cuda`, and pytest; `python -m benchmarks.requirements` names the missing ones. The parts run in this
-order:
+`make gpu`, which is `python -m benchmarks.gpu [--capture CAPTURE...] [--quality NAME...] [--only PART...]`, writes
+`gpu.json`, images and the output of the tests into `$OUT`, or `build/gpu`. It needs no network, only the packages on
+Python's path: those of the package, its extra `cuda`, and pytest; `python -m benchmarks.requirements` names the missing
+ones. The parts run in this order:
 
     tests     the tests that are marked `gpu`
     kernels   milliseconds of each kernel: on the GPU, in plain torch on the GPU, and on the CPU
     draft     DRAFT on the bundled clip with its true poses, on the GPU and on the CPU: seconds, scores, difference
     profile   kernel launches, synchronisations and copies in one step of stages 2 and 3
-    standard  STANDARD on `--capture`, or on the bundled clip with 200 frames of 512 x 512: seconds, memory, scores
-    graphs    milliseconds of a step of stages 2 and 3 with and without a CUDA graph (`tumble run --graph`)
+    standard  STANDARD on the bundled clip with 200 frames of 512 x 512: seconds, memory, scores; with `--capture`,
+              the recipes `--quality` (draft and standard) on each of those captures, in as many times its limit
+    graphs    milliseconds of a step of stages 2 and 3 with and without a CUDA graph
 
 Each part is a process of its own with a limit of time. A part that fails, or is stopped at its limit, is marked in
 `gpu.json` beside what it measured until then, and the next part runs. `--dry` runs everything on the CPU with tiny
@@ -49,7 +50,7 @@ from tumble.evaluation import align_views, predict_views, read_with_truth, score
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files, tree
 from tumble.pipeline import reconstruct
-from tumble.recipes import DRAFT, SMOKE, STANDARD, Recipe, known_poses
+from tumble.recipes import DRAFT, QUALITIES, SMOKE, STANDARD, Recipe, known_poses
 from tumble.scene import Asset, Capture, Truth
 
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (100_000, 256), (100_000, 512), (100_000, 1024)]
@@ -79,10 +80,13 @@ class Plan:
 
     out: Path
     """Folder of all results."""
-    capture: Path | None
-    """Capture of the STANDARD run; None for the bundled clip."""
+    captures: tuple[Path, ...]
+    """Captures of the STANDARD runs; none for the bundled clip."""
     dry: bool
     """Whether everything runs on the CPU with tiny settings."""
+
+    qualities: tuple[str, ...] = ("draft", "standard")
+    """Recipes for `captures`."""
 
     @property
     def device(self) -> torch.device:
@@ -92,7 +96,8 @@ class Plan:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--capture", type=Path, help="capture of the STANDARD run, with known poses")
+    parser.add_argument("--capture", type=Path, nargs="+", default=(), help="captures to run, with known poses")
+    parser.add_argument("--quality", nargs="+", choices=QUALITIES, default=Plan.qualities, help="recipes for them")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT") or "build/gpu"))
     parser.add_argument("--dry", action="store_true", help="on the CPU with tiny settings, to test the command")
@@ -100,14 +105,15 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.dry or torch.cuda.is_available()):
         sys.exit("torch finds no NVIDIA GPU on this machine; `tumble doctor` lists what it finds")
-    plan = Plan(arguments.out, arguments.capture, arguments.dry)
+    plan = Plan(arguments.out, tuple(arguments.capture), arguments.dry, tuple(arguments.quality))
     plan.out.mkdir(parents=True, exist_ok=True)
     if arguments.here:
         sys.exit(not run_part(plan, arguments.only[0]))
     document: Row = {"command": " ".join(["python -m benchmarks.gpu", *sys.argv[1:]]), "machine": machine()}
-    end = time.perf_counter() + sum(LIMITS[name] for name in arguments.only)
+    limits = LIMITS | {"standard": LIMITS["standard"] * max(1, len(plan.captures))}
+    end = time.perf_counter() + sum(limits[name] for name in arguments.only)
     for number, name in enumerate(arguments.only):
-        later = sum(LIMITS[other] for other in arguments.only[number + 1 :])
+        later = sum(limits[other] for other in arguments.only[number + 1 :])
         document[name] = result_of_process(plan, name, end - time.perf_counter() - later)
         files.write_json(plan.out / "gpu.json", document)
     print(json.dumps(document, indent=1))
@@ -121,8 +127,11 @@ def result_of_process(plan: Plan, name: str, limit: float) -> Row:
     file, started = plan.out / f"{name}.json", time.perf_counter()
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "benchmarks.gpu", "--here", "--only", name, "--out", str(plan.out)]
-    command += ["--dry"] * plan.dry + (["--capture", str(plan.capture)] if plan.capture else [])
-    process = subprocess.Popen(command, start_new_session=True)
+    command += ["--dry"] * plan.dry + ["--quality", *plan.qualities]
+    command += ["--capture", *map(str, plan.captures)] if plan.captures else []
+    # As `tumble` does: threads that spin while they wait delay those of the backward pass by milliseconds.
+    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
+    process = subprocess.Popen(command, start_new_session=True, env=environment)
     in_time = False
     try:
         process.wait(limit)
@@ -220,13 +229,16 @@ def draft_recipe(plan: Plan) -> Recipe:
 
 
 def standard(plan: Plan, row: Row) -> None:
-    """A STANDARD run on the GPU."""
-    subject = plan.capture or posed_clip(plan.out / "clip")
-    capture = folder.load(subject)
-    if not plan.capture:
-        frames, side = (12, 96) if plan.dry else (STANDARD_FRAMES, STANDARD_SIDE)
-        capture = enlarged(capture, frames, side)
-    measure_run(row, capture, subject, plan.out / "standard", SMOKE if plan.dry else STANDARD, plan.device)
+    """Runs of the captures on the GPU, or STANDARD on the bundled clip."""
+    for path in plan.captures:
+        for name in plan.qualities:
+            rows, recipe = row.setdefault(path.name, {}), SMOKE if plan.dry else QUALITIES[name]
+            out = plan.out / f"{path.name}-{name}"
+            measure_run(rows.setdefault(name, {}), folder.load(path), path, out, recipe, plan.device)
+    if not plan.captures:
+        clip, (frames, side) = posed_clip(plan.out / "clip"), (12, 96) if plan.dry else (STANDARD_FRAMES, STANDARD_SIDE)
+        capture = enlarged(folder.load(clip), frames, side)
+        measure_run(row, capture, clip, plan.out / "standard", SMOKE if plan.dry else STANDARD, plan.device)
 
 
 def enlarged(capture: Capture, n: int, side: int) -> Capture:
@@ -310,10 +322,10 @@ SCORES = ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "image.psnr_fg_srgb", "no
 
 
 def profile(plan: Plan, row: Row) -> None:
-    """Profiles of both stages: DRAFT on the bundled clip, and STANDARD on `--capture` if that is given."""
+    """Profiles of both stages: DRAFT on the bundled clip, and STANDARD on the first of `--capture`."""
     cases = {"draft": (posed_clip(plan.out / "clip"), draft_recipe(plan))}
-    if plan.capture:
-        cases["standard"] = (plan.capture, STANDARD)
+    if plan.captures:
+        cases["standard"] = (plan.captures[0], STANDARD)
     for name, (path, recipe) in cases.items():
         row[name] = profile_stages(path, known_poses(recipe), plan.device)
 
@@ -326,7 +338,7 @@ def graphs(plan: Plan, row: Row) -> None:
     inputs = refine.Inputs(capture, capture.trajectory)
     state = time_steps(plan, row, refine, recipe.refine, inputs)
     third = decompose.Inputs(capture, refine.finish(recipe.refine, inputs, state))
-    time_steps(plan, row, decompose, recipe.decompose, third)
+    time_steps(plan, row, decompose, untried(recipe), third)
 
 
 def time_steps(plan: Plan, row: Row, stage: Any, cfg: Any, inputs: Any) -> loop.State:
@@ -361,8 +373,14 @@ def profile_stages(path: Path, recipe: Recipe, device: torch.device) -> Row:
     state = state_after(refine, recipe.refine, inputs, WARMUP_STEPS)
     profiles = {"refine": profile_step(lambda: run_step(refine, recipe.refine, inputs, state))}
     inputs_3 = decompose.Inputs(capture, refine.finish(recipe.refine, inputs, state))
-    state_3 = state_after(decompose, recipe.decompose, inputs_3, WARMUP_STEPS)
-    return profiles | {"decompose": profile_step(lambda: run_step(decompose, recipe.decompose, inputs_3, state_3))}
+    cfg_3 = untried(recipe)
+    state_3 = state_after(decompose, cfg_3, inputs_3, WARMUP_STEPS)
+    return profiles | {"decompose": profile_step(lambda: run_step(decompose, cfg_3, inputs_3, state_3))}
+
+
+def untried(recipe: Recipe) -> Any:
+    """Settings of stage 3 without its trials, which take the first steps of stage 2 for metal, whose step is longer."""
+    return replace(recipe.decompose, try_matte=False)
 
 
 def state_after(stage: Any, cfg: Any, inputs: Any, n: int) -> loop.State:
