@@ -192,8 +192,8 @@ def run(
         quality: How much is computed, and from how many frames of which size if the input is footage.
             draft: 3,000 and 1,000 steps. 23 seconds on two CPU cores for 64 frames of 128 x 128 pixels with known
             poses, where it reaches 23 to 35 dB of albedo. All measured runs are of this quality.
-            standard: 20,000 and 10,000 steps, for a GPU. 75 seconds on an H200 for 100 frames of 512 x 512 pixels with
-            known poses (benchmarks/gpu.md).
+            standard: 20,000 and 10,000 steps, for a GPU, about 1 dB ahead of draft. 75 seconds on an H200 for 100
+            frames of 512 x 512 pixels with known poses (benchmarks/gpu.md).
             full: 150,000 steps each, for a GPU. Never run.
             paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
             (docs/method.md), where it is far behind draft.

@@ -45,8 +45,8 @@ MASK = 3.0
 """Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
 
 DIAMETER = 107.0
-"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which DRAFT's numbers of Gaussians were
-chosen [pixels]."""
+"""Diameter of the object's sphere in the captures of 128 x 128 pixels on which the numbers of Gaussians were chosen
+[pixels]."""
 
 REALIGNMENTS = 9
 """Number of photometric alignments after the progressive stage 1 for CPUs. Gaussians learn errors that neighbouring
@@ -121,8 +121,10 @@ STANDARD = replace(
         weights=replace(OURS.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
         crease=CREASE,
         rates=replace(OURS.refine.rates, specular_scale=0.005),
-        points=20_000,
-        densification=densify.Config(max_gaussians=60_000),
+        points=9_000,
+        densification=densify.Config(max_gaussians=16_000),
+        hull=96,
+        diameter=DIAMETER,
     ),
     decompose=inverse_rendering.decompose.Config(
         steps=10_000,
@@ -139,10 +141,10 @@ STANDARD = replace(
 
 FULL = replace(
     STANDARD,
-    refine=replace(STANDARD.refine, steps=150_000, points=50_000, densification=densify.Config(max_gaussians=200_000)),
+    refine=replace(STANDARD.refine, steps=150_000),
     decompose=replace(STANDARD.decompose, steps=150_000, warmup=15_000, doublings=6),
 )
-"""STANDARD with the paper's numbers of steps, more Gaussians and the paper's resolution of the light. Never run."""
+"""STANDARD with the paper's numbers of steps and the paper's resolution of the light. Never run."""
 
 DRAFT = replace(
     OURS,
