@@ -52,8 +52,19 @@ REALIGNMENTS = 9
 """Number of photometric alignments after the progressive stage 1 for CPUs. Gaussians learn errors that neighbouring
 frames share, of which each alignment corrects a small part; poses of the graph stage gain nothing from more than 4."""
 
-OURS = Recipe(refine=inverse_rendering.refine.Config(realignments=4))
-"""What our recipes share: the default configuration of every stage, and realigned poses."""
+OURS = Recipe(
+    # A normal weight above the paper's 0.05 gives smoother normals; `crease` keeps it from filling grooves.
+    refine=inverse_rendering.refine.Config(
+        points=9_000,
+        densification=densify.Config(max_gaussians=16_000),
+        hull=96,
+        diameter=DIAMETER,
+        weights=inverse_rendering.refine.Weights(normal=2.0, proj=PROJ, specular=0.002),
+        crease=CREASE,
+        realignments=4,
+    )
+)
+"""What our recipes share: stage 2's weights, realigned poses, and as many Gaussians as the images resolve."""
 
 PAPER = Recipe(
     track=progressive.Config(lift="pnp"),
@@ -118,13 +129,7 @@ STANDARD = replace(
     refine=replace(
         OURS.refine,
         steps=20_000,
-        weights=replace(OURS.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
-        crease=CREASE,
         rates=replace(OURS.refine.rates, specular_scale=0.005),
-        points=9_000,
-        densification=densify.Config(max_gaussians=16_000),
-        hull=96,
-        diameter=DIAMETER,
     ),
     decompose=inverse_rendering.decompose.Config(
         steps=10_000,
@@ -148,16 +153,10 @@ FULL = replace(
 
 DRAFT = replace(
     OURS,
-    # A normal weight above the paper's 0.05 gives smoother normals; `crease` keeps it from filling grooves.
     refine=replace(
         OURS.refine,
         steps=3_000,
-        points=9_000,
-        densification=densify.Config(refine_every=300, max_gaussians=16_000),
-        hull=96,
-        diameter=DIAMETER,
-        weights=replace(OURS.refine.weights, normal=2.0, proj=PROJ, specular=0.002),
-        crease=CREASE,
+        densification=replace(OURS.refine.densification, refine_every=300),
         rates=replace(OURS.refine.rates, specular_scale=0.02),
         ramp=0.5,
     ),
