@@ -35,7 +35,7 @@ Overwrite = Annotated[
 ]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
-    arg(help="Where to compute. cuda: on an NVIDIA GPU, which no test has run on yet. auto: on one if there is one."),
+    arg(help="Where to compute. cuda: on an NVIDIA GPU (benchmarks/gpu.md). auto: on one if there is one."),
 ]
 OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 OptionalData = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
@@ -191,9 +191,9 @@ def run(
         out: Run directory. Repeating the command resumes an interrupted run.
         quality: How much is computed, and from how many frames of which size if the input is footage.
             draft: 3,000 and 1,000 steps. 23 seconds on two CPU cores for 64 frames of 128 x 128 pixels with known
-            poses, where it reaches 23 to 35 dB of albedo. All measured runs are of this quality.
-            standard: 20,000 and 10,000 steps, for a GPU, about 1 dB ahead of draft. 75 seconds on an H200 for 100
-            frames of 512 x 512 pixels with known poses (benchmarks/gpu.md).
+            poses, where it reaches 23 to 35 dB of albedo. Nearly all figures in docs are of this quality.
+            standard: 20,000 and 10,000 steps, for a GPU, 1 to 2 dB ahead of draft. On an H200, with half as many
+            Gaussians as now, 75 seconds for 100 frames of 512 x 512 pixels with known poses (benchmarks/gpu.md).
             full: 150,000 steps each, for a GPU. Never run.
             paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
             (docs/method.md), where it is far behind draft.
