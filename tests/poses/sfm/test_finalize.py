@@ -194,6 +194,24 @@ def test_rotation_about_an_axis_that_holds_all_texture_is_unobservable(monkeypat
     assert quality.sentence == observability.sentence
 
 
+def test_lost_frames_say_nothing_about_what_is_observable() -> None:
+    """More than half of the frames have no matches and arbitrary rotations, and are lost."""
+    scene, rng = tumbling(24), torch.Generator().manual_seed(0)
+    kept = torch.arange(24) < 10
+    matches = [scene.match(t - k, t, rng, noise=0.3, wrong=0.0) for k in (1, 2) for t in range(k, 10)]
+    tracks, contours = chain_matches(matches, torch.full((24,), 5.0)), frontier_points.convex_contours(scene.capture)
+    R, t = scene.T_cam_obj.rotation.matrix(), scene.T_cam_obj.xyz / DISTANCE
+    wrong = torch.where(kept[:, None, None], R, torch.stack([random_rotation(rng) for _ in range(24)]).to(R))
+    symmetry = mirror_symmetry(scene.capture.masks)
+    sigma = [
+        finalize.pose_result(
+            scene.capture, tracks, contours, symmetry, Solution(each, t, 0.9 / DISTANCE, torch.zeros(24), kept)
+        ).quality.observability.sigma
+        for each in (R, wrong)
+    ]
+    assert torch.allclose(*sigma, rtol=1e-4)
+
+
 def test_no_rotation_of_an_untextured_sphere_is_observable() -> None:
     """Uniform grey images and round contours, whatever the matches are."""
     capture, tracks, solution = on_an_axis()

@@ -137,7 +137,8 @@ def pose_result(
     trajectory = _trajectory(T, capture)
     points = ((X[reliable] - centre) / scale) @ R_first.mT
     colours = _point_colours(capture, tracks, residual, reliable)
-    observability, textured = _observability(capture, contours, solution, problem, scene, residual < INLIER_THRESHOLD)
+    is_inlier = residual < INLIER_THRESHOLD
+    observability, textured = _observability(capture, contours, solution, problem, scene, is_inlier, lost)
     if not textured:
         observability = _observability_from_symmetry(observability, mirror_symmetry)
     disagreement = solution.rotation_disagreement.float()
@@ -374,12 +375,13 @@ def _observability(
     problem: bundle_adjustment.Problem,
     scene: bundle_adjustment.BundleState,
     inlier: Tensor,
+    lost: Bool[Tensor, " t"],
 ) -> tuple[Observability, bool]:
     """Standard deviations of a frame's rotation, from the Fisher information of texture and contours.
 
-    The points are held fixed, the translation is eliminated, and the information is averaged over frames, normalised by
-    its trace. Also returned is whether the object has texture, without which a body of revolution is recognised by the
-    mirror symmetry of its silhouettes instead.
+    The points are held fixed, the translation is eliminated, and the information is averaged over the frames that are
+    not lost, normalised by its trace. Also returned is whether the object has texture, without which a body of
+    revolution is recognised by the mirror symmetry of its silhouettes instead.
     """
     R, t, camera, n = solution.R, solution.t, capture.camera, len(solution.R)
     texture = texture_information.information(capture, problem.tracks) * inlier[:, None, None]
@@ -389,9 +391,10 @@ def _observability(
         + bundle_adjustment.NOISE**2 * torch.eye(2, dtype=torch.float64)
     )
     information = bundle_adjustment.information(problem, scene, precision)
-    frames = torch.arange(0, n, max(1, n // ASSESSED_FRAMES))
+    kept = torch.nonzero(~lost)[:, 0] if int((~lost).sum()) > 1 else torch.arange(n)
+    frames, references = (kept[:: max(1, len(kept) // m)] for m in (ASSESSED_FRAMES, REFERENCE_FRAMES))
     for k in frames.tolist():
-        others = torch.tensor([i for i in range(0, n, max(1, n // REFERENCE_FRAMES)) if i != k])
+        others = references[references != k]
         contour, other_contours = contours[torch.tensor([k])], contours[others]
         constraints = ContourConstraints((R[others], t[others]), contour, other_contours, camera, solution.radius)
         information[k] += relocalization.information(constraints, R[k], t[k])
