@@ -51,6 +51,16 @@ def test_an_arm_that_others_frames_do_not_show_becomes_background(scene: Tumble)
     assert not trimmed.images[trimmed.masks == BACKGROUND].any()
 
 
+def test_more_matches_outweigh_a_lost_frame_but_not_a_rating(scene: Tumble) -> None:
+    old, new = (result(scene, overlap=0.93, lost=lost) for lost in (1, 2))
+    more = replace(new, quality=replace(new.quality, inliers=60 * torch.ones(N)))
+    assert mask_refinement.explains_more(more, old)
+    assert not mask_refinement.explains_more(new, old), "fewer frames with as many matches each"
+    contradicting = replace(more, quality=replace(more.quality, overlap=0.8 * torch.ones(N)))
+    assert contradicting.quality.rating == "bad"
+    assert not mask_refinement.explains_more(contradicting, old)
+
+
 def test_a_frame_without_pose_keeps_its_mask(scene: Tumble) -> None:
     capture, arm = with_arm(scene.capture)
     trimmed = mask_refinement.trim_masks(capture, result(scene, lost=2))

@@ -92,9 +92,12 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
 
 
 def explains_more(new: PoseResult, old: PoseResult) -> bool:
-    """Whether poses from trimmed masks are better: by their rating, else by the number of frames with a pose."""
+    """Whether poses from trimmed masks are better: by their rating, else by the number of matches that agree with them.
+
+    A count of frames would refuse better poses of all of them for the sake of a single frame.
+    """
     order = ("bad", "warn", "good")
-    ranks = [(order.index(each.quality.rating), -int(each.quality.lost.sum())) for each in (new, old)]
+    ranks = [(order.index(q.rating), float(q.inliers[~q.lost].sum())) for q in (new.quality, old.quality)]
     return ranks[0] > ranks[1]
 
 
