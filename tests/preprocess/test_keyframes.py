@@ -89,11 +89,11 @@ def test_the_sharpest_frame_of_every_window_is_selected_and_steps_are_limited() 
     blurs = RNG.uniform(1, 3, 721)
     kept = keyframes.select_keyframes(total, blurs, np.ones(721, bool), 100)
     steps = np.degrees(np.diff(total[kept]))
-    assert len(kept) == 46
-    # Eight degrees; each frame is at most a quarter of a window off its middle.
-    assert steps.min() >= 4
-    assert steps.max() <= 12.1
-    assert blurs[kept].mean() < 1.3
+    assert len(kept) == 91
+    # Four degrees; each frame is at most a quarter of a window off its middle.
+    assert steps.min() >= 1.9
+    assert steps.max() <= 6.1
+    assert blurs[kept].mean() < 1.5
     assert keyframes.largest_step(total, kept) == pytest.approx(math.radians(steps.max()))
 
 
@@ -107,9 +107,9 @@ def test_unusable_frames_are_never_selected_and_few_frames_are_spread_wider() ->
 
 
 def test_all_frames_of_a_short_video_are_selected() -> None:
-    """48 frames 5 to 12 degrees apart, two of them underestimated: windows of 8 degrees would drop some."""
+    """48 frames 5 to 12 degrees apart, two of them underestimated: windows of 4 degrees would drop some."""
     steps = RNG.uniform(5, 12, 47)
-    steps[[20, 30]] = 1
+    steps[[20, 30]] = 0.5
     total = np.radians(np.concatenate([[0], steps.cumsum()]))
     usable = np.arange(48) != 40
     assert keyframes.select_keyframes(total, RNG.uniform(1, 3, 48), usable, 96) == np.nonzero(usable)[0].tolist()

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-KEYFRAME_STEP = math.radians(8)
-"""Rotation between keyframes [radians]; with the choice inside each window, 4 to 12 degrees."""
+KEYFRAME_STEP = math.radians(4)
+"""Rotation between keyframes [radians]; with the choice inside each window, 2 to 6 degrees. On a surface with little
+texture, or behind a hand, flow reports less than half of the rotation."""
 FRAMES_PER_WINDOW = 2
 """If a video has at most this many usable frames per window, all are kept, because single rotation estimates are too
 rough to select from so few."""
