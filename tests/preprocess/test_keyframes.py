@@ -115,5 +115,14 @@ def test_all_frames_of_a_short_video_are_selected() -> None:
     assert keyframes.select_keyframes(total, RNG.uniform(1, 3, 48), usable, 96) == np.nonzero(usable)[0].tolist()
 
 
+def test_a_fast_part_does_not_cost_frames_of_the_rest() -> None:
+    """Half of the rotation lies between two frames, as it seems where a hand changes its grip."""
+    total = np.radians(np.concatenate([np.arange(100) * 2.0, 400 + np.arange(100) * 2.0]))
+    kept = keyframes.select_keyframes(total, np.ones(200), np.ones(200, bool), 100)
+    assert len(kept) == pytest.approx(100, abs=4)
+    steps = np.degrees(np.diff(total[kept]))
+    assert np.sort(steps)[-2] <= 6.1
+
+
 def test_one_frame_of_an_object_that_does_not_rotate_is_selected() -> None:
     assert len(keyframes.select_keyframes(np.zeros(30), np.ones(30), np.ones(30, bool), 10)) == 1

@@ -113,21 +113,30 @@ def select_keyframes(
         usable: Frames with a reliable mask.
         n_frames: Maximum number of keyframes; the windows widen accordingly.
     """
-    first, last = float(rotation[0]), float(rotation[-1])
-    count = max(min(round((last - first) / KEYFRAME_STEP) + 1, n_frames), 1)
+    count = max(round(float(rotation[-1] - rotation[0]) / KEYFRAME_STEP) + 1, 1)
     candidates = [int(i) for i in np.nonzero(usable)[0]]
     if len(candidates) <= min(FRAMES_PER_WINDOW * count, n_frames):
         return candidates
+    # Where the object turns fast, windows are empty: more of them than keyframes may fit.
+    while len(kept := _sharpest_of_windows(rotation, blurs, usable, count)) > n_frames:
+        count = count * n_frames // len(kept)
+    return kept
+
+
+def _sharpest_of_windows(
+    rotation: Float64[np.ndarray, " t"], blurs: Float64[np.ndarray, " t"], usable: Bool[np.ndarray, " t"], count: int
+) -> list[int]:
+    """The sharpest usable frame near the middle of each of equal windows of rotation; none of an empty window."""
+    first, last = float(rotation[0]), float(rotation[-1])
     step = (last - first) / max(count - 1, 1)
-    kept: list[int] = []
-    for k in range(count):
-        target = first + k * step
+    kept: set[int] = set()
+    for target in np.linspace(first, last, count):
         near = np.nonzero(usable & (np.abs(rotation - target) <= step / 4))[0]
         if not len(near):
             near = np.nonzero(usable & (np.abs(rotation - target) <= step / 2))[0]
         if len(near):
-            kept.append(int(near[np.argmin(blurs[near])]))
-    return sorted(set(kept))
+            kept.add(int(near[np.argmin(blurs[near])]))
+    return sorted(kept)
 
 
 def largest_step(rotation: Float64[np.ndarray, " t"], kept: list[int]) -> float:
