@@ -124,5 +124,11 @@ def test_a_fast_part_does_not_cost_frames_of_the_rest() -> None:
     assert np.sort(steps)[-2] <= 6.1
 
 
+def test_of_a_video_with_a_few_frames_too_many_nearly_all_are_selected() -> None:
+    total = np.radians(RNG.uniform(3, 9, 146).cumsum())
+    kept = keyframes.select_keyframes(total, np.ones(146), np.ones(146, bool), 144)
+    assert 130 <= len(kept) <= 144
+
+
 def test_one_frame_of_an_object_that_does_not_rotate_is_selected() -> None:
     assert len(keyframes.select_keyframes(np.zeros(30), np.ones(30), np.ones(30, bool), 10)) == 1

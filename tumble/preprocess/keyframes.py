@@ -18,8 +18,8 @@ KEYFRAME_STEP = math.radians(4)
 """Rotation between keyframes [radians]; with the choice inside each window, 2 to 6 degrees. On a surface with little
 texture, or behind a hand, flow reports less than half of the rotation."""
 FRAMES_PER_WINDOW = 2
-"""If a video has at most this many usable frames per window, all are kept, because single rotation estimates are too
-rough to select from so few."""
+"""If a video has at most this many usable frames per window, all are kept, or as many as may be, because single
+rotation estimates are too rough to select from so few."""
 ANCHOR_ROTATION = math.radians(3)
 """Rotations are measured from an anchor frame until they exceed this, so that the noise of flow does not accumulate
 [radians]."""
@@ -105,7 +105,7 @@ def select_keyframes(
 ) -> list[int]:
     """Indices of the keyframes: in each window of rotation, the sharpest usable frame near its middle.
 
-    All usable frames of a video that has hardly more frames than windows.
+    All usable frames of a video that has hardly more frames than windows, or as many as may be.
 
     Args:
         rotation: From `cumulative_rotation` [radians].
@@ -115,8 +115,10 @@ def select_keyframes(
     """
     count = max(round(float(rotation[-1] - rotation[0]) / KEYFRAME_STEP) + 1, 1)
     candidates = [int(i) for i in np.nonzero(usable)[0]]
-    if len(candidates) <= min(FRAMES_PER_WINDOW * count, n_frames):
-        return candidates
+    if len(candidates) <= FRAMES_PER_WINDOW * count:
+        if len(candidates) <= n_frames:
+            return candidates
+        count *= FRAMES_PER_WINDOW
     # Where the object turns fast, windows are empty: more of them than keyframes may fit.
     while len(kept := _sharpest_of_windows(rotation, blurs, usable, count)) > n_frames:
         count = count * n_frames // len(kept)
