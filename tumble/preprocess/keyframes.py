@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 KEYFRAME_STEP = math.radians(4)
-"""Rotation between keyframes [radians]; with the choice inside each window, 2 to 6 degrees. On a surface with little
-texture, or behind a hand, flow reports less than half of the rotation."""
+"""Rotation between keyframes [radians]; with the choice inside each window, 2 to 6 degrees. Frames farther
+apart share too few features behind a hand; and flow reports less than half of the rotation of a plain surface."""
 FRAMES_PER_WINDOW = 2
 """If a video has at most this many usable frames per window, all are kept, or as many as may be, because single
 rotation estimates are too rough to select from so few."""
