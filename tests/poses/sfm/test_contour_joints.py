@@ -9,7 +9,7 @@ import torch
 from tests.lopsided import DISTANCE, tumbling
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.contour_joints import contour_joint
+from tumble.poses.sfm.contour_joints import Correspondences, contour_joint, fitted_to_both, moved_part
 from tumble.poses.sfm.partial import Observed, Partial
 from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
 from tumble.scene import BACKGROUND
@@ -80,3 +80,23 @@ def test_parts_of_which_little_is_seen_are_not_joined(observed: Observed) -> Non
     assert joint is not None
     assert joint.cost < 0.2
     assert not joint.accepted
+
+
+def test_contours_correct_a_joint_that_few_keypoints_suggest(observed: Observed) -> None:
+    """Ten points on one small patch, of which some are seen where they are not, leave the rotation uncertain."""
+    first, second = half(range(12)), half(range(12, 24))
+    generator = torch.Generator().manual_seed(0)
+    X = torch.tensor([0.1, 0.0, 0.1]) + 0.02 * torch.randn(14, 3, generator=generator)
+    X = X.double() / DISTANCE
+    place = torch.zeros(14, dtype=torch.long)
+    uv = SCENE.capture.camera.project(X @ R[12].mT + T[12]).double()
+    uv[10:] += 40
+    off = SO3.exp(torch.tensor([0.25, 0.2, -0.15], dtype=torch.float64)).matrix()
+    # The wrong motion turns about the patch, so that its points still agree.
+    middle = X.mean(0)
+    start = off[None], torch.cat([middle - off @ middle, torch.zeros(1, dtype=torch.float64)])[None]
+    seen = Correspondences(place, uv, X)
+    assert int((seen.errors(observed, second, start).norm(dim=-1) < 5).sum()) == 10
+    found = moved_part(second, fitted_to_both(observed, second, first, seen, start, 5.0), 0)
+    error = angle_between(SO3.from_matrix(found.R), SO3.from_matrix(R[12:24]))
+    assert math.degrees(float(error.max())) < 4  # 20 at first

@@ -76,9 +76,21 @@ def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
     assert gaps > 50
     assert right < 0.1
     assert wrong > 5 * right
-    assert Joint(second, 50, 3, right, gaps).accepted
-    assert not Joint(second, 50, 3, 2.0, gaps).accepted
-    assert not Joint(second, 30, 3, right, gaps).accepted
+    assert Joint(second, 50, 0.6, 3, right, gaps, True).accepted
+    assert not Joint(second, 50, 0.6, 3, 2.0, gaps, True).accepted
+    assert not Joint(second, 30, 0.6, 3, right, gaps, True).accepted
+    assert not Joint(second, 50, 0.4, 3, right, gaps, True).accepted
+    assert Joint(second, 110, 0.4, 3, right, gaps, True).accepted
+    assert not Joint(second, 50, 0.6, 3, 0.0, 9, True).accepted
+
+
+def test_a_jump_of_the_motion_is_the_last_resort() -> None:
+    """Print on both faces of a box: half a revolution agrees with contours better than what is right."""
+    part = Partial((0,), torch.eye(3)[None].double(), torch.zeros(1, 3).double())
+    jump, right = Joint(part, 50, 0.6, 3, 0.2, 100, False), Joint(part, 60, 0.6, 3, 0.9, 100, True)
+    refused = Joint(part, 60, 0.6, 3, 1.9, 100, True)
+    assert min((jump, right), key=lambda joint: joint.order) is right
+    assert min((jump, refused), key=lambda joint: joint.order) is jump
 
 
 def test_a_part_moved_to_another_object_frame_shows_the_same_points() -> None:

@@ -6,13 +6,15 @@ motion goes on where the first part ends, so that smaller rotations are likely t
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
+from tumble.poses.sfm.bundle_adjustment import MIN_DEPTH
 from tumble.poses.sfm.frontier_points import epipolar_tangencies
 from tumble.poses.sfm.partial import GAP_SCALE, Observed, Partial
 from tumble.poses.sfm.relocalization import JACOBIAN_STEP, candidate_rotations, damped_step, robust_cost
@@ -75,15 +77,15 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     """The joint of two parts whose contours agree best; None unless they are long and one follows the other."""
     if min(len(part), len(other)) < MIN_FRAMES:
         return None
-    distance, p, q = min((abs(a - b), p, q) for p, a in enumerate(part.frames) for q, b in enumerate(other.frames))
+    distance, p, q = part.nearest(other)
     if not 0 < distance <= MAX_GAP:
         return None
     turns = candidate_rotations(TURNS)
     R_new_obj = (turns @ other.R[q]).mT @ part.R[p]
-    pairs = _Pairs(observed, *(each.select(_spread(len(each))) for each in (part, other)))
+    pairs = _Pairs.of(observed, part, other)
     start = R_new_obj, R_new_obj.new_zeros(len(turns), 4)
     best = robust_cost(pairs.gaps(start), GAP_SCALE).argsort()[:REFINED]
-    (R_new_obj, rest), cost = _refined(pairs, (start[0][best], start[1][best]))
+    (R_new_obj, rest), cost = _refined(pairs.gaps, (start[0][best], start[1][best]))
     step = angle_between(SO3.from_matrix(part.R[p] @ R_new_obj.mT), SO3.from_matrix(other.R[q]))
     cost = torch.where(step <= MAX_TURN, cost, torch.inf)
     k = int(cost.argmin())
@@ -91,9 +93,59 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
         return None
     differs = angle_between(SO3.from_matrix(R_new_obj), SO3.from_matrix(R_new_obj[k])) > OTHER_ROTATION
     second = float(torch.where(differs, cost, torch.inf).min())
-    moved = part.moved(R_new_obj[k], float(rest[k, 3].exp()), rest[k, :3])
+    moved = moved_part(part, (R_new_obj, rest), k)
     seen = float((~pairs.gaps((R_new_obj[k : k + 1], rest[k : k + 1])).isnan()).double().mean())
     return ContourJoint(moved, float(cost[k]), seen, second)
+
+
+def moved_part(part: Partial, motion: Similarity, k: int) -> Partial:
+    """A part in the object frame of another by hypothesis k."""
+    R_new_obj, rest = motion
+    return part.moved(R_new_obj[k], float(rest[k, 3].exp()), rest[k, :3])
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Keypoints of a part and surface points of another."""
+
+    place: Int64[Tensor, " c"]
+    """Place of the keypoint's frame in the part."""
+    uv: Float[Tensor, "c 2"]
+    """Keypoints [pixels]."""
+    X: Float[Tensor, "c 3"]
+    """Surface points, object frame of the other part."""
+
+    def errors(self, observed: Observed, part: Partial, motion: Similarity) -> Float[Tensor, "h c 2"]:
+        """Reprojection errors after each motion of the part [pixels]."""
+        R, t = _moved(part, motion)
+        x = torch.einsum("hcij,cj->hci", R[:, self.place], self.X) + t[:, self.place]
+        in_front = torch.cat([x[..., :2], x[..., 2:].clamp_min(MIN_DEPTH)], -1)
+        return observed.inputs.capture.camera.project(in_front) - self.uv
+
+
+def fitted_to_both(
+    observed: Observed, part: Partial, other: Partial, seen: Correspondences, start: Similarity, error: float
+) -> Similarity:
+    """Hypotheses after a fit to the contours and to those correspondences that agree with each at first.
+
+    A few keypoints, often on one face of the object, leave a rotation uncertain that contours then determine.
+
+    Args:
+        seen: Correspondences of the part and the other.
+        error: Reprojection error up to which they agree [pixels].
+    """
+    agrees = seen.errors(observed, part, start).norm(dim=-1) < error
+    used = agrees.any(0)
+    seen = Correspondences(seen.place[used], seen.uv[used], seen.X[used])
+    # A hypothesis keeps its own correspondences; the others are wrong, or right for another hypothesis.
+    of_others = torch.where(agrees[:, used], 0.0, torch.nan)[..., None]
+    pairs = _Pairs.of(observed, part, other)
+
+    def residuals(motion: Similarity) -> Float[Tensor, "h n"]:
+        errors = seen.errors(observed, part, motion) + of_others
+        return torch.cat([pairs.gaps(motion), errors.flatten(1)], 1)
+
+    return _refined(residuals, start)[0]
 
 
 def _spread(n: int) -> list[int]:
@@ -109,12 +161,15 @@ class _Pairs:
     part: Partial
     other: Partial
 
+    @staticmethod
+    def of(observed: Observed, part: Partial, other: Partial) -> "_Pairs":
+        """Those of some frames of each, spread evenly."""
+        return _Pairs(observed, *(each.select(_spread(len(each))) for each in (part, other)))
+
     def gaps(self, motion: Similarity) -> Float[Tensor, "h n"]:
         """Tangency gaps after each motion of the part [pixels]; NaN where they are not valid."""
-        (R_new_obj, rest), inputs = motion, self.observed.inputs
-        h, a, b = len(rest), len(self.part), len(self.other)
-        R = self.part.R @ R_new_obj[:, None].mT
-        t = rest[:, None, 3:].exp() * self.part.t - torch.einsum("hfij,hj->hfi", R, rest[:, :3])
+        (R, t), inputs = _moved(self.part, motion), self.observed.inputs
+        h, a, b = len(R), len(self.part), len(self.other)
 
         def of_part(x: Tensor) -> Tensor:
             return x[:, :, None].expand(h, a, b, *x.shape[2:]).flatten(0, 2)
@@ -135,20 +190,33 @@ class _Pairs:
         return torch.where(found.valid, found.gap, torch.nan).reshape(h, -1)
 
 
-def _refined(pairs: _Pairs, start: Similarity) -> tuple[Similarity, Float[Tensor, " h"]]:
-    """Hypotheses after Levenberg-Marquardt with finite differences, and their costs."""
+def _moved(part: Partial, motion: Similarity) -> tuple[Float[Tensor, "h f 3 3"], Float[Tensor, "h f 3"]]:
+    """Poses of a part in the object frame of another: `R_cam_obj`, and the object's origin in the camera frame."""
+    R_new_obj, rest = motion
+    R = part.R @ R_new_obj[:, None].mT
+    return R, rest[:, None, 3:].exp() * part.t - torch.einsum("hfij,hj->hfi", R, rest[:, :3])
+
+
+def _refined(
+    residuals: Callable[[Similarity], Float[Tensor, "h n"]], start: Similarity
+) -> tuple[Similarity, Float[Tensor, " h"]]:
+    """Hypotheses after Levenberg-Marquardt with finite differences, and their costs.
+
+    Args:
+        residuals: Residuals of all hypotheses [pixels]; NaN where they are not valid.
+    """
     unit = JACOBIAN_STEP * torch.eye(7, dtype=torch.float64)
 
     def shifted(motion: Similarity, rotation: Tensor, rest: Tensor) -> Similarity:
         return SO3.exp(rotation).matrix() @ motion[0], motion[1] + rest
 
     def linearised(motion: Similarity) -> Linearised:
-        gaps = pairs.gaps(motion)
-        return Linearised(robust_cost(gaps, GAP_SCALE), gaps)
+        r = residuals(motion)
+        return Linearised(robust_cost(r, GAP_SCALE), r)
 
-    def moved(motion: Similarity, gaps: Tensor, damping: Tensor) -> Similarity:
-        columns = [(pairs.gaps(shifted(motion, step[:3], step[3:])) - gaps) / JACOBIAN_STEP for step in unit]
-        return shifted(motion, *damped_step(gaps, torch.stack(columns, -1), damping, GAP_SCALE))
+    def moved(motion: Similarity, r: Tensor, damping: Tensor) -> Similarity:
+        columns = [(residuals(shifted(motion, step[:3], step[3:])) - r) / JACOBIAN_STEP for step in unit]
+        return shifted(motion, *damped_step(r, torch.stack(columns, -1), damping, GAP_SCALE))
 
     damping = Damping(start=1e-2, accepted=0.3, rejected=5.0)
     motion, last = minimise(start, linearised, moved, select_rows, steps=STEPS, damping=damping)

@@ -69,6 +69,10 @@ class Partial:
         )
         return both.select(np.argsort(both.frames).tolist())
 
+    def nearest(self, other: "Partial") -> tuple[int, int, int]:
+        """The frames of both that are nearest in time: their distance [frames], and their places in both parts."""
+        return min((abs(a - b), p, q) for p, a in enumerate(self.frames) for q, b in enumerate(other.frames))
+
     def moved(self, R_new_obj: Tensor, scale: float, shift: Tensor) -> "Partial":
         """The same motion in another object frame: `x_new = scale * R_new_obj @ x + shift`."""
         R = self.R @ R_new_obj.mT

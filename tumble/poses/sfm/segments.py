@@ -8,7 +8,8 @@ once with all features of the object and the hand, which moves with it while its
 apart in time, of the object alone, then join segments that show the same side, and add the frames between them. Frames
 that nothing confirms get no pose.
 
-Where this leaves frames out, a network matches neighbouring frames and frames far apart as well, and all is done again.
+Where this leaves frames out, a network matches these with their neighbours and with frames far apart as well, and all
+is done again.
 """
 
 import math
@@ -105,7 +106,8 @@ def segmented_poses(
     if part is None or n - len(part) > MAX_MISSING * n:
         near = set(neighbours(n))
         far = {(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)}
-        learned = _matched(inputs, sorted(near | far), LEARNED_MATCHER)
+        missing = set(range(n)) - set(part.frames if part else ())
+        learned = _matched(inputs, sorted(each for each in near | far if missing & {*each}), LEARNED_MATCHER)
         of_near = [match for match in learned if (match.i, match.j) in near]
         inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), hidden=True)
         other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng)
