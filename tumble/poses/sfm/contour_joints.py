@@ -3,6 +3,8 @@
 The contours of all pairs of frames of two parts together leave few ways to put one into the other (epipolar tangency).
 They cannot tell a bottle from the same bottle after half a revolution, nor a box from one after a quarter; but the
 motion goes on where the first part ends, so that smaller rotations are likely there.
+
+Joints that keypoints suggest are fitted to the contours as well (`fitted_to_both`).
 """
 
 import math

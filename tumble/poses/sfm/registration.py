@@ -53,7 +53,7 @@ MIN_JOINT_KEYPOINTS = 100
 MIN_MAJORITY_KEYPOINTS = 40
 """The same if they are more than half of the keypoints that have a surface point in the other part. Of 149 pairs of
 pieces of twelve frames (the film `MC1` of a cracker box, a synthetic one of a soup can in a hand) hypotheses with 40
-to 100 keypoints were wrong 15 times of 15 where these were less than half, and right 8 times of 8 elsewhere."""
+to 100 keypoints were wrong 12 times of 12 where these were less than half, and right 10 times of 10 elsewhere."""
 MIN_JOINT_FRAMES = 2
 """Number of frames with `MIN_CORRESPONDENCES` agreeing keypoints below which two parts are not joined."""
 MIN_GAPS = 50
