@@ -134,6 +134,7 @@ def fitted_to_both(
 
     Args:
         seen: Correspondences of the part and the other.
+        start: Hypotheses for the motion of the part.
         error: Reprojection error up to which they agree [pixels].
     """
     agrees = seen.errors(observed, part, start).norm(dim=-1) < error

@@ -107,17 +107,20 @@ class Joint:
     @property
     def accepted(self) -> bool:
         """Whether the two parts belong together in this way."""
-        enough = MIN_MAJORITY_KEYPOINTS if self.share > 0.5 else MIN_JOINT_KEYPOINTS
-        if self.gaps < MIN_GAPS:
-            enough = MIN_JOINT_KEYPOINTS
-        elif self.cost > MAX_CONTOUR_COST:
+        if self.confirmable and self.cost > MAX_CONTOUR_COST:
             return False
+        enough = MIN_MAJORITY_KEYPOINTS if self.confirmable and self.share > 0.5 else MIN_JOINT_KEYPOINTS
         return self.keypoints >= enough and self.frames >= MIN_JOINT_FRAMES
+
+    @property
+    def confirmable(self) -> bool:
+        """Whether enough contours are seen to confirm or to contradict it."""
+        return self.gaps >= MIN_GAPS
 
     @property
     def order(self) -> tuple[bool, bool, float]:
         """What the best of several hypotheses for the same parts has least of."""
-        return not self.accepted, not self.continuous, self.cost if self.gaps >= MIN_GAPS else math.inf
+        return not self.accepted, not self.continuous, self.cost if self.confirmable else math.inf
 
 
 Propose = Callable[[Observed, Partial, Partial], Joint | ContourJoint | None]
@@ -215,14 +218,14 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
     together = Correspondences(*map(torch.from_numpy, (place, observed.keypoints.uv[keypoint], points)))
     fitted = fitted_to_both(observed, part, other, together, (proposed[0][chosen], proposed[1][chosen]), JOINT_ERROR)
     distance, p, q = part.nearest(other)
-    joints = []
+    matched, joints = max(1, len(np.unique(keypoint))), []
     for new in (moved_part(part, fitted, k) for k in range(len(chosen))):
         counts = _agreeing(observed, new, keypoint, points, JOINT_ERROR)
         step = float(angle_between(SO3.from_matrix(new.R[p]), SO3.from_matrix(other.R[q])))
         continuous = distance == 0 or step <= MAX_STEP * distance
-        frames = int((counts >= MIN_CORRESPONDENCES).sum())
-        share = float(counts.sum()) / max(1, len(np.unique(keypoint)))
-        joints.append(Joint(new, int(counts.sum()), share, frames, *contour_cost(observed, other, new), continuous))
+        number, frames = int(counts.sum()), int((counts >= MIN_CORRESPONDENCES).sum())
+        cost, gaps = contour_cost(observed, other, new)
+        joints.append(Joint(new, number, number / matched, frames, cost, gaps, continuous))
     most = max(joint.keypoints for joint in joints)
     joints = [joint for joint in joints if joint.keypoints >= MIN_SHARE * most]
     return min(joints, key=lambda joint: joint.order)

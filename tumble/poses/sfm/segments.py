@@ -107,7 +107,7 @@ def segmented_poses(
         near = set(neighbours(n))
         far = {(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)}
         missing = set(range(n)) - set(part.frames if part else ())
-        learned = _matched(inputs, sorted(each for each in near | far if missing & {*each}), LEARNED_MATCHER)
+        learned = _matched(inputs, sorted(each for each in near | far if missing.intersection(each)), LEARNED_MATCHER)
         of_near = [match for match in learned if (match.i, match.j) in near]
         inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), hidden=True)
         other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng)
