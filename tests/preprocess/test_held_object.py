@@ -63,6 +63,34 @@ def test_a_print_in_the_colour_of_the_hand_is_object() -> None:
     assert (masks.labels[printed] == OBJECT).mean() > 0.9
 
 
+def test_a_hole_with_the_colours_of_a_hand_is_print_unless_a_hand_is_there() -> None:
+    inside, hand, fingertip = (np.zeros((60, 90), bool) for _ in range(3))
+    inside[10:50, 10:80] = True
+    for left in (20, 40, 60):
+        inside[20:30, left : left + 10] = False
+    hand[20:30, 20:30] = hand[20:30, 60:70] = True
+    hand[:, 85:] = True
+    fingertip[25:32, 65:68] = True
+    printed = held_object._with_print(inside, hand, fingertip) & ~inside
+    assert (printed == (hand & (np.arange(90) < 30))).all(), "the hole of the background and that of the finger stay"
+
+
+def test_a_forearm_that_touches_the_object_is_not_object() -> None:
+    """It appears where the background is unknown, away from the landmarks, behind a sleeve that reaches the border."""
+    video = scene(hand=True)
+    pictures, arm = video.pictures.copy(), np.zeros_like(video.object)
+    for i, picture in enumerate(pictures):
+        arm[i, 44:66, 14 : 24 + min(6 * i, 60)] = True
+        arm[i] &= ~video.object[i] & ~video.hand[i]
+        picture[44:66, :14], picture[arm[i]] = (30, 30, 34), (164, 120, 96)
+    background = estimate_background(video.pictures, video.object | video.hand)
+    background.known[36:76, 8:36] = False
+    hands = [[landmarks(i)] for i in range(len(pictures))]
+    masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
+    assert (masks.labels[10:][arm[10:]] == OBJECT).mean() < 0.02
+    assert (masks.labels[video.object] == OBJECT).mean() > 0.8
+
+
 def test_what_a_hand_had_hidden_is_object_again() -> None:
     """A second hand covers three quarters of the object for some frames."""
     video, covered = scene(), slice(6, 11)

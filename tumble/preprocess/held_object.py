@@ -60,7 +60,7 @@ belongs to an island where no hand was detected."""
 MAX_AVERAGED_LOG_RATIO = 4.0
 """Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
 MAX_HOLE_FRACTION = 0.3
-"""Maximum area of a hole in the predicted object that is expected to be its print, as a fraction of the object's."""
+"""Maximum area of a hole in the object that may be its print, as a fraction of the object's."""
 SEED_ITERATIONS = 2
 """Number of times that the colours and the mask of the seed frame are estimated in turn."""
 SEED_PRIOR = {
@@ -238,15 +238,19 @@ def _islands(
 ) -> Bool[np.ndarray, "h w"]:
     """Connected parts of the foreground that are likely to show the object.
 
-    No hand covers them, and they do not reach the border of the image, as arms do. They are near the predicted object,
-    or they have its colours and are next to a hand; any place will do if the object was not predicted anywhere.
+    No hand covers them, none of their parts has rather a hand's colours, and they do not reach the border of the image,
+    as arms do. They are near the predicted object, or they have its colours and are next to a hand; any place will do
+    if the object was not predicted anywhere.
     """
     log_ratio = _object_over_hand(log_likelihood)
-    hand = log_ratio < MIN_ISLAND_LOG_RATIO if frame.surroundings is None else frame.surroundings
+    radius = segmentation.search_radius(predicted)
+    if frame.surroundings is None:
+        hand = log_ratio < MIN_ISLAND_LOG_RATIO
+    else:  # Without the colours, a forearm that touches the object would be a part of its island.
+        hand = frame.surroundings | (cv2.blur(log_ratio, (2 * radius + 1,) * 2) < 0)
     count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
     size = np.bincount(ids.ravel(), minlength=count)
     mean = np.bincount(ids.ravel(), log_ratio.ravel(), minlength=count) / np.maximum(size, 1)
-    radius = segmentation.search_radius(predicted)
     near = _touches(ids, count, segmentation.dilated(predicted, 2 * radius))
     place = np.ones_like(predicted)
     if predicted.any():
@@ -281,23 +285,25 @@ def _segment_frame(
 
     Args:
         predicted: The object, as predicted.
-        expected: Where the object is expected; away from the landmarks, a colour in it does not tell a hand: it is the
-            object's print.
+        expected: Where the object is expected; inside of it, away from the landmarks, a colour does not tell a hand: it
+            is the object's print. At its edge an arm would grow into the object from frame to frame.
         log_likelihood: Of the pixels' colours under object, hand and background.
     """
-    log_ratio = log_likelihood.copy()
+    log_ratio, radius = log_likelihood.copy(), segmentation.search_radius(predicted)
     doubtful = np.zeros_like(predicted)
     if frame.surroundings is not None:
         doubtful = frame.surroundings & (_object_over_hand(log_ratio) < 0)
-        far = expected & ~frame.surroundings
+        far = segmentation.eroded(expected, radius) & ~frame.surroundings
         log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)
     log_ratio = np.maximum(log_ratio, log_ratio.max(0) - MAX_LOG_RATIO)
     hidden = log_ratio[OBJECT_CLASS] - log_ratio[HAND_CLASS] > MAX_OBJECT_LOG_RATIO
     log_ratio[HAND_CLASS, frame.strokes & ~hidden] += STROKE_LOG_ODDS
-    inner = segmentation.eroded(predicted, segmentation.search_radius(predicted))
+    inner = segmentation.eroded(predicted, radius)
     log_ratio[HAND_CLASS, frame.arm & ~inner] += ARM_LOG_ODDS
     probabilities = class_probabilities(log_ratio + np.log(prior), frame.image)
-    inside = _connected(probabilities.argmax(0) == OBJECT_CLASS, predicted)
+    label = probabilities.argmax(0)
+    inside = _connected(label == OBJECT_CLASS, predicted)
+    inside = _with_print(inside, label == HAND_CLASS, frame.surroundings)
     return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful)
 
 
@@ -337,6 +343,20 @@ def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """The mask without holes, except those too large for a print that was taken for something else."""
     _, ids, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     return mask | (stats[:, cv2.CC_STAT_AREA] <= MAX_HOLE_FRACTION * mask.sum())[ids]
+
+
+def _with_print(
+    inside: Bool[np.ndarray, "h w"], hand: Bool[np.ndarray, "h w"], surroundings: Bool[np.ndarray, "h w"] | None
+) -> Bool[np.ndarray, "h w"]:
+    """The object with its print in a hand's colours: holes that show these for the most part, but no detected hand."""
+    count, ids = segmentation.components(~inside)
+    size = np.bincount(ids.ravel(), minlength=count)
+    filled = ~_at_border(ids, count) & (size <= MAX_HOLE_FRACTION * inside.sum())
+    filled &= np.bincount(ids[hand], minlength=count) > 0.5 * size
+    if surroundings is not None:
+        filled &= ~_touches(ids, count, surroundings)
+    filled[0] = False
+    return inside | filled[ids]
 
 
 def _updated(colours: ColourModel, frame: _Frame, state: _State, predicted: Bool[np.ndarray, "h w"]) -> ColourModel:
