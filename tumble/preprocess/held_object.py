@@ -30,6 +30,7 @@ from tumble.preprocess.colour_model import (
     class_probabilities,
     hand_colours,
     log_likelihoods,
+    skin_coloured,
     trim_rim,
 )
 from tumble.preprocess.hands import Hand, arm_region, hand_strokes, hand_surroundings
@@ -61,12 +62,14 @@ MAX_AVERAGED_LOG_RATIO = 4.0
 """Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
 MAX_HOLE_FRACTION = 0.3
 """Maximum area of a hole in the object that may be its print, as a fraction of the object's."""
+MIN_SKIN_FRACTION = 0.1
+"""Minimum fraction of skin-coloured pixels at the landmarks of hands without gloves."""
 SEED_ITERATIONS = 2
 """Number of times that the colours and the mask of the seed frame are estimated in turn."""
 SEED_PRIOR = {
     "object": (0.9, 0.05, 0.05),
     "hand": (0.25, 0.6, 0.15),
-    "box": (0.4, 0.1, 0.5),
+    "box": (0.1, 0.1, 0.8),
     "moving": (0.01, 0.9, 0.09),
     "rest": (0.01, 0.2, 0.79),
 }
@@ -162,10 +165,14 @@ def _segment_seed(
     """Segmentation of the seed frame and the colours of the classes."""
     static = segmentation.opened(background.same(frame.image), 1)
     box = segmentation.box_mask(frame.differs.shape, seed.box or segmentation.box_around(seed.click, frame.differs))
-    at_hand = frame.strokes if frame.surroundings is None else frame.surroundings
+    # The object may hide what landmarks show; hands that do not have the colours of skin wear gloves.
+    skin = skin_coloured(frame.image)
+    skin |= skin[frame.strokes].mean() < MIN_SKIN_FRACTION if frame.strokes.any() else True
+    strokes = frame.strokes & skin
+    at_hand = strokes if frame.surroundings is None else frame.surroundings & skin
     trimap = np.where(box & ~static, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
     trimap[box & at_hand] = cv2.GC_PR_BGD
-    trimap[box & frame.strokes] = cv2.GC_BGD
+    trimap[box & strokes] = cv2.GC_BGD
     if seed.click is not None:
         trimap[segmentation.disc_around(seed.click, box)] = cv2.GC_FGD
     empty = np.zeros(frame.differs.shape, bool)

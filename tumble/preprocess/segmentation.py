@@ -146,7 +146,7 @@ def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h 
         alike = channel_max(np.abs(image.astype(np.int16) - colour)) < MIN_DIFFERENCE
         if alike[~inside].sum() < MAX_ALIKE * (~inside).sum():
             enclosed |= dilated(ids == k, EDGE_MARGIN) & static & inside
-    mostly_static = (moving & inside).sum() < MIN_MOVING_FRACTION * inside.sum()
+    mostly_static = ((moving | ~background.known) & inside).sum() < MIN_MOVING_FRACTION * inside.sum()
     return replace(background, known=background.known & ~(inside if mostly_static else enclosed))
 
 
