@@ -91,6 +91,21 @@ def test_a_forearm_that_touches_the_object_is_not_object() -> None:
     assert (masks.labels[video.object] == OBJECT).mean() > 0.8
 
 
+def test_landmarks_that_the_object_hides_do_not_make_it_a_hand() -> None:
+    """On the seed frame the hand is behind the object, and its landmarks are all over the box."""
+    video = scene(hand=True)
+    left, top, width, height = video.box()
+    points = landmarks(0).landmarks
+    points = (points - points.min(0)) / np.ptp(points, 0) * (width, height) + (left, top)
+    hands = [[Hand(points.astype(np.float32), 1.0, 1.0)], *([landmarks(i)] for i in range(1, len(video.pictures)))]
+    background = estimate_background(video.pictures, video.object | video.hand)
+    masks = held_object.segment(video.pictures, background, Seed(0, video.box()), hands)
+    known = masks.labels[0] != UNKNOWN
+    assert overlap(masks.labels[0] == OBJECT, video.object[0] & known) > 0.85
+    assert (masks.labels[5:][video.object[5:]] == OBJECT).mean() > 0.7
+    assert (masks.labels[video.hand] == OBJECT).mean() < 0.01
+
+
 def test_what_a_hand_had_hidden_is_object_again() -> None:
     """A second hand covers three quarters of the object for some frames."""
     video, covered = scene(), slice(6, 11)
