@@ -94,9 +94,9 @@ def test_a_forearm_that_touches_the_object_is_not_object() -> None:
 def test_landmarks_that_the_object_hides_do_not_make_it_a_hand() -> None:
     """On the seed frame the hand is behind the object, and its landmarks are all over the box."""
     video = scene(hand=True)
-    left, top, width, height = video.box()
-    points = landmarks(0).landmarks
-    points = (points - points.min(0)) / np.ptp(points, 0) * (width, height) + (left, top)
+    rows, columns = np.nonzero(video.object[0])
+    corner, points = np.array([columns.min(), rows.min()]), landmarks(0).landmarks
+    points = (points - points.min(0)) / np.ptp(points, 0) * (np.ptp(columns), np.ptp(rows)) + corner
     hands = [[Hand(points.astype(np.float32), 1.0, 1.0)], *([landmarks(i)] for i in range(1, len(video.pictures)))]
     background = estimate_background(video.pictures, video.object | video.hand)
     masks = held_object.segment(video.pictures, background, Seed(0, video.box()), hands)
