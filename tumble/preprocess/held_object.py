@@ -245,8 +245,8 @@ def _islands(
 ) -> Bool[np.ndarray, "h w"]:
     """Connected parts of the foreground that are likely to show the object.
 
-    No hand covers them, none of their parts has rather a hand's colours, and they do not reach the border of the image,
-    as arms do. They are near the predicted object, or they have its colours and are next to a hand; any place will do
+    No hand covers them, none of their parts is skin by its colours, and they do not reach the border of the image, as
+    arms do. They are near the predicted object, or they have its colours and are next to a hand; any place will do
     if the object was not predicted anywhere.
     """
     log_ratio = _object_over_hand(log_likelihood)
@@ -254,7 +254,9 @@ def _islands(
     if frame.surroundings is None:
         hand = log_ratio < MIN_ISLAND_LOG_RATIO
     else:  # Without the colours, a forearm that touches the object would be a part of its island.
-        hand = frame.surroundings | (cv2.blur(log_ratio, (2 * radius + 1,) * 2) < 0)
+        window = (2 * radius + 1,) * 2
+        skin = cv2.blur(skin_coloured(frame.image).astype(np.float32), window) > 0.5
+        hand = frame.surroundings | (skin & (cv2.blur(log_ratio, window) < 0))
     count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
     size = np.bincount(ids.ravel(), minlength=count)
     mean = np.bincount(ids.ravel(), log_ratio.ravel(), minlength=count) / np.maximum(size, 1)
@@ -292,15 +294,17 @@ def _segment_frame(
 
     Args:
         predicted: The object, as predicted.
-        expected: Where the object is expected; inside of it, away from the landmarks, a colour does not tell a hand: it
-            is the object's print. At its edge an arm would grow into the object from frame to frame.
+        expected: Where the object is expected; away from the landmarks a colour does not tell a hand there: it is the
+            object's print, or a side that comes into view. Only skin at the edge may be an arm, which would else become
+            object from frame to frame.
         log_likelihood: Of the pixels' colours under object, hand and background.
     """
     log_ratio, radius = log_likelihood.copy(), segmentation.search_radius(predicted)
     doubtful = np.zeros_like(predicted)
     if frame.surroundings is not None:
         doubtful = frame.surroundings & (_object_over_hand(log_ratio) < 0)
-        far = segmentation.eroded(expected, radius) & ~frame.surroundings
+        inner = segmentation.eroded(expected, radius) | ~skin_coloured(frame.image)
+        far = expected & inner & ~frame.surroundings
         log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)
     log_ratio = np.maximum(log_ratio, log_ratio.max(0) - MAX_LOG_RATIO)
     hidden = log_ratio[OBJECT_CLASS] - log_ratio[HAND_CLASS] > MAX_OBJECT_LOG_RATIO
