@@ -11,7 +11,7 @@ from tumble.preprocess import held_object
 from tumble.preprocess.background import estimate_background
 from tumble.preprocess.colour_model import UNIFORM_DENSITY, hand_colours
 from tumble.preprocess.hands import Hand
-from tumble.preprocess.segmentation import Masks, Seed, overlap
+from tumble.preprocess.segmentation import Masks, Seed, opened, overlap
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
 PRINT = (196, 140, 112)
@@ -89,6 +89,21 @@ def test_a_forearm_that_touches_the_object_is_not_object() -> None:
     masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
     assert (masks.labels[10:][arm[10:]] == OBJECT).mean() < 0.02
     assert (masks.labels[video.object] == OBJECT).mean() > 0.8
+
+
+def test_a_side_that_comes_into_view_is_object_in_the_colours_of_the_sleeve_too() -> None:
+    video, sleeve = scene(hand=True), (30, 60, 160)
+    pictures, side = video.pictures.copy(), np.zeros_like(video.object)
+    for i, picture in enumerate(pictures):
+        left = 50 + 6 * (i % 5)
+        picture[-14:, left : left + 50] = sleeve
+        right = np.nonzero(opened(video.object[i] & ~video.hand[i], 6))[1].max()
+        side[i] = video.object[i] & (np.arange(side.shape[2]) > right - 2.5 * (i - 3)) & (i > 3)
+        picture[side[i]] = sleeve
+    hands = [[landmarks(i)] for i in range(len(pictures))]
+    background = estimate_background(pictures, video.object | video.hand)
+    masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
+    assert (masks.labels[14:][side[14:]] == OBJECT).mean() > 0.8
 
 
 def test_landmarks_that_the_object_hides_do_not_make_it_a_hand() -> None:
