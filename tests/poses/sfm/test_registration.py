@@ -81,7 +81,6 @@ def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
     assert not Joint(second, 30, 0.6, 3, right, gaps, True).accepted
     assert not Joint(second, 50, 0.4, 3, right, gaps, True).accepted
     assert Joint(second, 110, 0.4, 3, right, gaps, True).accepted
-    assert not Joint(second, 110, 0.15, 3, right, gaps, True).accepted
     assert not Joint(second, 50, 0.6, 3, 0.0, 9, True).accepted
 
 

@@ -54,10 +54,6 @@ MIN_MAJORITY_KEYPOINTS = 40
 """The same if they are more than half of the keypoints that have a surface point in the other part. Of 149 pairs of
 pieces of twelve frames (the film `MC1` of a cracker box, a synthetic one of a soup can in a hand) hypotheses with 40
 to 100 keypoints were wrong 12 times of 12 where these were less than half, and right 10 times of 10 elsewhere."""
-MIN_JOINT_SHARE = 0.2
-"""Fraction of the keypoints with a surface point in the other part below which two parts are not joined: between long
-parts, repeated print makes a hundred agree with a wrong joint. On the films for tuning right joints have 0.23 and more;
-two wrong ones, of parts of 29 to 44 frames, have 0.17 and 0.19."""
 MIN_JOINT_FRAMES = 2
 """Number of frames with `MIN_CORRESPONDENCES` agreeing keypoints below which two parts are not joined."""
 MIN_GAPS = 50
@@ -114,7 +110,7 @@ class Joint:
         if self.confirmable and self.cost > MAX_CONTOUR_COST:
             return False
         enough = MIN_MAJORITY_KEYPOINTS if self.confirmable and self.share > 0.5 else MIN_JOINT_KEYPOINTS
-        return self.keypoints >= enough and self.share >= MIN_JOINT_SHARE and self.frames >= MIN_JOINT_FRAMES
+        return self.keypoints >= enough and self.frames >= MIN_JOINT_FRAMES
 
     @property
     def confirmable(self) -> bool:
