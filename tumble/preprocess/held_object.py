@@ -95,6 +95,8 @@ class _Frame:
     surroundings: Bool[np.ndarray, "h w"] | None
     """Pixels that may show the detected hands or their arms; None if no hand was detected."""
     arm: Bool[np.ndarray, "h w"]
+    skin: Bool[np.ndarray, "h w"]
+    """Pixels in the colour range of skin."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,7 @@ def segment(
             hand_strokes(found, shape),
             hand_surroundings(found, shape) | arm if found else None,
             arm,
+            skin_coloured(images[i]),
         )
 
     start = frame(seed.index)
@@ -166,10 +169,9 @@ def _segment_seed(
     static = segmentation.opened(background.same(frame.image), 1)
     box = segmentation.box_mask(frame.differs.shape, seed.box or segmentation.box_around(seed.click, frame.differs))
     # The object may hide what landmarks show; hands that do not have the colours of skin wear gloves.
-    skin = skin_coloured(frame.image)
-    skin |= skin[frame.strokes].mean() < MIN_SKIN_FRACTION if frame.strokes.any() else True
-    strokes = frame.strokes & skin
-    at_hand = strokes if frame.surroundings is None else frame.surroundings & skin
+    gloved = not frame.strokes.any() or frame.skin[frame.strokes].mean() < MIN_SKIN_FRACTION
+    strokes = frame.strokes & (frame.skin | gloved)
+    at_hand = strokes if frame.surroundings is None else frame.surroundings & (frame.skin | gloved)
     trimap = np.where(box & ~static, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
     trimap[box & at_hand] = cv2.GC_PR_BGD
     trimap[box & strokes] = cv2.GC_BGD
@@ -255,7 +257,7 @@ def _islands(
         hand = log_ratio < MIN_ISLAND_LOG_RATIO
     else:  # Without the colours, a forearm that touches the object would be a part of its island.
         window = (2 * radius + 1,) * 2
-        skin = cv2.blur(skin_coloured(frame.image).astype(np.float32), window) > 0.5
+        skin = cv2.blur(frame.skin.astype(np.float32), window) > 0.5
         hand = frame.surroundings | (skin & (cv2.blur(log_ratio, window) < 0))
     count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
     size = np.bincount(ids.ravel(), minlength=count)
@@ -303,8 +305,8 @@ def _segment_frame(
     doubtful = np.zeros_like(predicted)
     if frame.surroundings is not None:
         doubtful = frame.surroundings & (_object_over_hand(log_ratio) < 0)
-        inner = segmentation.eroded(expected, radius) | ~skin_coloured(frame.image)
-        far = expected & inner & ~frame.surroundings
+        possible_arm = frame.skin & ~segmentation.eroded(expected, radius)
+        far = expected & ~possible_arm & ~frame.surroundings
         log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)
     log_ratio = np.maximum(log_ratio, log_ratio.max(0) - MAX_LOG_RATIO)
     hidden = log_ratio[OBJECT_CLASS] - log_ratio[HAND_CLASS] > MAX_OBJECT_LOG_RATIO

@@ -58,8 +58,8 @@ MAX_COVER_OUTSIDE = 0.5
 """Maximum fraction of the image outside the region in which the object is expected that one hand covers; a wall covers
 more."""
 MIN_MOVING_FRACTION = 0.1
-"""Minimum fraction of the box that differs from the background; with less, the background inside the box is not
-used."""
+"""Minimum fraction of the box that differs from the background, or has none that is known; with less, the background
+inside the box is not used."""
 MIN_STATIC_PART = 0.02
 """Minimum area of a static part that may be the object, as a fraction of the box; smaller ones are closed as holes."""
 MAX_ALIKE = 0.01
