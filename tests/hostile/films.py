@@ -96,6 +96,8 @@ def options() -> Iterator[Case]:
         **{f"--box 5 5 20 20 --object 3 3 {at}": "a click is on frame" for at in ("-1", "8", "1000000000")},
         "--object 3 3 0 --masks nowhere": "leave them out, or --masks",
         **{f"--box 5 5 20 20 --at {at}": "at" for at in ("-1", "8", "1000000000")},
+        **{f"--part {part}": "--part is the first and the last" for part in ("3 3", "4 2", "-1 5")},
+        "--part 1000000000 1000000001": "--part begins with frame 1000000000",
         "--masks nowhere": "nowhere: is missing",
         "--segmenter sam2": "needs --weights",
         "--matcher ../x": "no '../x' in",

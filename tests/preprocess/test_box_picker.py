@@ -178,6 +178,8 @@ def video_of(tmp_path: Path) -> Path:
 def test_the_frame_is_the_sharpest_of_the_first_or_the_given_one(at: int, number: int, tmp_path: Path) -> None:
     frame = box_picker.sharpest_frame(video_of(tmp_path), FootageOptions(at=at, focal=300.0))
     assert frame.number == number
+    part = FootageOptions(at=at and 12, focal=300.0, part=(8, 15))
+    assert box_picker.sharpest_frame(video_of(tmp_path), part).number == (at or 9)
     with pytest.raises(BadFile, match="has no frame 99"):
         box_picker.sharpest_frame(video_of(tmp_path), FootageOptions(at=99, focal=300.0))
 

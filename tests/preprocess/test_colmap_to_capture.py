@@ -273,6 +273,7 @@ BROKEN: dict[str, tuple[Callable[[Path], Any], FootageOptions, str]] = {
     "shrunk images": (shrink, FootageOptions(), r"001\.png: has 200 x 150 pixels, but in the COLMAP model 400 x 300"),
     "a path to elsewhere": (escape, FootageOptions(), r"'\.\./\.\./x\.png' leaves the folder"),
     "empty masks": (wipe, FootageOptions(), "has only empty masks"),
+    "a part": (lambda p: None, FootageOptions(part=(0, 3)), "whose images are all used .leave out --part"),
     "a second lens": (lambda p: None, FootageOptions(fov=40.0), "--fov contradicts it"),
     "text as a model": (
         lambda p: (p / "sparse/0/images.bin").write_text("hello"),

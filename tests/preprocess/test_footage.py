@@ -92,6 +92,24 @@ def test_masks_of_a_video_are_one_per_frame_in_order(tmp_path: Path) -> None:
         opened(path, tmp_path / "m")
 
 
+def test_a_part_keeps_the_numbers_of_its_frames_and_nothing_after_it_is_read(tmp_path: Path) -> None:
+    video.write_clip(tmp_path / "x.mp4", [np.full((66, 80, 3), 20 * i, np.uint8) for i in range(9)])
+    for i in range(9):
+        files.write_png(tmp_path / "m" / f"{i}.png", np.full((66, 80, 1), 255 * (i == 4), np.uint8))
+    film = footage.open_footage(tmp_path / "x.mp4", tmp_path / "m")
+    frames = list(footage.read_frames(film, part=(3, 5)))
+    assert [frame.number for frame in frames] == [3, 4, 5]
+    assert [round(float(frame.image.mean()) / 20) for frame in frames] == [3, 4, 5]
+    assert [int(frame.mask[0, 0]) for frame in frames if frame.mask is not None] == [0, 255, 0]
+    assert [frame.number for frame in footage.read_frames(film, part=(7, 100))] == [7, 8]
+    with pytest.raises(BadFile, match=r"has 9 frames.*begins with frame 9"):
+        list(footage.read_frames(film, part=(9, 12)))
+    for i in range(9):
+        files.write_png(tmp_path / "i" / f"{i}.png", np.full((8, 9 + (i > 5), 3), i, np.uint8))
+    frames = list(footage.read_frames(footage.open_footage(tmp_path / "i"), part=(2, 5)))
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [2, 3, 4, 5]
+
+
 def test_bad_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(BadFile, match="holds no images"):

@@ -167,6 +167,9 @@ def test_a_frame_with_an_empty_mask_is_dropped_and_only_empty_masks_are_refused(
         (np.stack([np.roll(p, 2 * i, 1) for i, p in enumerate(scene().pictures)]), WITH_BOX, "a moving camera"),
         (scene().pictures, FootageOptions(box=(100, 100, 100, 100)), "the box or click lies outside"),
         (scene().pictures, FootageOptions(box=(1, 1, 20, 20), at=99), "--at is 99"),
+        (scene().pictures, FootageOptions(box=(1, 1, 20, 20), part=(2, 9)), "frames 2 to about 9 .* --at is 0"),
+        (scene().pictures, FootageOptions(object=((9, 9, 12),), part=(2, 9)), "a click is on frame 12"),
+        (scene().pictures, FootageOptions(part=(99, 120)), "begins with frame 99"),
         (np.repeat(scene().background[None], 8, 0), FootageOptions(), "nothing that moves"),
         (np.zeros((4, 40, 40, 3), np.uint8), FootageOptions(), "has 40 x 40 pixels"),
     ],
@@ -195,11 +198,26 @@ def test_nothing_is_overwritten_and_a_failure_leaves_no_files(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_part_of_a_video_gives_a_capture_of_its_frames(tmp_path: Path) -> None:
+    path, last = written(scene().pictures, tmp_path / "x.mp4"), len(scene().pictures) - 4
+    options = FootageOptions(box=scene().box(3), at=3, part=(3, last))
+    survey = survey_footage(path, options)
+    assert survey.numbers.tolist() == list(range(3, last + 1))
+    out = video_to_capture.capture_from_video(path, tmp_path / "out", options)
+    record = files.read_json(out / video_to_capture.PROVENANCE)
+    assert {3 <= each["source_frame"] <= last for each in record["frames"]} == {True}
+    assert record["options"]["part"] == [3, last]
+    # Captures made before there was this option have no such entry, and remain valid.
+    assert "part" not in video_to_capture.footage_fingerprint(path, FootageOptions())["options"]
+
+
 def test_long_videos_are_subsampled_and_too_long_ones_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(scene().pictures, tmp_path / "x.mp4")
     monkeypatch.setattr("tumble.preprocess.survey.MAX_SURVEY_FRAMES", 8)
     survey = survey_footage(path, FootageOptions(box=scene().box(), frames=8))
     assert survey.numbers.tolist() == [0, 4, 8, 12, 16]
+    survey = survey_footage(path, FootageOptions(box=scene().box(1), at=1, frames=8, part=(1, 15)))
+    assert survey.numbers.tolist() == [1, 3, 5, 7, 9, 11, 13, 15]
     monkeypatch.setattr("tumble.preprocess.survey.MAX_FRAMES", 10)
     with pytest.raises(BadFile, match="has more than 10 frames"):
         survey_footage(path, FootageOptions(box=scene().box(), frames=8))
@@ -213,6 +231,8 @@ def test_long_videos_are_subsampled_and_too_long_ones_refused(tmp_path: Path, mo
         ({"segmenter": "sam2"}, "needs --weights"),
         ({"frames": 1}, "--frames must be 3"),
         ({"size": 8}, "--size 64"),
+        ({"part": (5, 5)}, "the first and the last frame"),
+        ({"part": (-1, 5)}, "the first and the last frame"),
     ],
 )
 def test_contradictory_options_are_refused(options: dict, message: str) -> None:

@@ -95,6 +95,8 @@ def collect_silhouettes(path: Path, options: FootageOptions) -> PosedImages:
         raise BadFile(
             path, f"has a COLMAP model, which contains the lens: --{lens[0]} contradicts it", "leave that option out"
         )
+    if options.part:
+        raise BadFile(path, "has a COLMAP model, whose images are all used", "leave out --part")
     model = colmap.read(path)
     root = path / "images" if (path / "images").is_dir() else path
     spread = np.linspace(0, len(model.views) - 1, min(options.frames, len(model.views))).round().astype(int)

@@ -9,6 +9,7 @@ whole name (`0001.jpg.png`). Without other masks the alpha channel of an image i
 import math
 import re
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -107,15 +108,26 @@ def open_footage(path: Path, masks: Path | None = None) -> Footage:
     return Footage(path, images, mask_files, _positive_number(equivalent_focal), None)
 
 
-def read_frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[FootageFrame]:
-    """Read all frames, one at a time.
+def read_frames(
+    footage: Footage, *, part: tuple[int, int] | None = None, invert_masks: bool = False
+) -> Iterator[FootageFrame]:
+    """Read the frames, one at a time.
+
+    Args:
+        part: Numbers of the first and the last frame; None for all.
 
     Raises:
-        BadFile: A frame cannot be read or differs in size from the first; a mask is missing or has another size.
+        BadFile: A frame cannot be read or differs in size from the first; a mask is missing or has another size; the
+            footage ends before the part begins.
     """
+    first, last = part or (0, sys.maxsize)
     source = _video_frames(footage) if not footage.images else _image_frames(footage, invert_masks)
     shape, number = None, -1
     for number, (time, image, mask) in enumerate(source):
+        if number > last:
+            return
+        if number < first:
+            continue
         shape = shape or image.shape
         if image.shape != shape:
             name = footage.images[number] if footage.images else footage.path
@@ -127,6 +139,8 @@ def read_frames(footage: Footage, *, invert_masks: bool = False) -> Iterator[Foo
                 raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the video, in order")
             mask = read_mask(footage.masks[number], image, invert_masks)
         yield FootageFrame(number, time, image, mask)
+    if 0 <= number < first:
+        raise BadFile(footage.path, f"has {number + 1} frames", f"--part begins with frame {first}, counted from 0")
     if footage.masks and not footage.images and number + 1 < len(footage.masks):
         rule = f"holds {len(footage.masks)} masks, but the video has {number + 1} frames"
         raise BadFile(footage.masks[0].parent, rule, "give one mask per frame of the video, in order")

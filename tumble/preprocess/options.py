@@ -44,6 +44,8 @@ class FootageOptions:
     """A pixel on the object on frame `--at`, in place of a box: column, row [pixels]."""
     at: int = 0
     """Number of the frame to which the box or the click refers, counted from 0."""
+    part: Annotated[tuple[int, int] | None, arg(metavar="FIRST LAST", help_behavior_hint="")] = None
+    """Numbers of the first and the last frame that are used, counted from 0. Default: all frames."""
     object: Clicks = ()
     """A pixel on the object where the mask lacks it: column, row [pixels], frame. The mask is cut again there."""
     not_object: Clicks = ()
@@ -84,6 +86,8 @@ class FootageOptions:
             raise ValueError(
                 f"--box is left, top, width, height, at least 2 x 2 pixels; this one is {self.box[2]} x {self.box[3]}"
             )
+        if self.part is not None and not 0 <= self.part[0] < self.part[1]:
+            raise ValueError(f"--part is the first and the last frame, in this order; these are {self.part}")
         if self.segmenter != "grabcut" and self.weights is None:
             raise ValueError(f"--segmenter {self.segmenter} needs --weights, the path of its checkpoint file")
         if not MIN_FRAMES <= self.frames <= MAX_SURVEY_FRAMES or not MIN_SIDE <= self.size <= 4096:

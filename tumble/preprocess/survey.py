@@ -235,22 +235,23 @@ def _at_hands(images: np.ndarray, hands: Sequence[Sequence[Hand]]) -> Bool[np.nd
 def _read_scan(footage: Footage, options: FootageOptions) -> _Scan:
     small: list[tuple[FootageFrame, np.ndarray]] = []
     stride, lens, scale = 1, None, 1.0
-    for frame in read_frames(footage, invert_masks=options.invert_masks):
+    first = options.part[0] if options.part else 0
+    for frame in read_frames(footage, part=options.part, invert_masks=options.invert_masks):
         height, width = frame.image.shape[:2]
         if lens is None:
             lens, scale = lens_of(footage, options, height, width), min(SURVEY_SIDE / max(height, width), 1.0)
-        if frame.number >= MAX_FRAMES:
+        if frame.number - first >= MAX_FRAMES:
             raise BadFile(
-                footage.path, f"has more than {MAX_FRAMES} frames", "cut out the part in which the object is turned"
+                footage.path, f"has more than {MAX_FRAMES} frames", "give --part, in which the object is turned"
             )
-        if frame.number % stride:
+        if (frame.number - first) % stride:
             continue
         small.append(_downsample(undistort_frame(frame, lens), scale))
         if len(small) > MAX_SURVEY_FRAMES:
             small, stride = small[::2], 2 * stride
     if lens is None:
         raise BadFile(footage.path, "has no frames")
-    _check_box_and_click(footage, options, lens.camera, 1 + small[-1][0].number + stride - 1)
+    _check_box_and_click(footage, options, lens.camera, range(first, small[-1][0].number + stride))
     kept = [frame for frame, _ in small]
     with_masks = [frame.mask for frame in kept if frame.mask is not None]
     if with_masks and len(with_masks) < len(kept):
@@ -285,20 +286,21 @@ def lens_of(footage: Footage, options: FootageOptions, height: int, width: int) 
     )
 
 
-def _check_box_and_click(footage: Footage, options: FootageOptions, camera: Camera, n_frames: int) -> None:
+def _check_box_and_click(footage: Footage, options: FootageOptions, camera: Camera, used: range) -> None:
     left, top, width, height = options.box or ((*options.click, 1, 1) if options.click else (0, 0, 1, 1))
     if left < 0 or top < 0 or left + width > camera.width or top + height > camera.height:
         rule = f"has {camera.width} x {camera.height} pixels; the box or click lies outside"
         raise BadFile(footage.path, rule, "--box is left top width height, --click column row, in the upright image")
-    if not 0 <= options.at < n_frames:
-        raise BadFile(footage.path, f"has about {n_frames} frames, but --at is {options.at}")
+    used_frames = f"frames {used.start} to about {used.stop - 1} are used"
+    if (options.box or options.click or options.at) and options.at not in used:
+        raise BadFile(footage.path, f"{used_frames}, but --at is {options.at}", "mark the object on one of them")
     for column, row, number in (*options.object, *options.not_object):
         fix = "--object and --not-object are column, row and frame, counted from 0, in the upright image"
         if not (0 <= column < camera.width and 0 <= row < camera.height):
             rule = f"has {camera.width} x {camera.height} pixels; the click {column} {row} lies outside"
             raise BadFile(footage.path, rule, fix)
-        if not 0 <= number < n_frames:
-            raise BadFile(footage.path, f"has about {n_frames} frames, but a click is on frame {number}", fix)
+        if number not in used:
+            raise BadFile(footage.path, f"{used_frames}, but a click is on frame {number}", fix)
 
 
 def _downsample(frame: FootageFrame, scale: float) -> tuple[FootageFrame, np.ndarray]:

@@ -99,8 +99,8 @@ def footage_fingerprint(path: Path, options: FootageOptions) -> dict[str, Any]:
     for each in inside:
         with each.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
-    # Without clicks the options are those of captures made before there were any.
-    stated = {name: value for name, value in vars(options).items() if value != ()}
+    # Without clicks and part the options are those of captures made before there were any.
+    stated = {name: value for name, value in vars(options).items() if value != () and (name, value) != ("part", None)}
     return {"footage": digest.hexdigest(), "options": json.loads(json.dumps(stated, default=str))}
 
 
@@ -179,7 +179,7 @@ def _write(
     behind = None if held or survey.seed is None else _output_background(survey, window, size)
     entries: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
-    for frame in read_frames(survey.footage, invert_masks=options.invert_masks):
+    for frame in read_frames(survey.footage, part=options.part, invert_masks=options.invert_masks):
         if frame.number not in indices:
             continue
         i, name = indices[frame.number], f"{len(entries):04d}.png"
