@@ -92,6 +92,15 @@ def test_a_check_selects_as_many_frames_as_the_run_that_it_is_for(
     assert "7 selected" in capsys.readouterr().out
 
 
+def test_a_batch_converts_films_as_the_quality_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(
+        "tumble.batch.run_batch", lambda _captures, _out, _recipe, options, *_, **__: seen.append(options) or []
+    )
+    assert run(monkeypatch, "batch", "x.mp4", "-o", str(tmp_path / "b"), "--quality", "standard") == 0
+    assert [(each.frames, each.size) for each in seen] == [FRAMES_AND_SIZE["standard"]]
+
+
 def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

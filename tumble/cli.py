@@ -246,6 +246,7 @@ def batch(
     from tumble.recipes import QUALITIES
 
     workers = Workers(jobs, address, gpu=device == "cuda")
+    options = at_quality(options, quality, frames=None, size=None)
     recipe = replace(QUALITIES[quality], seed=seed)
     failed = 0
     for outcome in run_batch(captures, out, recipe, options, workers, poses=poses, device=device):

@@ -47,6 +47,21 @@ def test_a_moving_camera_does_not_pass(tmp_path: Path) -> None:
     assert "tripod" in results["camera"].advice
 
 
+def test_masks_of_ones_own_admit_a_moving_camera_and_keep_the_colours(tmp_path: Path) -> None:
+    """The brightness of a wall that passes by says nothing about the exposure of the object in front of it."""
+    video = scene()
+    wall = np.tile(np.concatenate([video.background, video.background[:, ::-1]], 1), (1, 2, 1))
+    wall = (wall * np.linspace(0.5, 1, wall.shape[1])[:, None]).astype(np.uint8)
+    width = video.pictures.shape[2]
+    behind = np.stack([wall[:, 9 * i : 9 * i + width] for i in range(len(video.pictures))])
+    pictures = np.where(video.object[..., None], video.pictures, behind)
+    for i, mask in enumerate(video.object):
+        files.write_png(tmp_path / "m" / f"{i}.png", (mask * np.uint8(255))[..., None])
+    results = findings(pictures, tmp_path, FootageOptions(masks=tmp_path / "m", focal=300.0))
+    assert results["camera"].rating == "warn"
+    assert results["exposure"].rating == "good", results["exposure"].state
+
+
 def test_an_object_that_does_not_rotate_does_not_pass(tmp_path: Path) -> None:
     results = findings(scene(still=True).pictures, tmp_path, OPTIONS)
     assert results["rotation"].rating == "stop"

@@ -62,6 +62,18 @@ def test_masks_may_be_alpha_or_have_the_values_0_and_1(tmp_path: Path) -> None:
     assert frame.mask[[0, 9], 0].tolist() == [OBJECT, BACKGROUND]
 
 
+def test_masks_may_be_opaque_images_or_coloured_labels(tmp_path: Path) -> None:
+    """Image editors add an opaque alpha channel; DAVIS and VOC label the first object dark red."""
+    white = np.zeros((10, 10, 4), np.uint8)
+    white[:5, :, :3], white[..., 3] = 255, 255
+    label = np.zeros((10, 10, 3), np.uint8)
+    label[:5, :, 0] = 128
+    for values in (white, label):
+        files.write_png(tmp_path / "m" / "a.png", values)
+        mask = footage.read_mask(tmp_path / "m" / "a.png", white, False)
+        assert mask[[0, 9], 0].tolist() == [OBJECT, BACKGROUND]
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_images_are_rotated_upright(tmp_path: Path, orientation: int) -> None:
     """Pillow's own transposition is the reference."""

@@ -198,6 +198,18 @@ def test_nothing_is_overwritten_and_a_failure_leaves_no_files(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_other_masks_of_the_same_name_are_other_footage(tmp_path: Path) -> None:
+    path = written(scene().pictures[:2], tmp_path / "x.mp4")
+    files.write_png(tmp_path / "m" / "0.png", np.zeros((9, 9, 1), np.uint8))
+    options = FootageOptions(masks=tmp_path / "m")
+    before = video_to_capture.footage_fingerprint(path, options)
+    assert video_to_capture.footage_fingerprint(path, options) == before
+    files.write_png(tmp_path / "m" / "0.png", np.ones((9, 9, 1), np.uint8))
+    after = video_to_capture.footage_fingerprint(path, options)
+    assert after != before
+    assert after["footage"] == before["footage"]
+
+
 def test_a_part_of_a_video_gives_a_capture_of_its_frames(tmp_path: Path) -> None:
     path, last = written(scene().pictures, tmp_path / "x.mp4"), len(scene().pictures) - 4
     options = FootageOptions(box=scene().box(3), at=3, part=(3, last))

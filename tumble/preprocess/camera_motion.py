@@ -1,12 +1,10 @@
-"""Whether the camera moved, from the optical flow of the background; footage of a moving camera is refused."""
+"""Whether the camera moved, from the optical flow of the background."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from tumble.io import BadFile
 from tumble.preprocess.background import Background
-from tumble.preprocess.survey import Survey
 from tumble.scene import BACKGROUND
 
 MAX_CAMERA_MOTION = 0.02
@@ -19,22 +17,17 @@ MIN_USABLE_FRACTION = 0.01
 """Minimum fraction of usable pixels of an image; with fewer, its shift is not estimated."""
 
 
-def refuse_camera_motion(survey: Survey) -> None:
-    """Nothing if the camera stood still.
+def camera_motion(
+    images: UInt8[np.ndarray, "t h w 3"], background: Background, labels: UInt8[np.ndarray, "t h w"]
+) -> float:
+    """Upper quartile over frames of the motion of the background, as a fraction of the image's longer side.
 
-    Raises:
-        BadFile: The background moves by more than `MAX_CAMERA_MOTION`.
+    Args:
+        background: The background from which it is measured.
+        labels: Masks of the frames.
     """
-    if (motion := camera_motion(survey)) > MAX_CAMERA_MOTION:
-        rule = f"was recorded by a moving camera: the background moves by {100 * motion:.1f} % of the image"
-        raise BadFile(survey.footage.path, rule, "put the camera on a tripod, or give --masks")
-
-
-def camera_motion(survey: Survey) -> float:
-    """Upper quartile over frames of the motion of the background, as a fraction of the image's longer side."""
-    samples = np.unique(np.linspace(0, len(survey.images) - 1, N_MOTION_SAMPLES).round().astype(int))
-    covered = survey.masks.labels[samples] != BACKGROUND
-    return float(np.percentile(background_shift(survey.images[samples], survey.background, covered), 75))
+    samples = np.unique(np.linspace(0, len(images) - 1, N_MOTION_SAMPLES).round().astype(int))
+    return float(np.percentile(background_shift(images[samples], background, labels[samples] != BACKGROUND), 75))
 
 
 def background_shift(

@@ -13,13 +13,14 @@ from typing import Literal
 import numpy as np
 
 from tumble.io import outputs, progress, video
-from tumble.preprocess import camera_motion, colmap_to_capture, keyframes, segmentation, video_to_capture
+from tumble.preprocess import colmap_to_capture, keyframes, segmentation, video_to_capture
+from tumble.preprocess.camera_motion import MAX_CAMERA_MOTION
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.picker import pick_box
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey_footage
 
-CAMERA_MOTION = (0.004, camera_motion.MAX_CAMERA_MOTION)
+CAMERA_MOTION = (0.004, MAX_CAMERA_MOTION)
 """Limits of the motion of the background [longer side of the image]; 8 and 38 of 1920 pixels."""
 EDGE_BLUR = (1.2, 2.5)
 """Limits of the blur of the object's edges in the selected frames [pixels of the capture's images]."""
@@ -146,9 +147,11 @@ def _inputs(survey: Survey) -> Finding:
 
 
 def _camera(survey: Survey) -> Finding:
-    motion = camera_motion.camera_motion(survey)
-    state = f"the background moves by {100 * motion:.1f} % of the image"
-    return _finding("camera", _rate(motion, CAMERA_MOTION), state, "put the camera on a tripod: it must stand still")
+    state = f"the background moves by {100 * survey.camera_motion:.1f} % of the image"
+    rating = _rate(survey.camera_motion, CAMERA_MOTION)
+    if survey.still_camera or rating == "good":
+        return _finding("camera", rating, state, "put the camera on a tripod: it must stand still")
+    return _finding("camera", "warn", state, "put the camera on a tripod: the light is taken to move with the camera")
 
 
 def _masks(survey: Survey) -> Finding:

@@ -24,7 +24,7 @@ from PIL import Image
 
 from tumble.datasets import MAX_DISTORTION, plausible_focal
 from tumble.io import BadFile, files, video
-from tumble.scene import Camera, decode_mask, mask_from_alpha, undistortion
+from tumble.scene import BACKGROUND, OBJECT, Camera, decode_mask, mask_from_alpha, undistortion
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """File endings of the images that are read from folders."""
@@ -44,6 +44,10 @@ EXIF_EQUIVALENT_FOCAL = 0xA405
 ORIENTATIONS = ((0, False), (0, False), (0, True), (2, False), (2, True), (3, True), (3, False), (1, True), (1, False))
 """Per EXIF orientation 0 (not stated) to 8: number of quarter turns counter-clockwise, and whether to mirror left to
 right after them."""
+OPAQUE = 255
+"""Alpha of an opaque pixel."""
+MAX_TINT = 16
+"""Largest difference between the channels of a grey pixel in a lossy image [code values]."""
 PROVENANCE = "ingest.json"
 """File name, in a capture, of the record of how it was made."""
 WRONG_PROVENANCE = "remove the folder that holds it, and convert the footage again"
@@ -269,10 +273,18 @@ def _upright(path: Path, values: np.ndarray) -> np.ndarray:
 def read_mask(path: Path, image: UInt8[np.ndarray, "h w c"], invert: bool) -> UInt8[np.ndarray, "h w"]:
     """Read a mask with the size of an image, as OBJECT, UNKNOWN and BACKGROUND.
 
+    It is the alpha channel unless that is opaque, as image editors add it; else the brightness, or what is not black in
+    an image of labels, in which every object has a colour.
+
     Raises:
         BadFile: The mask cannot be read or has another size.
     """
-    mask = np.ascontiguousarray(files.read_image(path)[..., -1])
+    values = files.read_image(path)
+    mask = values[..., :3].max(-1)
+    if values.shape[2] == 4 and values[..., 3].min() < OPAQUE:
+        mask = np.ascontiguousarray(values[..., 3])
+    elif (mask - values[..., :3].min(-1)).max() > MAX_TINT:
+        mask = np.where(mask > 0, np.uint8(OBJECT), np.uint8(BACKGROUND))
     if mask.shape != image.shape[:2]:
         rule = f"has {mask.shape[1]} x {mask.shape[0]} pixels, its frame {image.shape[1]} x {image.shape[0]}"
         raise BadFile(path, rule, "masks must be as large as the upright frames")
@@ -294,6 +306,8 @@ class Provenance(msgspec.Struct, frozen=True):
 
     footage: str = ""
     """SHA-256 of the footage."""
+    masks: str = ""
+    """SHA-256 of the masks that were given in a folder of their own."""
     options: dict[str, Any] = {}
     """The `FootageOptions`, by name."""
     frames: tuple[SourceFrame, ...] = ()

@@ -30,6 +30,7 @@ from tumble.preprocess.background import (
     fill_unknown,
     sample_background,
 )
+from tumble.preprocess.camera_motion import MAX_CAMERA_MOTION, camera_motion
 from tumble.preprocess.clicks import Click, correct_masks
 from tumble.preprocess.colour_model import hand_coloured_fraction
 from tumble.preprocess.footage import Footage, FootageFrame, Lens, open_footage, read_frames, resolve_lens
@@ -80,6 +81,10 @@ class Survey:
     """Fraction of each mask with the colours of the hands, which is small unless a hand is taken for the object."""
     blurs: Float64[np.ndarray, " t"]
     """Blur of the edges on the object, from `keyframes.edge_blur` [pixels of the footage]."""
+    still_camera: bool
+    """Whether the masks suppose that the camera stood still; those that were given, and SAM's, do not."""
+    camera_motion: float
+    """Motion of the background [longer side of the image]."""
     rotation: Float64[np.ndarray, " t"]
     """Angle by which the object has rotated since the first frame, summed along the path [radians]."""
 
@@ -126,6 +131,10 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
         background = estimate_background(images, covered)
     else:
         images, gains, background, seed, masks, hands = _segment(path, scan, options)
+    still_camera = scan.masks is None and options.segmenter == "grabcut"
+    motion = camera_motion(images, background, masks.labels)
+    if motion > MAX_CAMERA_MOTION:  # The brightness of a background that moves tells nothing about the exposure.
+        images, gains = scan.images, np.ones_like(gains)
     inside = masks.labels == OBJECT
     size = (scan.energy.shape[2], scan.energy.shape[1])
     resized = [cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in inside]
@@ -145,6 +154,8 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
         hands=hands,
         hand_coloured=hand_coloured_fraction(images, inside, hands, background),
         blurs=blurs,
+        still_camera=still_camera,
+        camera_motion=motion,
         rotation=keyframes.cumulative_rotation(images, inside),
     )
 

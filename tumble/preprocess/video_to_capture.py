@@ -25,7 +25,7 @@ from tumble.io import BadFile, files, video
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.preprocess import keyframes, segmentation
 from tumble.preprocess.background import channel_max, compensate, settle_border
-from tumble.preprocess.camera_motion import refuse_camera_motion
+from tumble.preprocess.camera_motion import MAX_CAMERA_MOTION
 from tumble.preprocess.footage import PROVENANCE, FootageFrame, read_frames
 from tumble.preprocess.options import MIN_FRAMES, FootageOptions
 from tumble.preprocess.survey import MIN_GAIN_CHANGE, Survey, downsample_mask, survey_footage, undistort_frame
@@ -93,15 +93,20 @@ def write_folder(out: Path, write: Callable[[Path], None]) -> Path:
 
 
 def footage_fingerprint(path: Path, options: FootageOptions) -> dict[str, Any]:
-    """What a capture made from footage depends on: the hash of the content, and the options."""
-    digest = hashlib.sha256()
-    inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for each in inside:
-        with each.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+    """What a capture made from footage depends on: the hashes of footage and masks, and the options."""
     # Without clicks and part the options are those of captures made before there were any.
     stated = {name: value for name, value in vars(options).items() if value != () and (name, value) != ("part", None)}
-    return {"footage": digest.hexdigest(), "options": json.loads(json.dumps(stated, default=str))}
+    masks = {} if options.masks is None else {"masks": _digest(options.masks)}
+    return {"footage": _digest(path), **masks, "options": json.loads(json.dumps(stated, default=str))}
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of all files in a folder."""
+    digest = hashlib.sha256()
+    for each in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        with each.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 def select_frames(survey: Survey, options: FootageOptions) -> list[int]:
@@ -111,8 +116,11 @@ def select_frames(survey: Survey, options: FootageOptions) -> list[int]:
         BadFile: The camera moved, the object hardly rotates, or too few frames show it.
     """
     path, usable = survey.footage.path, survey.usable
-    if survey.seed is not None and options.segmenter == "grabcut":
-        refuse_camera_motion(survey)
+    if survey.still_camera and survey.camera_motion > MAX_CAMERA_MOTION:
+        rule = (
+            f"was recorded by a moving camera: the background moves by {100 * survey.camera_motion:.1f} % of the image"
+        )
+        raise BadFile(path, rule, "put the camera on a tripod, or give --masks")
     if survey.footage.images:
         candidates = np.nonzero(usable)[0]
         spread = np.linspace(0, len(candidates) - 1, min(options.frames, len(candidates))).round().astype(int)
