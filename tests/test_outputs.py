@@ -153,6 +153,43 @@ def test_the_functions_for_notebooks_follow_the_same_rule(
     actions.export_asset(asset, tmp_path, "splat", overwrite=True)
 
 
+def test_a_capture_that_has_changed_is_not_taken_for_that_of_the_run(
+    whole: Path,  # noqa: F811
+    capture: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    run_folder, moved = tmp_path / "run", tmp_path / "moved"
+    shutil.copytree(whole, run_folder)
+    shutil.copytree(capture, moved)
+    write_report(run_folder, capture=moved)
+    photo = next(moved.glob("images/*.png"))
+    files.write_png(photo, 255 - files.read_image(photo))
+    with pytest.raises(BadFile, match="images, masks or camera have changed since"):
+        write_report(run_folder, capture=moved)
+    recipe = run_folder / "recipe.json"
+    recipe.write_text(recipe.read_text().replace(str(capture.resolve()), str(moved)))
+    with pytest.warns(UserWarning, match="have changed since.*baked from the Gaussians"):
+        actions.export_run(run_folder, tmp_path / "out", "game", None)
+
+
+def test_an_interrupted_evaluation_does_not_block_the_next(
+    whole: Path,  # noqa: F811
+    capture: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tumble.evaluation.evaluate.compare", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            actions.evaluate_run(whole, capture, tmp_path / "scores")
+    report = actions.evaluate_folder(whole, capture, tmp_path / "scores")
+    assert report["prediction"] == "scores"
+    assert {path.name for path in (tmp_path / "scores").iterdir()} == {"prediction", "report.json", "sheet.png"}
+
+
 def test_the_output_may_not_lie_in_the_footage(tmp_path: Path, command: Callable[..., str]) -> None:
     """A run hashes its footage, so that it would find other footage when it is resumed."""
     source = tmp_path / "images"

@@ -28,12 +28,12 @@ from tumble.evaluation import (
     predict_views,
     read_with_truth,
     score,
+    score_prediction,
 )
 from tumble.export import EXPORT_FILE, PresetName, write_asset
 from tumble.glb_scores import score_glb
 from tumble.io import BadFile, files, load_plugin, outputs, progress, tree, video
 from tumble.maths import SE3, to_srgb8
-from tumble.poses import background_removal
 from tumble.preprocess import PROVENANCE, FootageOptions, pick_box, read_provenance
 from tumble.recipes import Recipe
 from tumble.rendering import Buffers, antialiased_gbuffer, usable_device
@@ -174,8 +174,7 @@ def _scored(
     place = asset.gamma.device
     capture, truth = tree.to(known.capture, place), tree.to(known.truth, place)
     prediction: Prediction = predict_views(cfg, asset, capture, truth, tree.to(alignment, place), names=names)
-    prediction.write(out / run.PREDICTION)
-    return score(out / run.PREDICTION, known, out, notes=[words])
+    return score_prediction(prediction, known, out, [words])
 
 
 # Runs -----------------------------------------------------------------------------------------------------------------
@@ -455,21 +454,21 @@ def export_run(
     folder = folder or out / run.EXPORT / preset
     asset = finished(out, device)
     names = run.frame_names(out, len(asset.trajectory))
-    capture = None if preset == "splat" else _capture_of_run(out, asset, names)
+    capture = None if preset == "splat" else _frames_of_run(out, asset)
     return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, capture=capture, overwrite=overwrite)
 
 
-def _capture_of_run(out: Path, asset: Asset, names: list[str]) -> Capture | None:
-    """The frames of a run's trajectory, with the masks of the run; None with a warning if the capture is gone."""
-    from tumble.report import frames_of_run
+def _frames_of_run(out: Path, asset: Asset) -> Capture | None:
+    """The frames of a run's trajectory, with its masks; None with a warning if the capture is gone or has changed."""
+    from tumble.report import capture_of_run
 
     path = run.capture_source(out)
-    if not path.exists():
-        text = f"{path} is gone: the base colour is baked from the Gaussians, not solved from the photographs"
+    try:
+        return capture_of_run(out, asset, path).frames
+    except BadFile as error:
+        text = f"{error}; the base colour is baked from the Gaussians, not solved from the photographs"
         warnings.warn(text, stacklevel=3)
         return None
-    _, capture = background_removal.stored_result(out, pipeline.read_capture(path))
-    return frames_of_run(capture, asset, names, path)
 
 
 def _relighting(out: Path) -> relighting.Config:

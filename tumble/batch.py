@@ -13,7 +13,7 @@ from typing import Any, Literal
 from tumble import actions, bench, pipeline
 from tumble.bench import CaptureTask, Case, Outcome, SuiteRow, Workers
 from tumble.engine import loop, run
-from tumble.evaluation import read_with_truth
+from tumble.evaluation import PREDICTION, read_with_truth
 from tumble.io import files, one_line, outputs, progress
 from tumble.preprocess import FootageOptions
 from tumble.recipes import METHODS, QUALITIES, SMOKE, Recipe
@@ -196,7 +196,7 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     row["albedo_scale"], row["notes"] = report["albedo_scale"], report["notes"]
     if known.truth.light is not None:
         row["directionality"] = round(known.truth.light.directionality(), 3)
-    return row, bench.picture_of(capture, where / run.PREDICTION, report)
+    return row, bench.picture_of(capture, where / PREDICTION, report)
 
 
 def _empty_row(case: Case) -> SuiteRow:

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from tumble.evaluation import CaptureWithTruth, Prediction, Report, metrics, score
+from tumble.evaluation import CaptureWithTruth, Prediction, Report, metrics, score_prediction
 from tumble.export import EXPORT_FILE
 from tumble.io import BadFile, files, progress
 from tumble.maths import to_srgb8
@@ -63,5 +63,4 @@ def score_glb(glb: Path, asset: Asset, known: CaptureWithTruth, aligned: tuple[A
         masks=torch.from_numpy(maps.mask),
         relit=relit,
     )
-    prediction.write(out / "prediction")
-    return score(out / "prediction", known, out, notes=[words])
+    return score_prediction(prediction, known, out, [words])

@@ -176,7 +176,8 @@ def reconstruct(
         return _upright(*_reconstruct(opened, capture, where, found, white, device), up)
     out = Path(out)
     with run.exclusive_access(out):
-        opened = run.open(out, where, recipe, content=content_key(capture), report=progress)
+        keys = {"content": content_key(capture), "frames": content_key(replace(capture, trajectory=None))}
+        opened = run.open(out, where, recipe, **keys, report=progress)
         asset, names = _reconstruct(opened, capture, where, found, white, device)
         asset = _upright(asset, names, up)
         _keep(asset, names, out)

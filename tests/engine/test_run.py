@@ -242,9 +242,17 @@ def test_captures_are_compared_by_content_if_known_else_by_path(tmp_path: Path) 
     run.open(tmp_path / "a", Path("moved"), Recipe(), content="key")
     with pytest.raises(BadFile, match=r"capture\.content is 'key' in the folder, 'other' was requested"):
         run.open(tmp_path / "a", Path("clip"), Recipe(), content="other")
-    run.open(tmp_path / "a", Path("clip"), Recipe())
-    with pytest.raises(BadFile, match=r"capture\.path is '.*clip' in the folder, '.*moved' was requested"):
-        run.open(tmp_path / "a", Path("moved"), Recipe())
+    assert run.capture_source(tmp_path / "a") == Path("moved").resolve()
+    run.open(tmp_path / "a", Path("moved"), Recipe())
+    with pytest.raises(BadFile, match=r"capture\.path is '.*moved' in the folder, '.*clip' was requested"):
+        run.open(tmp_path / "a", Path("clip"), Recipe())
+
+
+def test_a_capture_in_the_run_moves_with_it(tmp_path: Path) -> None:
+    (tmp_path / "a" / run.CAPTURE).mkdir(parents=True)
+    run.open(tmp_path / "a", tmp_path / "a" / run.CAPTURE, Recipe(), content="key")
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert run.capture_source(tmp_path / "b") == tmp_path / "b" / run.CAPTURE
 
 
 def test_folders_of_something_else_are_not_changed(tmp_path: Path) -> None:

@@ -65,8 +65,6 @@ REPORT = "report.html"
 """Report of a finished run."""
 SCORES = "report.json"
 """Numbers of the report."""
-PREDICTION = "prediction"
-"""Folder of renderings for evaluation."""
 RELIT = "relit"
 """Folder of relit renderings."""
 EXPORT = "export"
@@ -92,6 +90,7 @@ class _CaptureRecord(TypedDict):
 
     path: str
     content: NotRequired[str]
+    frames: NotRequired[str]
 
 
 class _RunRecord(TypedDict):
@@ -187,6 +186,7 @@ def open(
     recipe: Any,
     *,
     content: str = "",
+    frames: str = "",
     report: Callable[[Progress], None] | None = None,
 ) -> Run:
     """Create a run directory, or open it to continue the run in it. A run without any results yet is overwritten.
@@ -197,6 +197,7 @@ def open(
         recipe: A frozen dataclass of frozen dataclasses with a `seed`.
         content: Hash of the capture. If both runs have one, captures are compared by it instead of by path, so that a
             capture may be moved.
+        frames: Hash of the capture without its poses, by which it is recognised later (`frames_key`).
         report: Called with the progress of the stages.
 
     Raises:
@@ -207,7 +208,7 @@ def open(
     requested = {
         "tumble": __version__,
         "format": FORMAT,
-        "capture": {"path": str(Path(capture_path).resolve()), "content": content},
+        "capture": {"path": str(Path(capture_path).resolve()), "content": content, "frames": frames},
         "recipe": _plain(recipe),
     }
     file = path / RECIPE
@@ -222,7 +223,8 @@ def open(
     if different and has_results:
         rule = f"holds another run: {'; '.join(different)}"
         raise BadFile(path, rule, "choose another folder with -o, or remove this one")
-    if different or not has_results:
+    moved = content and _lookup(stored, "capture") != requested["capture"]
+    if different or moved or not has_results:
         files.write_json(file, requested)
     return Run(path, recipe, report)
 
@@ -233,7 +235,18 @@ def capture_source(path: Path) -> Path:
     Raises:
         BadFile: The folder holds no run, or a run of an older format.
     """
-    return Path(_document(path)["capture"]["path"])
+    stored, own = Path(_document(path)["capture"]["path"]), path / CAPTURE
+    # One that was made from footage lies in the run, and moves with it.
+    return own if stored.name == CAPTURE and own.is_dir() else stored
+
+
+def frames_key(path: Path) -> str:
+    """Hash of the capture of a run without its poses; empty for runs of earlier versions.
+
+    Raises:
+        BadFile: The folder holds no run, or a run of an older format.
+    """
+    return _document(path)["capture"].get("frames", "")
 
 
 def recipe(path: Path) -> dict[str, Any]:

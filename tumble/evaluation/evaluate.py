@@ -4,6 +4,8 @@ Keys of the report have the form `part.metric_where_space`, as in `albedo.psnr_f
 metric, docs/metrics.md gives the reasons. A region's score is the mean over its views; regions are never mixed.
 """
 
+import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +30,9 @@ TOLERANCE_METRES = 0.1
 """Position error up to which recall is integrated for the AUC, for captures in metres [m]."""
 TOLERANCE_FRACTION = 0.1
 """The same error for captures in other units [fraction of the mean camera distance]."""
-RUN_FOLDERS = ("capture", "prediction")
+PREDICTION = "prediction"
+"""Folder of the rendered prediction in a folder of scores."""
+RUN_FOLDERS = ("capture", PREDICTION)
 """Folders of a run; the report gives the run's name for them."""
 IDENTITY_TOLERANCE = 1e-3
 """Limit below which an alignment counts as the identity: relative change of scale, rotation [radians] and shift [mean
@@ -164,6 +168,29 @@ def score(
     files.write_png(out / SHEET, sheet)
     files.write_json(out / "report.json", report)
     return cast(Report, report)
+
+
+def score_prediction(predicted: Prediction, target: CaptureWithTruth, out: Path, notes: Sequence[str]) -> Report:
+    """Score a prediction in memory; write `prediction/`, report.json and sheet.png.
+
+    The prediction moves to its place at the end: an interrupted evaluation leaves nothing that would block the next.
+
+    Args:
+        out: Folder for the files; created if missing.
+        notes: See `score`.
+
+    Raises:
+        BadFile: See `score`.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=out) as scratch:
+        # The report names a run by the folder above.
+        partial, place = Path(scratch) / out.resolve().name / PREDICTION, out / PREDICTION
+        predicted.write(partial)
+        report = score(partial, target, out, notes=notes)
+        shutil.rmtree(place, ignore_errors=True)
+        partial.replace(place)
+    return report
 
 
 @torch.no_grad()

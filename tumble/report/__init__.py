@@ -2,10 +2,10 @@
 
 from tumble.report import preset_lights
 from tumble.report.figures import panorama, small_camera, webp_file
-from tumble.report.page import frames_of_run, script_hash, style_sheet, write_report
+from tumble.report.page import capture_of_run, script_hash, style_sheet, write_report
 
 __all__ = [
-    "frames_of_run",
+    "capture_of_run",
     "panorama",
     "preset_lights",
     "script_hash",

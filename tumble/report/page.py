@@ -13,7 +13,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,12 @@ from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
 from tumble.io import BadFile, begin, files, progress, tree
 from tumble.maths import fibonacci_sphere
-from tumble.poses import PoseQuality, background_removal
+from tumble.poses import PoseQuality, PoseResult, background_removal
 from tumble.preprocess import read_provenance
 from tumble.report import coverage, figures, health_card, preset_lights, svg, training_views, worst_frames
 from tumble.report.training_views import RenderedFrame
 from tumble.report.worst_frames import AllFrames
-from tumble.scene import Asset, Capture, Environment, opengl_from_opencv
+from tumble.scene import Asset, Capture, Environment, content_key, opengl_from_opencv
 
 N_COMPARISONS = 6
 """Number of photos shown beside their renders."""
@@ -95,23 +95,50 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
     asset, path = run.asset(out, Asset), capture or run.capture_source(out)
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
-    full_capture = reader_for(path).load(path)
-    tracked, refined = background_removal.stored_result(out, full_capture)
+    used = capture_of_run(out, asset, path)
     made = read_provenance(path) if path.is_dir() else None
     hand_coloured = {frame.name: frame.hand_coloured for frame in made.frames} if made else {}
-    run_capture = frames_of_run(refined, asset, run.frame_names(out, len(asset.trajectory)), path)
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
-    assumed_focal = float(full_capture.camera.fx_fy_cx_cy[0]) if full_capture.focal_assumed else None
+    assumed_focal = float(used.whole.camera.fx_fy_cx_cy[0]) if used.whole.focal_assumed else None
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
     with tempfile.TemporaryDirectory() as folder:
         asset = tree.to(asset, device)
-        quality = tracked.quality if tracked else None
-        all_frames = AllFrames(full_capture, refined, hand_coloured)
+        quality = used.tracked.quality if used.tracked else None
+        all_frames = AllFrames(used.whole, used.masked, hand_coloured)
         with ThreadPoolExecutor(1) as beside:
             # The mesh is made by one thread most of the time.
             model = begin(beside, asset.gaussians.means.device, lambda: write_model(asset, Path(folder)))
-            build(asset, run_capture, model, summary, quality, out / run.REPORT, all_frames=all_frames)
+            build(asset, used.frames, model, summary, quality, out / run.REPORT, all_frames=all_frames)
     return out / run.REPORT
+
+
+@dataclass(frozen=True)
+class RunCapture:
+    """The capture of a run."""
+
+    whole: Capture
+    """As it was read."""
+    tracked: PoseResult | None
+    """The poses that stage 1 found; None if they came with the capture."""
+    masked: Capture
+    """With the masks that stages 2 and 3 have seen."""
+    frames: Capture
+    """Its frames that have a pose, in the order of the asset's trajectory."""
+
+
+def capture_of_run(out: Path, asset: Asset, path: Path) -> RunCapture:
+    """Read the capture of a finished run from its path.
+
+    Raises:
+        BadFile: It cannot be read, or is not the capture of the run, or has changed since.
+    """
+    whole, known = reader_for(path).load(path), run.frames_key(out)
+    if known and content_key(replace(whole, trajectory=None)) != known:
+        rule = "is not the capture of this run, or its images, masks or camera have changed since"
+        raise BadFile(path, rule, "give the right one with --capture, or run the capture again")
+    tracked, masked = background_removal.stored_result(out, whole)
+    frames = frames_of_run(masked, asset, run.frame_names(out, len(asset.trajectory)), path)
+    return RunCapture(whole, tracked, masked, frames)
 
 
 def frames_of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Path) -> Capture:
