@@ -402,9 +402,27 @@ def test_an_exported_glb_is_scored_like_its_run(
         actions.evaluate_glb(out, glb, stretched)
 
 
+def test_a_card_beside_the_object_is_seen_in_the_whole_photos(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The images that the stages see are black there."""
+    out, held = tmp_path / "run", pipeline.read_capture(capture)
+    photos = held.images.clone()
+    photos[0, :6, :6] = torch.tensor([200, 190, 120], dtype=torch.uint8)
+    held = dataclasses.replace(held, full_images=photos)
+    pipeline.reconstruct(held, out, RECIPE)
+    monkeypatch.setattr(loop, "drive", None)
+    before = runs.log_records(out)[-1]
+    pipeline.reconstruct(held, out, RECIPE, white=(2, 2, "0.png"))
+    after = [r for r in runs.log_records(out) if r.get("event") == "colour"][-1]
+    assert after["white"], before
+    with pytest.raises(ValueError, match="too dark"):
+        pipeline.reconstruct(held, out, RECIPE, white=(20, 0, "0.png"))
+
+
 @pytest.mark.parametrize(
     ("white", "rule"),
-    [((3, 3, "9999.png"), "no such frame"), ((32, 3, "0.png"), "outside"), ((0, 0, "0.png"), "too dark")],
+    [((3, 3, "9999.png"), "no such frame"), ((32, 3, "0.png"), "outside"), ((0, 0, "0.png"), "is background")],
 )
 def test_an_unsuitable_white_is_refused(
     finished: tuple[Path, Asset], capture: Path, tmp_path: Path, white: tuple[int, int, str], rule: str

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
@@ -29,7 +31,7 @@ from tumble.preprocess import (
     to_capture,
 )
 from tumble.recipes import DRAFT, Recipe
-from tumble.scene import Asset, Capture, Trajectory, content_key, opengl_from_opencv
+from tumble.scene import BACKGROUND, Asset, Capture, Trajectory, content_key, opengl_from_opencv
 
 MIN_FRAMES = 8
 """Minimum number of frames with a pose; fewer show too little of the object."""
@@ -71,6 +73,17 @@ def video_to_capture(path: Path | str, out: Path | str, options: FootageOptions 
         BadFile: The footage cannot be converted, or `out` exists; nothing is written then.
     """
     return to_capture(Path(path), Path(out), options or FootageOptions())
+
+
+class _WhitePixel(NamedTuple):
+    """A pixel that the user calls white or grey."""
+
+    column: int
+    row: int
+    name: str
+    """File name of its frame."""
+    shown: UInt8[Tensor, "3"]
+    """Its sRGB code values, also beside the object, where stages 2 and 3 see black."""
 
 
 def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
@@ -170,15 +183,15 @@ def reconstruct(
     check_plausible(capture, where)
     found = poses if isinstance(poses, PoseResult) else None
     _check_up(up, capture, where)
-    _check_white(white, capture)
+    grey = _white_pixel(white, capture)
     if out is None:
         opened = run.Run(None, recipe, progress)
-        return _upright(*_reconstruct(opened, capture, where, found, white, device), up)
+        return _upright(*_reconstruct(opened, capture, where, found, grey, device), up)
     out = Path(out)
     with run.exclusive_access(out):
         keys = {"content": content_key(capture), "frames": content_key(replace(capture, trajectory=None))}
         opened = run.open(out, where, recipe, **keys, report=progress)
-        asset, names = _reconstruct(opened, capture, where, found, white, device)
+        asset, names = _reconstruct(opened, capture, where, found, grey, device)
         asset = _upright(asset, names, up)
         _keep(asset, names, out)
     return asset
@@ -189,7 +202,7 @@ def _reconstruct(
     capture: Capture,
     where: Path,
     found: PoseResult | None,
-    white: tuple[int, int, str] | None,
+    white: _WhitePixel | None,
     device: torch.device | str,
 ) -> tuple[Asset, tuple[str, ...]]:
     """The asset on the CPU, and the names of its frames."""
@@ -215,18 +228,18 @@ def _reconstruct(
     return tree.to(asset, "cpu"), capture.names
 
 
-def _in_absolute_colour(opened: run.Run, asset: Asset, capture: Capture, white: tuple[int, int, str] | None) -> Asset:
+def _in_absolute_colour(opened: run.Run, asset: Asset, capture: Capture, white: _WhitePixel | None) -> Asset:
     """The asset with the most likely division of each colour channel between albedo and light; logs the estimate.
 
     Raises:
-        ValueError: The pixel `white` is unsuitable, or the pose of its frame was not found.
+        ValueError: The pose of the frame of the pixel `white` was not found.
     """
     target = None
     if white is not None:
-        column, row, name = white
-        if name not in capture.names:
-            raise ValueError(f"the pose of frame {name} was not found; choose another frame for --white")
-        target = absolute_colour.known_white(asset, capture, capture.names.index(name), column, row)
+        if white.name not in capture.names:
+            raise ValueError(f"the pose of frame {white.name} was not found; choose another frame for --white")
+        frame = capture.names.index(white.name)
+        target = absolute_colour.known_white(asset, capture, frame, white.column, white.row, white.shown)
     pixels = absolute_colour.shaded_pixels(asset, capture)
     metalness = 0.0 if asset.material.metalness is None else float(asset.material.metalness.mean())
     found = absolute_colour.estimate(pixels, float(asset.material.f0), target, metalness=metalness)
@@ -282,6 +295,9 @@ def _track(
         with progress.task("observations in all frames"):
             inputs: Any = sfm.gather(capture, matches, hidden=hidden)
             if route is progressive:
+                if capture.focal_assumed:
+                    text = "the focal length is a guess, which the progressive route does not refine"
+                    warnings.warn(f"{text}: give --focal or --fov", stacklevel=2)
                 inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
@@ -323,10 +339,10 @@ def _check_up(up: str, capture: Capture, where: Path) -> None:
         raise ValueError("--up is for estimated poses: the poses of this capture define its frame, in which +y is up")
 
 
-def _check_white(white: tuple[int, int, str] | None, capture: Capture) -> None:
-    """Raise `ValueError` unless the pixel exists."""
+def _white_pixel(white: tuple[int, int, str] | None, capture: Capture) -> _WhitePixel | None:
+    """The pixel with what it shows; raise `ValueError` unless it exists and is neither dark nor saturated."""
     if white is None:
-        return
+        return None
     column, row, name = white
     if name not in capture.names:
         shown = f"{capture.names[0]} to {capture.names[-1]}"
@@ -334,6 +350,11 @@ def _check_white(white: tuple[int, int, str] | None, capture: Capture) -> None:
     height, width = capture.masks.shape[1:]
     if not (0 <= column < width and 0 <= row < height):
         raise ValueError(f"--white {column} {row} is outside of the images of {width} x {height} pixels")
+    frame, photos = capture.names.index(name), capture.images if capture.full_images is None else capture.full_images
+    if capture.full_images is None and capture.masks[frame, row, column] == BACKGROUND:
+        rule = "is background, which these images leave black"
+        raise ValueError(f"the pixel of --white {column} {row} {rule}; choose one on the object")
+    return _WhitePixel(column, row, name, absolute_colour.code_values(photos[frame], column, row))
 
 
 def _upright(asset: Asset, names: tuple[str, ...], up: str) -> Asset:

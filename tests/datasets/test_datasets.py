@@ -292,6 +292,14 @@ def test_masks_of_other_kinds_label_object_and_hand(masks: str, tmp_path: Path) 
         assert (labels[-12:][hand[-12:] & ~covered[-12:]] != BACKGROUND).all()
 
 
+def test_masks_beside_a_sequence_are_found_from_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_ho3d(tmp_path, ending=".png", masks="masks_XMem")
+    monkeypatch.chdir(path)
+    assert torch.equal(ho3d.load(".").masks, ho3d.load(path).masks)
+    monkeypatch.chdir(path.parent)
+    assert torch.equal(ho3d.load(path.name).masks, ho3d.load(path).masks)
+
+
 def test_frames_without_a_mask_are_omitted(tmp_path: Path) -> None:
     path = write_ho3d(tmp_path)
     (path / "masks" / "0001.png").unlink()

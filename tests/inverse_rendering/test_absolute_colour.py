@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.surfaces import GAMMA, look_at, sphere
 from tumble.inverse_rendering import absolute_colour
 from tumble.inverse_rendering.absolute_colour import ShadedPixels
-from tumble.maths import SE3, fibonacci_sphere, srgb_from_linear
+from tumble.maths import SE3, SO3, fibonacci_sphere, srgb_from_linear
 from tumble.rendering import render_gbuffer, shade_split, surface, unoccluded
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.scene.asset import Asset
@@ -159,19 +159,40 @@ def test_the_factor_leaves_pictures_as_they_are(asset: Asset) -> None:
     assert float(picture(dull, 0).max()) > 0.05
 
 
+def white_at(asset: Asset, capture: Capture, frame: int, place: int) -> torch.Tensor:
+    shown = absolute_colour.code_values(capture.images[frame], place, place)
+    return absolute_colour.known_white(asset, capture, frame, place, place, shown)
+
+
+def test_a_light_that_turns_by_itself_is_taken_with_its_turns(asset: Asset, capture: Capture) -> None:
+    """The same light on the object, once turned by the trajectory and once by the map."""
+    turn = SO3.exp(torch.tensor([0.4, 1.1, -0.3])).matrix()
+    uneven = dataclasses.replace(
+        asset, environment=Environment.from_radiance(torch.linspace(0.1, 4, 16 * 32 * 3).reshape(16, 32, 3))
+    )
+    turned = dataclasses.replace(asset.trajectory, light_turns=turn.expand(len(capture), 3, 3))
+    by_trajectory = dataclasses.replace(uneven, trajectory=turned)
+    by_map = dataclasses.replace(uneven, environment=uneven.environment.rotated(turn.mT))
+    pixels = [absolute_colour.shaded_pixels(each, capture).diffuse.mean(0) for each in (by_trajectory, by_map, uneven)]
+    torch.testing.assert_close(pixels[0], pixels[1], rtol=0.05, atol=0)
+    assert float((pixels[2] / pixels[1] - 1).abs().max()) > 0.1
+    cards = [white_at(each, capture, 0, 2) for each in (by_trajectory, by_map)]
+    torch.testing.assert_close(cards[0], cards[1], rtol=0, atol=0.05)
+
+
 def test_a_pixel_on_the_object_is_made_neutral(asset: Asset, capture: Capture) -> None:
-    target = absolute_colour.known_white(asset, capture, 0, column=16, row=16)
+    target = white_at(asset, capture, 0, 16)
     after = absolute_colour.apply(asset, target - target.mean())
     shown = render_gbuffer(after, asset.trajectory.T_cam_obj[0], CAMERA).features["albedo"][16, 16]
     torch.testing.assert_close(shown, shown.mean().expand(3), rtol=0.02, atol=0)
     # The first camera looks at the green half, the other one at the red one.
-    other = absolute_colour.known_white(asset, capture, 1, column=16, row=16)
+    other = white_at(asset, capture, 1, 16)
     assert [int(target.argmin()), int(other.argmin())] == [1, 0]
 
 
 def test_a_card_beside_the_object_is_lit_by_the_light_before_the_camera(asset: Asset, capture: Capture) -> None:
     """Under this light all irradiances are in the ratio 1 : 0.8 : 0.6."""
-    target = absolute_colour.known_white(asset, capture, 0, column=2, row=2)
+    target = white_at(asset, capture, 0, 2)
     card = (((torch.tensor([200.0, 180.0, 150.0]) / 255) + 0.055) / 1.055) ** 2.4
     expected = torch.tensor([1.0, 0.8, 0.6]).log() - card.log()
     torch.testing.assert_close(colour(target), colour(expected), atol=1e-4, rtol=0)
@@ -179,7 +200,7 @@ def test_a_card_beside_the_object_is_lit_by_the_light_before_the_camera(asset: A
 
 def test_a_black_pixel_is_no_white(asset: Asset, capture: Capture) -> None:
     with pytest.raises(ValueError, match="too dark or saturated"):
-        absolute_colour.known_white(asset, capture, 0, column=30, row=30)
+        absolute_colour.code_values(capture.images[0], 30, 30)
 
 
 def test_the_estimate_undoes_a_planted_factor(asset: Asset, capture: Capture) -> None:

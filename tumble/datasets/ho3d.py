@@ -53,7 +53,7 @@ def load(path: Path | str) -> Capture:
     Raises:
         BadFile: A file is missing or broken, or there is no mask.
     """
-    root = Path(path)
+    root = Path(path).resolve()  # its name, and that of the folder above, say what it is
     images = _list_images(root)
     masked = ((image, mask) for image in images if (mask := _mask(root, image)) is not None)
     return _images.build_capture(root, masked, dict.fromkeys(images, _lens(root, images)), "camera")
@@ -65,7 +65,7 @@ def load_truth(path: Path | str) -> Truth | None:
     Raises:
         BadFile: A file is missing or broken.
     """
-    root = Path(path)
+    root = Path(path).resolve()
     images = _list_images(root)
     poses = {p.name: pose for p in images if (pose := _pose(root, p)) is not None}
     if not poses:

@@ -19,12 +19,12 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from tumble.maths import fibonacci_sphere, linear_from_srgb, texel_directions, texel_solid_angles
 from tumble.rendering import prefilter, render_gbuffer, shade_split, surface, unoccluded
-from tumble.scene import DIELECTRIC, OBJECT, Asset, Capture, Environment, env_from_obj
+from tumble.scene import DIELECTRIC, OBJECT, Asset, Capture, Environment
 
 FRAMES = 16
 """Maximum number of frames whose pixels are shaded."""
@@ -108,7 +108,8 @@ def shaded_pixels(asset: Asset, capture: Capture) -> ShadedPixels:
         solid = solid[torch.randperm(len(solid), generator=rng)[:PIXELS].to(solid.device)]
         points = surface(view, T_cam_obj, capture.camera, pixels=solid)
         albedo, rough = points.sample(view.features["albedo"]), points.sample(view.features["roughness"])
-        R_env_obj, seen = env_from_obj(T_cam_obj, asset.trajectory.light), unoccluded(directions, len(solid))
+        R_env_obj = asset.trajectory.R_env_obj_at(frame, T_cam_obj)
+        seen = unoccluded(directions, len(solid))
         lobes = [(torch.ones_like(albedo), 0.0), (torch.zeros_like(albedo), DIELECTRIC)]
         shaded = [shade_split(points, white, rough, light, R_env_obj, seen, f0=f0) for white, f0 in lobes]
         rows.append((albedo, *shaded))
@@ -162,8 +163,28 @@ def estimate(
     return Estimate(factor.to(pixels.albedo), deviation.to(pixels.albedo))
 
 
+def code_values(photo: UInt8[Tensor, "h w 3"], column: int, row: int) -> UInt8[Tensor, "3"]:
+    """sRGB code values of a pixel that the user calls white or grey: the median of its neighbourhood.
+
+    Raises:
+        ValueError: The pixel is too dark or saturated.
+    """
+    found = photo[_near(row), _near(column)].flatten(0, 1).median(0).values
+    if found.min() < WHITE_RANGE[0] or found.max() > WHITE_RANGE[1]:
+        rule = f"has the code values {', '.join(map(str, found.tolist()))}, too dark or saturated for a white"
+        raise ValueError(f"the pixel of --white {column} {row} {rule}; choose another")
+    return found
+
+
+def _near(place: int) -> slice:
+    """Rows or columns around one."""
+    return slice(max(0, place - WHITE_RADIUS), place + WHITE_RADIUS + 1)
+
+
 @torch.no_grad()
-def known_white(asset: Asset, capture: Capture, frame: int, column: int, row: int) -> Float[Tensor, "3"]:
+def known_white(
+    asset: Asset, capture: Capture, frame: int, column: int, row: int, shown: UInt8[Tensor, "3"]
+) -> Float[Tensor, "3"]:
     """Logarithm of the factor, up to its mean, for which a pixel shows a neutral colour.
 
     On the object, the albedo of stage 3 must become neutral. Beside it, the pixel shows a card that faces the camera.
@@ -174,23 +195,17 @@ def known_white(asset: Asset, capture: Capture, frame: int, column: int, row: in
         frame: Index of a frame.
         column: Column of the pixel.
         row: Row of the pixel.
-
-    Raises:
-        ValueError: The pixel is too dark or saturated.
+        shown: Its `code_values`.
     """
-    rows, columns = (slice(max(0, x - WHITE_RADIUS), x + WHITE_RADIUS + 1) for x in (row, column))
-    code_values = capture.images[frame, rows, columns].flatten(0, 1).median(0).values
-    if code_values.min() < WHITE_RANGE[0] or code_values.max() > WHITE_RANGE[1]:
-        rule = f"has the code values {', '.join(map(str, code_values.tolist()))}, too dark or saturated for a white"
-        raise ValueError(f"the pixel of --white {column} {row} {rule}; choose another")
+    rows, columns = _near(row), _near(column)
     T_cam_obj = asset.trajectory.T_cam_obj[frame]
     view = render_gbuffer(asset, T_cam_obj, capture.camera)
     covered = view.alpha[rows, columns].flatten() > 0.5
     if capture.masks[frame, row, column] == OBJECT and covered.any():
         return -view.features["albedo"][rows, columns].flatten(0, 1)[covered].median(0).values.log()
     to_camera = -T_cam_obj.rotation.matrix()[2]
-    n_env = env_from_obj(T_cam_obj, asset.trajectory.light) @ to_camera
-    card = linear_from_srgb(code_values.to(n_env) / 255)
+    n_env = asset.trajectory.R_env_obj_at(frame, T_cam_obj) @ to_camera
+    card = linear_from_srgb(shown.to(n_env) / 255)
     return (_irradiance(asset.environment, n_env) / card).log()
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
 from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult
 from tumble.poses.sfm import bundle_adjustment, relocalization
-from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
+from tumble.poses.sfm.frontier_points import Contours, tangencies_of_pairs
 from tumble.poses.sfm.relocalization import ContourConstraints
 from tumble.poses.sfm.symmetry import MirrorSymmetry, texture_information
 from tumble.poses.sfm.tracks import Tracks
@@ -188,8 +188,8 @@ def _frontier_points(
     """Median tangency gap of every frame with all others [pixels], and the frontier points with small gaps."""
     n = len(solution.R)
     i, j = torch.triu_indices(n, n, 1)
-    pose_i, pose_j = ((solution.R[k], solution.t[k]) for k in (i, j))
-    found = epipolar_tangencies(pose_i, pose_j, contours[i], contours[j], capture.camera, radius=solution.radius)
+    pairs = torch.stack([i, j], 1)
+    found = tangencies_of_pairs(solution.R, solution.t, capture.camera, contours, radius=solution.radius, pairs=pairs)
     table = torch.full((n, n, 2), torch.nan, dtype=torch.float64)
     table[i, j] = table[j, i] = torch.where(found.valid, found.gap.abs(), torch.nan)
     gap = table.flatten(1).nanmedian(1).values
@@ -198,7 +198,7 @@ def _frontier_points(
     wide = (angle > MIN_TRIANGULATION_ANGLE) & (angle < torch.pi - MIN_TRIANGULATION_ANGLE)
     max_gap = 2 * gap[~gap.isnan()].median().clamp_min(MIN_MEDIAN_GAP)
     chosen = found.valid & wide[:, None] & (found.gap.abs() < max_gap)
-    frames = torch.stack([i, j], 1)[:, None].expand(-1, 2, -1)[chosen]
+    frames = pairs[:, None].expand(-1, 2, -1)[chosen]
     uv_i, uv_j = contours.vertices[i[:, None], found.vertex_i], contours.vertices[j[:, None], found.vertex_j]
     uv = torch.stack([uv_i, uv_j], 2)[chosen]
     point = torch.arange(len(frames)).repeat_interleave(2)
