@@ -11,9 +11,11 @@ import torch
 from tests.films import HEIGHT, WIDTH, scene, written
 from tests.preprocess.test_held_object import landmarks
 from tumble.datasets import folder
+from tumble.demo import bundled_folder
 from tumble.io import files, video
 from tumble.io.files import BadFile
-from tumble.preprocess import video_to_capture
+from tumble.preprocess import survey, video_to_capture
+from tumble.preprocess.hands import Hand, track_hands
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.segmentation import overlap
 from tumble.preprocess.survey import survey_footage
@@ -68,8 +70,8 @@ def test_only_frames_of_a_held_object_are_kept_with_their_background(made: tuple
     assert folder.load(made[1]).full_images is None
     assert not (made[1] / "full_images").exists()
     options = FootageOptions(box=scene().box(), focal=300.0)
-    survey = survey_footage(made[0], options)
-    held = replace(survey, hands=[[landmarks(i)] for i in range(len(survey.images))])
+    surveyed = survey_footage(made[0], options)
+    held = replace(surveyed, hands=[[landmarks(i)] for i in range(len(surveyed.images))])
     kept = video_to_capture.select_frames(held, options)
     video_to_capture._write(held, kept, video_to_capture.crop_window(held, kept), tmp_path / "held", options)
     capture = folder.load(tmp_path / "held")
@@ -198,6 +200,18 @@ def test_nothing_is_overwritten_and_a_failure_leaves_no_files(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_prints_that_pass_for_a_hand_do_not_make_a_film_of_hands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The painted pot of the bundled clip shows "hands" on a third of the frames, hardly any of them certain."""
+    clip = np.stack(list(video.read_clip(bundled_folder() / "clip.mp4"))[:45:3])
+    assert any(track_hands(clip))
+    assert not any(survey._hands(clip))
+    shape = np.zeros((21, 2), np.float32)
+    for presence, counts in ((0.6, False), (0.9, True)):
+        shown = [[Hand(shape, presence, 1.0)] if i % 2 else [] for i in range(len(clip))]
+        monkeypatch.setattr(survey, "track_hands", lambda _, shown=shown: shown)
+        assert any(survey._hands(clip)) == counts
+
+
 def test_other_masks_of_the_same_name_are_other_footage(tmp_path: Path) -> None:
     path = written(scene().pictures[:2], tmp_path / "x.mp4")
     files.write_png(tmp_path / "m" / "0.png", np.zeros((9, 9, 1), np.uint8))
@@ -213,8 +227,8 @@ def test_other_masks_of_the_same_name_are_other_footage(tmp_path: Path) -> None:
 def test_a_part_of_a_video_gives_a_capture_of_its_frames(tmp_path: Path) -> None:
     path, last = written(scene().pictures, tmp_path / "x.mp4"), len(scene().pictures) - 4
     options = FootageOptions(box=scene().box(3), at=3, part=(3, last))
-    survey = survey_footage(path, options)
-    assert survey.numbers.tolist() == list(range(3, last + 1))
+    surveyed = survey_footage(path, options)
+    assert surveyed.numbers.tolist() == list(range(3, last + 1))
     out = video_to_capture.capture_from_video(path, tmp_path / "out", options)
     record = files.read_json(out / video_to_capture.PROVENANCE)
     assert {3 <= each["source_frame"] <= last for each in record["frames"]} == {True}
@@ -226,10 +240,10 @@ def test_a_part_of_a_video_gives_a_capture_of_its_frames(tmp_path: Path) -> None
 def test_long_videos_are_subsampled_and_too_long_ones_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(scene().pictures, tmp_path / "x.mp4")
     monkeypatch.setattr("tumble.preprocess.survey.MAX_SURVEY_FRAMES", 8)
-    survey = survey_footage(path, FootageOptions(box=scene().box(), frames=8))
-    assert survey.numbers.tolist() == [0, 4, 8, 12, 16]
-    survey = survey_footage(path, FootageOptions(box=scene().box(1), at=1, frames=8, part=(1, 15)))
-    assert survey.numbers.tolist() == [1, 3, 5, 7, 9, 11, 13, 15]
+    surveyed = survey_footage(path, FootageOptions(box=scene().box(), frames=8))
+    assert surveyed.numbers.tolist() == [0, 4, 8, 12, 16]
+    surveyed = survey_footage(path, FootageOptions(box=scene().box(1), at=1, frames=8, part=(1, 15)))
+    assert surveyed.numbers.tolist() == [1, 3, 5, 7, 9, 11, 13, 15]
     monkeypatch.setattr("tumble.preprocess.survey.MAX_FRAMES", 10)
     with pytest.raises(BadFile, match="has more than 10 frames"):
         survey_footage(path, FootageOptions(box=scene().box(), frames=8))

@@ -48,9 +48,12 @@ MIN_CONFIDENCE = 0.6
 MIN_GAIN_CHANGE = 0.01
 """Gains closer to 1 than this are not compensated: one code value."""
 
+SURE_PRESENCE = 0.8
+"""Probability of a hand from which a frame certainly shows one; a tracked hand needs less, and so do prints that pass
+for a hand (median 0.6)."""
 MIN_HAND_FRAMES = 0.25
-"""Fraction of frames with a detected hand below which no hand counts: in films of hands it is 0.76 or more
-(benchmarks/hands.md), while prints pass for a hand in up to 0.07 of the frames."""
+"""Fraction of frames that certainly show a hand below which no hand counts: in films of hands it is 0.53 to 1, in films
+of prints at most 0.05 (docs/method.md)."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +231,8 @@ def _segment(
 def _hands(images: UInt8[np.ndarray, "t h w 3"]) -> list[list[Hand]]:
     """The hands of every frame; none in a film in which few frames show one, since a print passed for it there."""
     found = track_hands(images)
-    return found if np.mean([bool(hands) for hands in found]) >= MIN_HAND_FRAMES else [[] for _ in images]
+    sure = np.mean([any(hand.presence >= SURE_PRESENCE for hand in hands) for hands in found])
+    return found if sure >= MIN_HAND_FRAMES else [[] for _ in images]
 
 
 def _hand_or_skin(images: np.ndarray, hands: Sequence[Sequence[Hand]], background: Background) -> np.ndarray:
