@@ -196,12 +196,12 @@ def report(rows: list[Row]) -> str:
         f"# From a video to an asset: {first['frames']} frames of {first['side']} x {first['side']} pixels",
         "",
         f"`{COMMAND}`: the input is `clip.mp4` and a box around the object in its first frame; the videos are "
-        "rendered from the meshes and light maps in `../shared/data` unless FOLDER has them. The focal length is given "
-        "(`--fov`). One thread per run, on a 2-core x86_64 CPU shared with other work. Scores over the evaluation "
-        "views of region shared, PSNR of sRGB values ([metrics](../docs/metrics.md)). Position: root mean square error "
-        "divided by the mean camera distance. Frames: number of frames with a pose. Unscaled: without the factor per "
-        "channel between albedo and truth. GLB: the file of `tumble export --preset web`, path traced by Mitsuba; its "
-        "normals are those of the mesh.",
+        "rendered from the meshes and light maps in `$TUMBLE_BENCH_DATA` unless FOLDER has them. The focal length is "
+        "given (`--fov`). One thread per run, on a 2-core x86_64 CPU shared with other work. Scores over the "
+        "evaluation views of region shared, PSNR of sRGB values ([metrics](../docs/metrics.md)). Position: root mean "
+        "square error divided by the mean camera distance. Frames: number of frames with a pose. Unscaled: without "
+        "the factor per channel between albedo and truth. GLB: the file of `tumble export --preset web`, path traced "
+        "by Mitsuba; its normals are those of the mesh.",
     ]
     for title, objects in (("Objects on which constants were chosen", TUNE), ("Other objects", REPORT)):
         if of_these := [row for row in rows if row["object"] in objects]:

@@ -1,11 +1,12 @@
 """Synthetic captures of the benchmarks of stage 1: five objects, each under two lights with two hand-held
 trajectories; nine other objects under the same lights; two captures at a higher resolution; and eight difficult ones.
 
-All are rendered from the files in `../shared/data` into capture folders. A difficulty that concerns images or masks is
-introduced after loading (`ODDITIES`).
+All are rendered from the files in `$TUMBLE_BENCH_DATA` into capture folders. A difficulty that concerns images or masks
+is introduced after loading (`ODDITIES`).
 """
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from tumble.maths import linear_from_srgb, srgb_from_linear
 from tumble.scene import BACKGROUND, OBJECT, Capture, Trajectory
 from tumble.synthetic import SynthOptions, render_capture
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
+DATA = Path(os.environ.get("TUMBLE_BENCH_DATA") or Path(__file__).parents[2] / "shared" / "data")
 """Folder of meshes and light maps."""
 TEXTURED = ("ycb_006_mustard_bottle", "ycb_003_cracker_box", "ycb_005_tomato_soup_can")
 """Objects with rich texture."""

@@ -241,13 +241,13 @@ def report(rows: Sequence[Row]) -> str:
     parts = [
         "# Poses from RGB\n",
         f"`{COMMAND}`; captures of {FRAMES} frames of 128 x 128 pixels, 5 to 12 degrees apart, rendered by "
-        "`tumble synth` from the meshes and light maps in `../shared/data` unless FOLDER has them. Median, mean and "
-        '"< 10 deg" are of the rotation errors. AUC_ATE: area under the recall curve of camera position errors up to '
-        f"{TOLERANCE:.0%} of the mean camera distance. Lost frames have no consistent pose. Estimated error and rating "
-        "are stage 1's own, without ground truth: the expected median rotation error, and good, warn or bad. Time: "
-        "matching and stage 1, on one thread of a 2-core x86_64 CPU shared with other work. Code: the commit; rows "
-        "without it were measured before surface points were located by their texture (docs/method.md). All tables "
-        "except the last are of route `graph`, that is `tumble.poses.sfm`.\n",
+        "`tumble synth` from the meshes and light maps in `$TUMBLE_BENCH_DATA` unless FOLDER has them. Median, mean "
+        'and "< 10 deg" are of the rotation errors. AUC_ATE: area under the recall curve of camera position errors up '
+        f"to {TOLERANCE:.0%} of the mean camera distance. Lost frames have no consistent pose. Estimated error and "
+        "rating are stage 1's own, without ground truth: the expected median rotation error, and good, warn or bad. "
+        "Time: matching and stage 1, on one thread of a 2-core x86_64 CPU shared with other work. Code: the commit; "
+        "rows without it were measured before surface points were located by their texture (docs/method.md). All "
+        "tables except the last are of route `graph`, that is `tumble.poses.sfm`.\n",
         table(["model", "light", "seed", *SCORES], plain_rows, TEXTURED, OTHERS),
         "## After stage 2\n",
         "Poses of stage 1, and after stage 2 of the draft recipe. Stage 1 estimates all six degrees of freedom, so "

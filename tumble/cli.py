@@ -391,8 +391,8 @@ def bench(
         suite: Name of a suite, or a .toml file. For report also the .json file of an earlier report.
         out: Folder of captures, runs and rows. Repeating the command continues.
         data: Folder with the suite's objects and lights, in meshes/ and hdri/. Default: $TUMBLE_BENCH_DATA.
-        method: Methods to run instead of the suite's: tumble, average, an ablation of tumble/recipes.py, or a Python
-            file with your own (docs/benchmarks.md).
+        method: Methods to run instead of the suite's: tumble, average, another name in METHODS of tumble/recipes.py, or
+            a Python file with your own (docs/benchmarks.md).
         only: Words that the name of a row must all contain.
         seeds: Seeds instead of the suite's.
         again: Measure rows again that have failed.

@@ -45,7 +45,8 @@ class FootageOptions:
     at: int = 0
     """Number of the frame to which the box or the click refers, counted from 0."""
     part: Annotated[tuple[int, int] | None, arg(metavar="FIRST LAST", help_behavior_hint="")] = None
-    """Numbers of the first and the last frame that are used, counted from 0. Default: all frames."""
+    """Numbers of the first and the last frame that are used, counted from 0. Default: all frames. `--at` and clicks
+    still count from the beginning."""
     object: Clicks = ()
     """A pixel on the object where the mask lacks it: column, row [pixels], frame. The mask is cut again there."""
     not_object: Clicks = ()
