@@ -281,6 +281,11 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     # Half of the frames are one stop darker.
     assert exposure.rating == "bad"
     assert float(exposure.value.split()[0]) == pytest.approx(1.0, abs=0.05)
+    assert "Lock exposure" in exposure.sentence
+    corrected = health_card.card(frames, quality, confidence.confidence_of(asset, asset.camera), corrected=True)[2]
+    assert (corrected.value, corrected.rating) == (exposure.value, exposure.rating)
+    assert "shades the object" in corrected.sentence
+    assert "Lock exposure" not in corrected.sentence
     assert (turn.value, turn.rating) == ("172 degrees", "good")
     assert (lost_frames.value, lost_frames.rating) == ("1 of 10", "warn")
     assert (match.value, match.rating) == ("4.00 px", "bad")

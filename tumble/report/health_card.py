@@ -33,6 +33,11 @@ LIMITS = {
 """Limits beyond which a row is rated "warn" and "bad", rules of thumb: median PSNR [dB], median IoU, range of exposure
 [stops], largest rotation between two frames [degrees], fraction of lost frames, median match residual [pixels],
 fraction of the surface lit from few directions, relative error of the albedo's scale."""
+SHADED = (
+    "The exposure was measured on the background and corrected, so that a hand or a person shades the object, or poses "
+    "are wrong."
+)
+"""Why photos of a film are not as bright as their renders."""
 MIN_LIGHT_DIRECTIONS = N_LIGHTS + 1
 """Number of light directions below which a point counts as lit from few directions: light that is fixed to the object
 gives at most one per bright light, `N_LIGHTS` in all."""
@@ -59,6 +64,8 @@ def card(
     quality: PoseQuality | None,
     confidence: Confidence,
     colour_deviation: Sequence[float] = (),
+    *,
+    corrected: bool = False,
 ) -> list[Row]:
     """All rows of the card, in the order of the page.
 
@@ -67,11 +74,12 @@ def card(
         quality: Quality of the poses; None if they came with the capture.
         confidence: How well the surface was seen and lit.
         colour_deviation: Standard deviation of the albedo's scale per channel; empty if it was not estimated.
+        corrected: Whether the exposure was measured on the background and corrected when the footage was converted.
     """
     return [
         _photo_row(frames),
         _silhouette_row(frames),
-        _exposure_row(frames),
+        _brightness_row(frames, corrected),
         _turn_row(quality),
         _lost_row(quality),
         _match_row(quality),
@@ -125,27 +133,32 @@ def _silhouette_row(frames: Sequence[RenderedFrame]) -> Row:
     return Row("Silhouettes against masks", f"{median:.3f} IoU", rating, sentence, values, _ratings(values, limits))
 
 
-def _exposure_row(frames: Sequence[RenderedFrame]) -> Row:
+def _brightness_row(frames: Sequence[RenderedFrame], corrected: bool) -> Row:
     values = [frame.exposure_stops for frame in frames]
     known = sorted(value for value in values if not math.isnan(value))
     if len(known) < 4:
-        return Row("Exposure drift", "-", "none", "There are too few frames to measure it.")
+        return Row("Brightness", "-", "none", "There are too few frames to measure it.")
     # Range of the middle 90 % of the frames: a single frame with a finger in front of the object is no drift.
     margin = len(known) // 20
     drift = known[-1 - margin] - known[margin]
     rating, median = _lower_is_better(drift, LIMITS["exposure"]), statistics.median(known)
     sentence = {
         "good": "All photos are about equally bright, compared with their renders.",
-        "warn": "Some photos are brighter than others, compared with their renders. Lock exposure and white balance "
-        "when you record.",
-        "bad": "The brightness of the photos changes: exposure was automatic, or the light changed while recording. "
-        "Lock exposure and white balance, and record again.",
+        "warn": "Some photos are brighter than others, compared with their renders. "
+        + (SHADED if corrected else "Lock exposure and white balance when you record."),
+        "bad": "The photos are brighter and darker than their renders. "
+        + (
+            f"{SHADED} Look at the frames with high bars."
+            if corrected
+            else "Exposure was automatic, or the light changed while recording. Lock exposure and white balance, and "
+            "record again."
+        ),
     }[rating]
     bars = tuple(abs(value - median) for value in values)
     marks: tuple[CardRating, ...] = tuple(
         _lower_is_better(bar, (LIMITS["exposure"][0], LIMITS["exposure"][1])) for bar in bars
     )
-    return Row("Exposure drift", f"{drift:.2f} stops", rating, sentence, bars, marks)
+    return Row("Brightness", f"{drift:.2f} stops", rating, sentence, bars, marks)
 
 
 def _turn_row(quality: PoseQuality | None) -> Row:

@@ -80,6 +80,8 @@ class RunSummary:
     """Settings by stage."""
     assumed_focal: float | None = None
     """The capture's focal length if it was assumed, else None [pixels]."""
+    exposure_corrected: bool = False
+    """Whether the capture was made from footage, whose exposure is measured on the background and corrected."""
 
 
 def write_report(out: Path, *, capture: Path | None = None, device: torch.device | str = "cpu") -> Path:
@@ -100,7 +102,8 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
     hand_coloured = {frame.name: frame.hand_coloured for frame in made.frames} if made else {}
     name = out.resolve().name if path.name == run.CAPTURE else path.stem
     assumed_focal = float(used.whole.camera.fx_fy_cx_cy[0]) if used.whole.focal_assumed else None
-    summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal)
+    corrected = made is not None and made.window_top_left_height_width is not None
+    summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal, corrected)
     with tempfile.TemporaryDirectory() as folder:
         asset = tree.to(asset, device)
         quality = used.tracked.quality if used.tracked else None
@@ -194,7 +197,8 @@ def build(
     selected = figures.select_diverse(asset, frames, N_COMPARISONS)
     views = selected[:N_VIEWS]
     confidence = confidence_of(asset, figures.small_camera(asset.camera))
-    rows = health_card.card(frames, quality, confidence, _colour_deviation(summary.records))
+    deviation = _colour_deviation(summary.records)
+    rows = health_card.card(frames, quality, confidence, deviation, corrected=summary.exposure_corrected)
     rating, word, sentence = health_card.overall(rows)
     covered = coverage.coverage_of(asset, capture)
     told = coverage.advice(covered, light_turns=asset.trajectory.light == "camera")
