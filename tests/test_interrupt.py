@@ -275,7 +275,7 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
     assert [path.name for path in (tmp_path / "pictures").iterdir()] == [actions.LIGHT_FILE]
     with full_disk(3000), pytest.raises(OSError, match=r"asset\.ply: cannot be written"):
         actions.export_run(whole, tmp_path / "export", "splat", None)
-    assert [path.name for path in (tmp_path / "export").iterdir()] == ["export.json"]
+    assert not list((tmp_path / "export").iterdir())
     for name, write in (("x.exr", files.write_exr), ("x.hdr", files.write_hdr)):
         with full_disk(100), pytest.raises(OSError, match=rf"{name}: cannot be written: .*(too large|full)"):
             write(tmp_path / name, torch.rand(8, 16, 3).numpy())

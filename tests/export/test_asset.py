@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -251,6 +252,34 @@ def test_splats_alone_need_no_mesh(asset: Asset, tmp_path: Path) -> None:
     assert not (tmp_path / "asset.glb").exists()
     assert files.read_json(tmp_path / "export.json")["metres_per_object_radius"] == 1.0
     assert np.allclose(table(tmp_path / "asset.ply")["x"], asset.gaussians.means[:, 0])
+
+
+def test_an_export_takes_the_place_of_one_with_another_preset_as_a_whole(
+    asset: Asset, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or not at all, if writing fails. What is not of an export stays."""
+
+    def content(path: Path) -> dict[str, bytes]:
+        return {str(each.relative_to(path)): each.read_bytes() for each in path.rglob("*") if each.is_file()}
+
+    out, foreign, fresh = tmp_path / "out", tmp_path / "foreign", tmp_path / "fresh"
+    shutil.copytree(folder, out)
+    (out / "notes.txt").write_text("mine")
+    before = content(out)
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "write_poses", lambda *about: files.write_json(about[-1] / "asset.ply" / "poses.json", 0))
+        with pytest.raises(files.WriteError, match=r"poses\.json: cannot be written"):
+            export.write_asset(asset, NAMES, out, "splat")
+    assert content(out) == before
+    export.write_asset(asset, NAMES, out, "splat")
+    assert content(out).keys() == before.keys() - {"asset.glb", "confidence.png"}
+    assert files.read_json(out / "export.json")["preset"] == "splat"
+    foreign.mkdir()
+    (foreign / "asset.glb").write_text("mine")
+    export.write_asset(asset, NAMES, foreign, "splat")
+    assert (foreign / "asset.glb").read_text() == "mine"
+    export.write_asset(asset, NAMES, fresh, "splat")
+    assert content(fresh) == {name: data for name, data in content(out).items() if name != "notes.txt"}
 
 
 def test_a_turntable_rotates_about_the_vertical_under_a_fixed_light(asset: Asset) -> None:

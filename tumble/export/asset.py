@@ -4,7 +4,9 @@ All files use the object frame, which has +y up as in glTF (if the object has an
 the object's size is given, else the object radius.
 """
 
-from collections.abc import Sequence
+import contextlib
+import tempfile
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,9 +50,11 @@ PRESETS: dict[str, Preset | None] = {
 }
 """Settings by name. "web" stays below 10 MB; "splat" has no mesh."""
 EXPORT_FILE = "export.json"
-"""Unit and settings of an exported folder, by which it is recognised; written first."""
+"""Unit and settings of an exported folder, by which it is recognised; moved there first."""
 CONFIDENCE_FILE = "confidence.png"
 """Confidence of the material as a texture, beside the GLB and over the same UVs."""
+MESH_FILES = ("asset.glb", CONFIDENCE_FILE)
+"""Files that not every preset writes."""
 COARSE_VIEWS = 12
 """Number of views of the coarse texture with which the surface is aligned."""
 SIZE_PRESET = Preset(triangles=20_000, texture=256, cells=128, views=32, pixels=256)
@@ -67,6 +71,8 @@ def write_asset(
     capture: Capture | None = None,
 ) -> None:
     """Write a folder: `asset.glb` and `confidence.png` (not for "splat"), both PLYs, `light.*`, `poses*`, `bop/`.
+
+    It takes the place of an earlier export as a whole, when all of it is written.
 
     Args:
         names: Names of the frames, in the order of the trajectory.
@@ -100,15 +106,36 @@ def write_asset(
         "f0": float(asset.material.f0),
         "tumble": __version__,
     }
-    files.write_json(out / EXPORT_FILE, facts)
-    if flat and textures and score:
-        gltf.write_glb(out / "asset.glb", flat, textures, f0=float(asset.material.f0), metres=metres)
-        texture = bake.nearest_gaussian_texture(score(), asset, flat, resolution=512)
-        files.write_png(out / CONFIDENCE_FILE, texture[..., None])
-    ply.write_ply(out / "asset.ply", ply.splat_columns(asset, metres))
-    ply.write_ply(out / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
-    _write_light(asset, out)
-    write_poses(asset, names, metres, out)
+    with _replacing(out) as partial:
+        files.write_json(partial / EXPORT_FILE, facts)
+        if flat and textures and score:
+            gltf.write_glb(partial / "asset.glb", flat, textures, f0=float(asset.material.f0), metres=metres)
+            texture = bake.nearest_gaussian_texture(score(), asset, flat, resolution=512)
+            files.write_png(partial / CONFIDENCE_FILE, texture[..., None])
+        ply.write_ply(partial / "asset.ply", ply.splat_columns(asset, metres))
+        ply.write_ply(partial / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
+        _write_light(asset, partial)
+        write_poses(asset, names, metres, partial)
+
+
+@contextlib.contextmanager
+def _replacing(out: Path) -> Iterator[Path]:
+    """A partial folder in `out`, whose files at last replace those of an earlier export; other files stay."""
+    # In a folder without the mark such files are not ours.
+    own = MESH_FILES if (out / EXPORT_FILE).is_file() else ()
+    with files.describe_write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=out) as name:
+            partial = Path(name)
+            yield partial
+            written = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
+            # The mark comes first: by it the folder is recognised if the process is killed here.
+            for path in sorted(written, key=lambda path: path.name != EXPORT_FILE):
+                (out / path).parent.mkdir(exist_ok=True)
+                (partial / path).replace(out / path)
+            for path in map(Path, own):
+                if path not in written:
+                    (out / path).unlink(missing_ok=True)
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
