@@ -11,7 +11,7 @@ pytest.importorskip("mitsuba", reason="needs the extra `synth`")
 from tests.test_cli import run
 from tumble import batch
 from tumble.bench import captures, code, rows
-from tumble.bench.suite import cases_of, read_suite
+from tumble.bench.suite import Case, cases_of, read_suite
 from tumble.engine import loop
 from tumble.io import files
 from tumble.io.files import BadFile
@@ -96,6 +96,33 @@ def test_a_method_in_a_file_is_measured_again_when_the_file_changes(suite: str, 
     assert batch.missing_rows([case], folder, None) == []
     own.write_text(own.read_text() + "# a change\n")
     assert [task.case for task in batch.missing_rows([case], folder, None)] == [case]
+
+
+def test_a_row_of_an_earlier_version_of_a_method_file_is_stale_and_in_no_mean(suite: str, tmp_path: Path) -> None:
+    own, folder = tmp_path / "changed.py", tmp_path / "out"
+    own.write_text("def method(recipe):\n    return recipe\n")
+    chosen = {"methods": [str(own)], "seeds": [0, 1], "only": ["estimate"]}
+    cases = cases_of(read_suite(suite), **chosen)
+
+    def measure(case: Case, score: float) -> rows.SuiteRow:
+        recipe = loop.fingerprint(batch.recipe_of(case), own.read_text())
+        row = rows.row_of(case, code.current_code(), recipe=recipe)
+        return row | {"regions": {"shared": {"albedo.psnr_fg_srgb": score}}}
+
+    first, second = measure(cases[0], 20.0), measure(cases[1], 20.0)
+    own.write_text(own.read_text() + "# a change\n")
+    again = measure(cases[1], 30.0)
+    files.write_json(folder / batch.MARK, {})
+    for row in (first, again):
+        files.write_json(rows.row_file(folder, row), row)
+    batch.report_suite(suite, folder, **chosen)
+    text, report = (folder / "pot.md").read_text("utf-8"), rows.read_results(folder / "pot.json")
+    assert "2 of 2 rows: 0 failed, 1 stale" in text
+    assert "| 1 | 30.0 |" in text.partition("## Means")[2]
+    assert [task.case for task in batch.missing_rows(cases, folder, None)] == [cases[0]]
+    # Of a case that has both the row of today is taken, also if the other one is written later.
+    about = "pot", read_suite(suite), cases, [again, second], code.current_code()
+    assert rows.results_of(*about, recipes=report["recipes"])["rows"][0]["regions"] == again["regions"]
 
 
 def test_a_row_in_one_line_has_the_error_of_poses_only_if_they_were_estimated(measured: Path) -> None:

@@ -200,8 +200,8 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
 
 
 def _empty_row(case: Case) -> SuiteRow:
-    source = Path(case.method).read_text("utf-8") if case.method.endswith(".py") else ""
     recipe = recipe_of(case)
+    source = Path(case.method).read_text("utf-8") if case.method.endswith(".py") else ""
     if case.poses == "given":
         recipe = dataclasses.replace(recipe, track=None, matcher="")  # stage 1 does not run
     return bench.row_of(case, bench.current_code(), recipe=loop.fingerprint(recipe, source))
@@ -230,13 +230,15 @@ def report_suite(name: str, out: Path, **selection: Any) -> Path:
 
     Raises:
         BadFile: There is no such suite, or a row is damaged.
+        ValueError: There is no such recipe or method.
     """
     if name.endswith(".json"):
         results = bench.read_results(Path(name))
     else:
         suite = bench.read_suite(name)
         cases, rows = bench.cases_of(suite, **selection), bench.read_rows(out)
-        results = bench.results_of(Path(name).stem, suite, cases, rows, bench.current_code())
+        recipes = {case.key: _empty_row(case)["recipe"] for case in cases}
+        results = bench.results_of(Path(name).stem, suite, cases, rows, bench.current_code(), recipes=recipes)
     _claim(out)
     texts = {".md": bench.markdown_of(results), ".html": bench.page_of(results, out)}
     texts = {f"{results['name']}{suffix}": text for suffix, text in texts.items()}

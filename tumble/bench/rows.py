@@ -90,6 +90,9 @@ class SuiteResults(TypedDict):
     code: Code
     """The code that was current when the report was written; rows of other code are stale."""
     rows: list[SuiteRow]
+    recipes: NotRequired[dict[str, str]]
+    """The recipe of each case when the report was written, by key: rows of another one are stale too, because the
+    Python file of a method is no part of `code`. Early reports lack them."""
 
 
 def row_of(case: Case, code: Code, *, recipe: str) -> SuiteRow:
@@ -128,12 +131,24 @@ def read_rows(out: Path) -> list[SuiteRow]:
     return [read_row(path) for path in paths]
 
 
-def results_of(name: str, suite: Suite, cases: Sequence[Case], rows: Sequence[SuiteRow], code: Code) -> SuiteResults:
-    """The rows of the given cases: of each that of the current code, or else the latest one of other code."""
+def results_of(
+    name: str,
+    suite: Suite,
+    cases: Sequence[Case],
+    rows: Sequence[SuiteRow],
+    code: Code,
+    *,
+    recipes: Mapping[str, str],
+) -> SuiteResults:
+    """The rows of the given cases: of each the current one, or else the latest one of other code.
+
+    Args:
+        recipes: The recipe of each case now, by key.
+    """
     latest: dict[str, SuiteRow] = {}
     for row in rows:
         before = latest.get(row["key"])
-        if before is None or not _is_current(before, code) or _is_current(row, code):
+        if before is None or not _is_current(before, code, recipes) or _is_current(row, code, recipes):
             latest[row["key"]] = row
     about: Any = dataclasses.asdict(suite)
     return {
@@ -144,6 +159,7 @@ def results_of(name: str, suite: Suite, cases: Sequence[Case], rows: Sequence[Su
         "code": code,
         # The labels depend on what else is in the suite; a row may have been measured for another one.
         "rows": [latest[c.key] | {"name": c.name, "labels": c.labels} for c in cases if c.key in latest],  # type: ignore
+        "recipes": dict(recipes),
     }
 
 
@@ -165,13 +181,14 @@ def read_results(path: Path) -> SuiteResults:
     return results
 
 
-def _is_current(row: SuiteRow, code: Code) -> bool:
-    return row["code"]["fingerprint"] in (code["fingerprint"], code.get("fingerprint_given"))
+def _is_current(row: SuiteRow, code: Code, recipes: Mapping[str, str]) -> bool:
+    same_recipe = recipes.get(row["key"], row["recipe"]) == row["recipe"]
+    return same_recipe and row["code"]["fingerprint"] in (code["fingerprint"], code.get("fingerprint_given"))
 
 
 def is_stale(row: SuiteRow, results: SuiteResults) -> bool:
-    """Whether a row was measured with other code than the report's."""
-    return not _is_current(row, results["code"])
+    """Whether a row was measured with other code than the report's, or with another recipe than its case has."""
+    return not _is_current(row, results["code"], results.get("recipes", {}))
 
 
 def rounded(scores: Mapping[str, Any]) -> dict[str, float | None]:
