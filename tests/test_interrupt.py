@@ -328,3 +328,33 @@ def test_lights_of_the_same_name_get_folders_of_their_own(whole: Path, tmp_path:
     actions.relight_run(out, lights[0], fast=True, exposure=1.0)
     bright = files.read_image(folders[0] / "0000.png").mean()
     assert bright > 1.2 * dark
+
+
+def test_no_image_of_an_earlier_light_stays_under_the_name_of_another(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether the other run has fewer frames, or its command is interrupted. Pictures of the user stay."""
+    out, lights = tmp_path / "pictures", [tmp_path / "day.hdr", tmp_path / "night.hdr"]
+    for light in lights:
+        Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
+
+    def pictures() -> list[str]:
+        return sorted(path.name for path in out.glob("*.png"))
+
+    asset, mine = actions.finished(whole), ["0077.png", "front.png"]
+    for name in ("0001.png", *mine):
+        files.write_png(out / name, np.zeros((2, 2, 1), np.uint8))
+    actions.relight_run(whole, lights[0], out, fast=True, overwrite=True)
+    numbered = [f"{i:04}.png" for i in range(8)]
+    assert pictures() == [*numbered, *mine]
+    few = dataclasses.replace(asset, trajectory=asset.trajectory.select([0, 1, 2]))
+    with monkeypatch.context() as patch:
+        patch.setattr(actions, "finished", lambda *_: few)
+        actions.relight_run(whole, lights[1], out, fast=True)
+    assert pictures() == [*numbered[:3], *mine]
+    assert "night" in files.read_json(out / actions.LIGHT_FILE)["light"]
+    actions.relight_run(whole, lights[1], out, fast=True)
+    with full_disk(300), pytest.raises(OSError, match="cannot be written"):
+        actions.relight_run(whole, lights[0], out, fast=True)
+    assert pictures() == mine
+    assert "day" in files.read_json(out / actions.LIGHT_FILE)["light"]

@@ -362,15 +362,30 @@ def relight_run(
     """
     gain = _gain(exposure)
     asset, light = finished(out, device), Environment.read(env)
-    note = {"light": str(env.resolve()), "sha256": hashlib.sha256(env.read_bytes()).hexdigest()}
-    images = images or _relit_folder(out, env.stem, note["sha256"])
+    sha256, n = hashlib.sha256(env.read_bytes()).hexdigest(), len(asset.trajectory)
+    images = images or _relit_folder(out, env.stem, sha256)
     outputs.claim_folder(images, LIGHT_FILE, overwrite=overwrite)
-    files.write_json(images / LIGHT_FILE, note)
+    _remove_images(images, n)
+    files.write_json(images / LIGHT_FILE, {"light": str(env.resolve()), "sha256": sha256, "images": n})
     views = relight(asset, light, cfg=_relighting(out), fast=fast)
-    n = len(asset.trajectory)
     for number, linear in enumerate(progress.track(views, f"relighting under {env.stem}", n)):
         files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).cpu().numpy())
     return images
+
+
+def _remove_images(images: Path, n: int) -> None:
+    """Remove the images that `n` new ones will replace, and all of an earlier output.
+
+    If the new ones are fewer, or the command is interrupted, the others would stay under the name of another light.
+    """
+    note = images / LIGHT_FILE
+    if note.is_file():
+        # Others may be the user's, who insisted on this folder.
+        n = max(n, int(files.read_json(note, dict[str, str | int], f"remove {images}").get("images", 0)))
+    for path in images.glob("[0-9][0-9][0-9][0-9]*.png"):
+        if path.stem.isdecimal() and int(path.stem) < n:
+            with files.describe_write_errors(path):
+                path.unlink()
 
 
 def _relit_folder(out: Path, name: str, sha256: str) -> Path:
