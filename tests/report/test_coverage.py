@@ -108,6 +108,20 @@ def test_a_face_that_no_frame_shows_is_named() -> None:
     assert re.match(r"No frame shows the bottom \(1\d% of the surface\): turn", told.sentence), told.sentence
 
 
+def test_three_of_many_frames_are_enough_to_show_a_face() -> None:
+    """All others are from above."""
+    asset = cube()
+    height = asset.trajectory.camera_positions[:, 1]
+    order = height.argmax().repeat(400)
+    order[[1, 2, 4]] = height.argmin()
+    asset = replace(asset, trajectory=asset.trajectory.select(order.tolist()))
+    found = coverage.coverage_of(asset, masks(asset))
+    top, bottom = (found.normals[:, 1] * sign > 0.95 for sign in (1, -1))
+    assert found.shown[top].median() == 397
+    assert found.shown[bottom].median() == 3
+    assert "the bottom" not in coverage.advice(found, light_turns=True).sentence
+
+
 def test_without_an_occluder_all_was_seen() -> None:
     asset = cube()
     found = coverage.coverage_of(asset, masks(asset))

@@ -38,8 +38,6 @@ MIN_COSINE = math.cos(math.radians(70))
 """Minimum cosine of the angle between the normal of a point and the direction to the camera at which it is usable."""
 MAX_DEPTH_DIFFERENCE = 0.08
 """Largest distance of a point behind the visible surface at which it counts as visible [object radius]."""
-MAX_FRAMES = 128
-"""Maximum number of frames that are counted, evenly spaced."""
 MIN_SHOWN = 3
 """Minimum number of frames that show a point that counts as seen."""
 MIN_TURN = math.radians(10)
@@ -110,12 +108,11 @@ def coverage_of(asset: Asset, capture: Capture) -> Coverage:
     """
     points, normals = _surface(asset)
     trajectory, camera = asset.trajectory, asset.camera
-    selected = torch.linspace(0, len(trajectory) - 1, min(MAX_FRAMES, len(trajectory))).round().long().unique()
     scale = min(1.0, 2 * VIEW_SIDE / max(camera.height, camera.width))
     small = camera.resized(max(1, round(scale * camera.height)), max(1, round(scale * camera.width)))
     faced, shown = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     total = torch.zeros_like(points)
-    for i in selected.tolist():
+    for i in range(len(trajectory)):
         T_cam_obj = trajectory.T_cam_obj[i]
         view = rasterize(asset.gaussians, asset.gamma, T_cam_obj, small, {})
         x_cam = T_cam_obj @ points
