@@ -430,6 +430,16 @@ def test_a_pose_free_video_under_a_white_light(pebble: Path, tmp_path: Path) -> 
     assert np.abs(expected.astype(float) - truth.images[solid].numpy()).mean() < 2
 
 
+def test_a_light_to_relight_under_may_have_any_name(pebble: Path, tmp_path: Path) -> None:
+    """Two of them were names of scenes of the program."""
+    lights = [tmp_path / f"{name}.hdr" for name in ("probe", "surrounded", "other")]
+    for channel, light in enumerate(lights):
+        Environment.from_radiance(0.01 + torch.eye(3)[channel].expand(8, 16, 3)).write(light)
+    options = SynthOptions(env="white", background="wall", relight=tuple(map(str, lights)), **TINY)
+    truth = folder.load_truth(synthesize.render_capture(pebble, tmp_path / "out", options))
+    assert [int(truth.relit[light.stem].sum((0, 1, 2)).argmax()) for light in lights] == [0, 1, 2]
+
+
 def test_a_roughness_sweep_changes_only_roughness(pebble: Path, tmp_path: Path) -> None:
     low, high = synthesize.render_captures(pebble, tmp_path, SynthOptions(env="white", **TINY), (0.2, 0.8))
     assert (low.name, high.name) == ("r0.20", "r0.80")

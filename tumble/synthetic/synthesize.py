@@ -39,8 +39,10 @@ SATURATED = 0.01
 """Fraction of the object's pixels that saturate under the automatic exposure."""
 LAYER_SAMPLES = 64
 """Samples per pixel of the masks of object and hand."""
-SURROUNDED = "surrounded"
-"""Name of the Mitsuba scene of the capture's light with hand and background."""
+SURROUNDED = "/surrounded"
+"""Name of the Mitsuba scene of the capture's light with hand and background. No light has a slash in its name."""
+PROBE = "/probe"
+"""Name of the Mitsuba scene of a light whose exposure is being measured."""
 LIGHT_ROWS = 512
 """Maximum height of an environment map; larger ones are averaged down to it, a resolution of a third of a degree."""
 MAP_SAMPLES = 256
@@ -256,10 +258,10 @@ def _exposure(context: _RenderContext, light: Environment, frames: list[_Frame],
     Raises:
         ValueError: The object is black in all of them.
     """
-    context.scenes["probe"] = pathtracer.lit_scene(context.shapes, light, context.options.path_depth)
+    context.scenes[PROBE] = pathtracer.lit_scene(context.shapes, light, context.options.path_depth)
     brightest = []
     for number, frame in enumerate(frames[:: max(1, math.ceil(len(frames) / 16))]):
-        pixels, coverage = context.render("probe", frame, 64, number, light_frame)
+        pixels, coverage = context.render(PROBE, frame, 64, number, light_frame)
         brightest.append(pixels[coverage >= 0.99].max(-1))
     level = float(np.quantile(np.concatenate(brightest), 1 - SATURATED)) if any(map(len, brightest)) else 0.0
     if level <= 0:
@@ -349,7 +351,7 @@ def _render_truth(context: _RenderContext, frame: _Frame, seed: int) -> np.ndarr
     maps = pathtracer.maps(context.unlit, frame.T_cam_obj, context.camera, samples=MAP_SAMPLES)
     for name in _map_names(options):
         files.write_exr(truth / name / exr, getattr(maps, name), half=name != "depth")
-    for light in (name for name in context.scenes if name not in ("", "probe", SURROUNDED)):
+    for light in (name for name in context.scenes if name not in ("", PROBE, SURROUNDED)):
         pixels, _ = context.render(light, frame, options.truth_samples, seed, "object")
         _write_srgb(truth / "relit" / light / frame.name, pixels)
     return maps.coverage
