@@ -1,5 +1,6 @@
 """Tables follow from the JSON document alone; means, spreads and tests have values known from elsewhere."""
 
+import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -45,8 +46,11 @@ OBJECTS = [f"o{i}" for i in range(10)]
 
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
-def test_a_committed_report_reproduces_its_tables(path: Path) -> None:
-    assert path.with_suffix(".md").read_text("utf-8") == markdown.markdown_of(read_results(path))
+def test_a_committed_report_reproduces_its_tables_and_plots(path: Path) -> None:
+    report = read_results(path)
+    assert path.with_suffix(".md").read_text("utf-8") == markdown.markdown_of(report)
+    for drawn in plot.line_plots(report):
+        assert (BENCHMARKS / drawn.file).read_text("utf-8") == drawn.svg
 
 
 def test_a_suite_is_committed() -> None:
@@ -124,6 +128,21 @@ def test_plots_have_a_line_for_each_setting_over_the_varied_values() -> None:
     assert (drawn.count(":path"), drawn.count(":circle")) == (2, 6)
     assert all(drawn.count(f">{name}<") == 1 for name in ("dome", "handheld"))
     assert f"]({found.file})" in markdown.markdown_of(results(rows, plot="views"))
+
+
+def test_a_line_of_a_plot_is_of_objects_that_all_its_values_have() -> None:
+    """Each value of "turntable" has another object, so that it has no line."""
+    absent = {("dome", "b", 400), ("handheld", "a", 25), ("turntable", "a", 25), ("turntable", "b", 400)}
+    rows = []
+    for setting, name, views in itertools.product(("dome", "handheld", "turntable"), ("a", "b"), (25, 400)):
+        one = row(name, setting, 0, {"a": 20.0, "b": 40.0}[name] + views / 25)
+        if (setting, name, views) not in absent:
+            rows.append({**one, "labels": {**one["labels"], "views": views}})
+    (found,) = plot.line_plots(results(rows, plot="views"))
+    drawn = ElementTree.tostring(ElementTree.fromstring(found.svg)).decode()
+    assert [drawn.count(f">{name}<") for name in ("dome", "handheld", "turntable")] == [1, 1, 0]
+    # The axis ends at the lowest value, of object a alone, and at the highest, of b alone.
+    assert (">21<" in drawn, ">56<" in drawn) == (True, True)
 
 
 @pytest.mark.parametrize(

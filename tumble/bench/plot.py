@@ -3,11 +3,12 @@
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from markupsafe import Markup
 
 from tumble.bench import tables
-from tumble.bench.rows import SuiteResults
+from tumble.bench.rows import SuiteResults, SuiteRow
 
 PLOTTED = ("albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "light.log_correlation", "roughness.rmse_fg")
 """Scores that are drawn."""
@@ -37,20 +38,34 @@ def line_plots(results: SuiteResults) -> list[LinePlot]:
     values = list(dict.fromkeys(row["labels"][along] for row in rows))
     numbers = [value for value in values if isinstance(value, int | float)]
     values = sorted(numbers) if len(numbers) == len(values) else values
-    labels = tables.varied_labels(rows, (*tables.of_object(results), along))
+    of_object = tables.of_object(results)
+    labels = tables.varied_labels(rows, (*of_object, along))
+    same = [name for name in of_object if name != along]
     plots = []
     for key in PLOTTED:
         lines: dict[str, Line] = {}
         for group, members in tables.grouped(rows, labels).items():
-            for (value,), same in tables.grouped(members, (along,)).items():
-                found = [score for row in same if (score := tables.value_of(row, key)) is not None]
-                if found:
-                    name = ", ".join(map(str, group)) or "all"
-                    lines.setdefault(name, []).append((values.index(value), statistics.fmean(found)))
+            if means := _means(members, key, along, same):
+                name = ", ".join(map(str, group)) or "all"
+                lines[name] = [(values.index(value), mean) for value, mean in means.items()]
         if lines:
             title, file = f"{tables.METRICS[key][0]} by {along}", f"{results['name']}-{key.replace('.', '-')}.svg"
             plots.append(LinePlot(title, file, _plot(lines, [str(value) for value in values])))
     return plots
+
+
+def _means(rows: Sequence[SuiteRow], key: str, along: str, same: Sequence[str]) -> dict[Any, float]:
+    """Mean scores by the values of a label, over the objects, lights and seeds (labels `same`) that all values have.
+
+    Otherwise the line would show which rows failed, or were not measured, as if it were an effect of the label.
+    """
+    at: dict[Any, dict[tuple[Any, ...], float]] = {}
+    for row in rows:
+        score = tables.value_of(row, key)
+        if score is not None:
+            at.setdefault(row["labels"][along], {})[tuple(row["labels"].get(name) for name in same)] = score
+    shared = set.intersection(*map(set, at.values())) if at else set()
+    return {value: statistics.fmean(scores[each] for each in shared) for value, scores in at.items() if shared}
 
 
 def _plot(lines: dict[str, Line], names: Sequence[str]) -> Markup:
