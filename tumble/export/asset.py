@@ -131,7 +131,7 @@ def _replacing(out: Path) -> Iterator[Path]:
             written = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
             # The mark comes first: by it the folder is recognised if the process is killed here.
             for path in sorted(written, key=lambda path: path.name != EXPORT_FILE):
-                (out / path).parent.mkdir(exist_ok=True)
+                (out / path).parent.mkdir(parents=True, exist_ok=True)
                 (partial / path).replace(out / path)
             for path in map(Path, own):
                 if path not in written:
