@@ -430,9 +430,9 @@ def relight_turntable(
     light = tree.to(Environment.read(env), asset.gamma.device)
     # A quarter of the rays is enough: in a video the noise averages out over frames.
     cfg = replace(cfg, brdf_samples=-(-cfg.brdf_samples // 4), light_samples=-(-cfg.light_samples // 4))
-    R_gl_obj, turning = relighting.turntable(asset.trajectory, TURNTABLE_FRAMES, TURNTABLE_ELEVATION)
     # The run's images are a window of the video; here the object is in the centre. H.264 needs even sides.
     camera = asset.camera.centred()
+    R_gl_obj, turning = relighting.turntable(asset, camera, TURNTABLE_FRAMES, TURNTABLE_ELEVATION)
     scale = TURNTABLE_SIDE / max(camera.height, camera.width)
     camera = camera.resized(*(2 * round(side * scale / 2) for side in (camera.height, camera.width)))
     views = relight(asset, light.rotated(R_gl_obj), turning, camera, cfg=cfg, fast=fast)

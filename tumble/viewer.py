@@ -237,6 +237,8 @@ class ViewerWindow:
             return
         names = self.snapshot.names
         self.frame.max = len(names) - 1
+        # An earlier snapshot may have had other frames, and another object frame.
+        self.server.scene.remove_by_name("/cameras")
         T_obj_cam, camera = trajectory.T_cam_obj.inverse(), capture.camera
         fov = 2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1]))
         for i in np.linspace(0, len(names) - 1, min(MAX_CAMERAS, len(names))).round().astype(int):

@@ -283,9 +283,21 @@ def test_an_export_takes_the_place_of_one_with_another_preset_as_a_whole(
 
 
 def test_a_turntable_rotates_about_the_vertical_under_a_fixed_light(asset: Asset) -> None:
-    R_gl_obj, turning = relight.turntable(asset.trajectory, 8, math.radians(20))
-    positions = turning.camera_positions
-    distance = asset.trajectory.camera_positions.norm(dim=-1).median()
+    shift = torch.tensor([0.3, -0.2, 0.1])
+    gaussians = replace(asset.gaussians, means=asset.gaussians.means + shift)
+    moved, camera = replace(asset, gaussians=gaussians), asset.camera.centred()
+    R_gl_obj, turning = relight.turntable(moved, camera, 8, math.radians(20))
+    at_left = asset.gaussians.means.amin(0) + shift
+    middle = 0.5 * (at_left + asset.gaussians.means.amax(0) + shift)
+    centre = turning.T_cam_obj @ middle
+    assert torch.allclose(centre[:, :2], torch.zeros(8, 2), atol=1e-4), "the object's centre stays in the middle"
+    narrow = replace(camera, fx_fy_cx_cy=camera.fx_fy_cx_cy * torch.tensor([6.0, 6.0, 1.0, 1.0]))
+    far = relight.turntable(moved, narrow, 2, 0.0)[1].T_cam_obj
+    uv = torch.stack([narrow.project(T @ gaussians.means) for T in (far[0], far[1])])
+    assert uv.min() > 0, "all of it is in the image"
+    assert (uv < torch.tensor([camera.width, camera.height])).all()
+    positions = turning.camera_positions - middle
+    distance = (asset.trajectory.camera_positions - middle).norm(dim=-1).median()
     assert torch.allclose(positions.norm(dim=-1), distance.expand(8), atol=1e-4)
     assert torch.allclose(positions[:, 1], (distance * math.sin(math.radians(20))).expand(8), atol=1e-4)
     assert torch.allclose(positions[0, [0]], torch.zeros(1), atol=1e-5)

@@ -94,6 +94,24 @@ def test_random_values_give_a_closed_surface() -> None:
     assert_closed(mesh.marching_tetrahedra(values, 0.0, 1.0))
 
 
+def test_tunnels_of_noise_are_closed_and_real_holes_stay() -> None:
+    x = grid()
+    to_sphere = np.linalg.norm(x, axis=-1) - 0.7
+    noisy = to_sphere + 1.2 * CELL * np.random.default_rng(0).standard_normal(to_sphere.shape)
+    assert mesh.n_tunnels(mesh.remove_floaters(marched(noisy))) > 50
+    cleaned = mesh.surface(noisy, -depth_fusion.HALF_SIDE, CELL)
+    assert mesh.n_tunnels(cleaned) <= mesh.MAX_TUNNELS
+    assert_closed(cleaned)
+    assert np.abs(np.linalg.norm(cleaned.vertices, axis=1) - 0.7).max() < 2 * CELL
+    # A plate with nine holes of two cells' radius.
+    middles = [(a, b) for a in (-0.5, 0.0, 0.5) for b in (-0.5, 0.0, 0.5)]
+    holes = np.stack([2.5 * CELL - np.hypot(x[..., 0] - a, x[..., 1] - b) for a, b in middles]).max(0)
+    plate = np.maximum(np.maximum(np.abs(x[..., :2]).max(-1) - 0.8, np.abs(x[..., 2]) - 0.13), holes)
+    kept = mesh.surface(plate, -depth_fusion.HALF_SIDE, CELL)
+    assert mesh.n_tunnels(kept) == 9
+    assert np.array_equal(kept.vertices, marched(plate).vertices)
+
+
 def fused(gaussians: Gaussians) -> Mesh:
     values = depth_fusion.signed_distances(gaussians, GAMMA, cells=CELLS, views=32, pixels=128)
     return mesh.remove_floaters(mesh.marching_tetrahedra(values, -depth_fusion.HALF_SIDE, CELL))

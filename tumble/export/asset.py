@@ -151,7 +151,7 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
     if values.min() >= 0:
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
     with progress.task("extracting the mesh"):
-        whole = mesh.remove_floaters(mesh.marching_tetrahedra(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells))
+        whole = mesh.surface(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)
         return mesh.simplify(mesh.smooth(whole), preset.triangles)
 
 

@@ -18,7 +18,7 @@ from tumble.rendering.prefiltered_light import prefilter
 from tumble.rendering.rasterizer import Buffers
 from tumble.rendering.shading import Bounce, Surface, material_at, shade_split, surface
 from tumble.rendering.trace import Tracer, build_tracer, surface_points, transfer, unoccluded, visibility
-from tumble.scene import Asset, Camera, Environment, Trajectory, opengl_from_opencv
+from tumble.scene import Asset, Camera, Environment, Trajectory, opacity, opengl_from_opencv
 
 SURFACE_VIEWS = 64
 """Maximum number of frames that are rendered to find the Gaussians' surface points."""
@@ -27,6 +27,8 @@ VISIBILITY_DIRECTIONS = 512
 
 MAX_ALBEDO = 0.999
 """Largest albedo after scaling."""
+MARGIN = 1.1
+"""Distance of a turntable's camera, over that at which the object's sphere fills the image."""
 
 
 @dataclass(frozen=True)
@@ -144,26 +146,42 @@ def gaussian_colours(asset: Asset, frame: int = 0) -> Float[Tensor, "n 3"]:
     )
 
 
-def turntable(reference: Trajectory, n: int, elevation: float) -> tuple[Float[Tensor, "3 3"], Trajectory]:
-    """One revolution of the object about its +y axis, in front of a fixed camera and a fixed light.
+def turntable(asset: Asset, camera: Camera, n: int, elevation: float) -> tuple[Float[Tensor, "3 3"], Trajectory]:
+    """One revolution of the object about the vertical through its centre, before a fixed camera and a fixed light.
+
+    The camera is as far away as in the median of the run's frames, or so far that all of the object is in the image.
 
     Args:
-        reference: Trajectory whose median camera distance is used.
+        camera: The camera; its principal point is the centre of the image.
         n: Number of frames.
         elevation: Angle by which the camera looks down on the object [radians].
 
     Returns:
         Object to env rotation of the first frame (for `Environment.rotated`), and the trajectory.
     """
-    like = reference.T_cam_obj.xyz
+    like = asset.trajectory.T_cam_obj.xyz
+    centre, radius = _extent(asset)
+    narrowest = min(camera.height / float(camera.fx_fy_cx_cy[1]), camera.width / float(camera.fx_fy_cx_cy[0]))
+    near = MARGIN * radius / math.sin(math.atan(0.5 * narrowest))
+    distance = max(near, float((asset.trajectory.camera_positions - centre).norm(dim=-1).median()))
     tilt = SO3.exp(like.new_tensor([elevation, 0.0, 0.0])).matrix()
     omega = like.new_zeros(n, 3)
     omega[:, 1] = 2 * math.pi * torch.arange(n).to(like) / n
-    T_gl_obj = SE3.from_rotation_matrix(tilt) @ SE3.from_rotation(SO3.exp(omega), torch.zeros_like(omega))
-    shift = like.new_tensor([0.0, 0.0, float(reference.camera_positions.norm(dim=-1).median())])
+    turn = SO3.exp(omega)
+    T_gl_obj = SE3.from_rotation_matrix(tilt) @ SE3.from_rotation(turn, -(turn.matrix() @ centre))
+    shift = like.new_tensor([0.0, 0.0, distance])
     flip = opengl_from_opencv(like)
     T_cam_gl = SE3.from_rotation(SO3.from_matrix(flip), shift)
     return tilt, Trajectory(T_cam_gl @ T_gl_obj, "camera")
+
+
+def _extent(asset: Asset) -> tuple[Float[Tensor, "3"], float]:
+    """Centre of the opaque Gaussians' bounds, object frame, and the radius of a sphere around it that holds them."""
+    means = asset.gaussians.means
+    opaque = means[opacity(asset.gaussians.sdf, asset.gamma) > 0.5]
+    points = opaque if len(opaque) else means
+    centre = 0.5 * (points.amin(0) + points.amax(0))
+    return centre, float((points - centre).norm(dim=-1).max())
 
 
 def scale_albedo(

@@ -53,13 +53,13 @@ def globes(positions: Float[np.ndarray, "t 3"]) -> Markup:
     d = positions / np.linalg.norm(positions, axis=-1, keepdims=True)
     width = 4 * RADIUS + 60
     sides = "".join(
-        _globe(d, azimuth, 15 + RADIUS + i * (2 * RADIUS + 30)) for i, azimuth in enumerate((0.5, 0.5 + math.pi))
+        _globe(d, azimuth, tilt, 15 + RADIUS + i * (2 * RADIUS + 30))
+        for i, (azimuth, tilt) in enumerate(((0.5, 0.35), (0.5 + math.pi, -0.35)))
     )
     return Markup(f'<svg viewBox="0 0 {width} {2 * RADIUS + 40}" role="img"><title>Camera path</title>{sides}</svg>')
 
 
-def _globe(d: Float[np.ndarray, "t 3"], azimuth: float, centre: float) -> str:
-    tilt = 0.35
+def _globe(d: Float[np.ndarray, "t 3"], azimuth: float, tilt: float, centre: float) -> str:
     cos, sin = math.cos(azimuth), math.sin(azimuth)
     R = np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]) @ np.array(
         [[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]

@@ -215,6 +215,8 @@ def _answer(name: str, marks: Marks, review: Review) -> tuple[int, str, bytes]:
         return 200, "image/jpeg", _overlay(survey, review.masks(marks), marks.frame)
     except BadFile as error:
         return 400, "text/plain", str(error).encode()
+    except Exception as error:
+        return 500, "text/plain", f"{type(error).__name__}: {error}".encode()
 
 
 def _parse_marks(content: bytes, height: int, width: int) -> Marks | None:

@@ -153,7 +153,10 @@
 
   for (const button of document.querySelectorAll(".lights button")) button.addEventListener("click", () => choose(button));
   for (const id of ["turn", "exposure", "backdrop"]) at(id).addEventListener("input", settle);
-  at("file").addEventListener("change", (event) => take(event.target.files[0]));
+  at("file").addEventListener("change", (event) => {
+    take(event.target.files[0]);
+    event.target.value = ""; // so that the same file can be chosen again
+  });
   // Anywhere in the window: a file dropped beside the panel would otherwise replace the page.
   addEventListener("dragover", (event) => { event.preventDefault(); panel.classList.add("over"); });
   addEventListener("dragleave", () => panel.classList.remove("over"));
