@@ -1,5 +1,6 @@
 """The viewer: the page shows the contents of the run directory, during a run and after it."""
 
+import dataclasses
 import socket
 import sys
 import time
@@ -21,6 +22,7 @@ from tumble.io import tree
 from tumble.io.files import BadFile
 from tumble.maths.images import linear_from_srgb
 from tumble.scene.asset import Asset
+from tumble.scene.camera import Camera
 
 
 def free_port() -> int:
@@ -122,6 +124,20 @@ def test_the_page_is_served_and_its_scene_holds_the_run(window: viewer.ViewerWin
     np.testing.assert_allclose(node("/cameras/3.png").position, camera.xyz.numpy(), atol=1e-6)
     assert "finished" in window.status.value
     assert window.map.options == ("as captured", "albedo", "roughness", "normals")
+    # Another snapshot with fewer frames.
+    fewer = asset.trajectory.select(torch.arange(4))
+    window.snapshot = dataclasses.replace(window.snapshot, trajectory=fewer, names=window.snapshot.names[:4])
+    window._show_cameras()
+    assert node("/cameras/3.png") is not None
+    assert node("/cameras/7.png") is None
+
+
+def test_the_border_makes_a_cropped_image_symmetric() -> None:
+    camera = Camera(torch.tensor([50.0, 50.0, 10.0, 33.0]), 40, 60)
+    left, right, top, bottom = viewer._border(camera)
+    assert (left, right, top, bottom) == (40, 0, 0, 26)
+    assert left + 10 == (60 + left + right) / 2
+    assert top + 33 == (40 + top + bottom) / 2
 
 
 # Access ---------------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from tumble.maths import SO3, resize_area, srgb_from_linear, texel_directions
 from tumble.poses import PoseResult, mask_refinement
 from tumble.rendering import relight
 from tumble.report import panorama
-from tumble.scene import Asset, Capture, Environment, Gaussians, Material, Trajectory, opacity
+from tumble.scene import Asset, Camera, Capture, Environment, Gaussians, Material, Trajectory, opacity
 from tumble.viewer_access import bind, guarded, new_token
 
 POLL_SECONDS = 2.0
@@ -239,17 +239,19 @@ class ViewerWindow:
         self.frame.max = len(names) - 1
         # An earlier snapshot may have had other frames, and another object frame.
         self.server.scene.remove_by_name("/cameras")
-        T_obj_cam, camera = trajectory.T_cam_obj.inverse(), capture.camera
-        fov = 2 * math.atan(0.5 * camera.height / float(camera.fx_fy_cx_cy[1]))
+        T_obj_cam, border = trajectory.T_cam_obj.inverse(), _border(capture.camera)
+        left, right, top, bottom = border
+        height, width = capture.camera.height + top + bottom, capture.camera.width + left + right
+        fov = 2 * math.atan(0.5 * height / float(capture.camera.fx_fy_cx_cy[1]))
         for i in np.linspace(0, len(names) - 1, min(MAX_CAMERAS, len(names))).round().astype(int):
             self.server.scene.add_camera_frustum(
                 f"/cameras/{names[i]}",
                 fov,
-                camera.width / camera.height,
+                width / height,
                 scale=0.2,
                 thickness=0.008,
                 color=(60, 110, 200),
-                image=_thumbnail(capture, names[i]),
+                image=_thumbnail(capture, names[i], border=border),
                 wxyz=T_obj_cam.wxyz[i].numpy(),
                 position=T_obj_cam.xyz[i].numpy(),
             )
@@ -310,9 +312,22 @@ def _load_capture(out: Path) -> Capture | None:
     return reader_for(path).load(path) if path.exists() else None
 
 
-def _thumbnail(capture: Capture, name: str, side: int = THUMBNAIL) -> UInt8[np.ndarray, "h w 3"]:
-    """An input image, reduced so that its longer side is at most `side` [pixels]."""
-    image = capture.images[capture.names.index(name)]
+def _border(camera: Camera) -> tuple[int, int, int, int]:
+    """Pixels to add on the left, right, top and bottom, so that the principal point becomes the centre of the image.
+
+    Images of a film are a window of it; frustums are symmetric.
+    """
+    cx, cy = camera.fx_fy_cx_cy[2:].tolist()
+    x, y = round(camera.width - 2 * cx), round(camera.height - 2 * cy)
+    return max(0, x), max(0, -x), max(0, y), max(0, -y)
+
+
+def _thumbnail(
+    capture: Capture, name: str, side: int = THUMBNAIL, border: tuple[int, int, int, int] = (0, 0, 0, 0)
+) -> UInt8[np.ndarray, "h w 3"]:
+    """An input image with a black border, reduced so that its longer side is at most `side` [pixels]."""
+    left, right, top, bottom = border
+    image = torch.nn.functional.pad(capture.images[capture.names.index(name)], (0, 0, left, right, top, bottom))
     scale = min(1.0, side / max(image.shape[:2]))
     size = (max(1, round(scale * length)) for length in image.shape[:2])
     return resize_area(image.float(), *size).round().to(torch.uint8).numpy()
