@@ -13,7 +13,8 @@ install: $(STAMP)
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || \
 	  { echo "tumble needs Python 3.11, 3.12 or 3.13: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
-	@$(BIN)/python -c 'import sys' 2>/dev/null || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
+	@test -f $(VENV)/.created && $(BIN)/python -c 'import sys' 2>/dev/null || \
+	  { rm -rf $(VENV); $(PYTHON) -m venv $(VENV) && touch $(VENV)/.created; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[synth,cuda,view,cluster,dev]'
 	@touch $@
@@ -56,7 +57,7 @@ bench: install
 	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m benchmarks.kernels
 
 docs: install
-	$(BIN)/pdoc -o build/docs tumble
+	$(BIN)/python docs/make_api.py build/docs
 
 clean:
 	rm -rf $(VENV) runs/demo .pytest_cache .ruff_cache

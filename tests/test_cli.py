@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import tumble
 from tests.films import scene, written
 from tests.test_interrupt import capture, whole  # noqa: F401 (fixtures)
 from tumble import actions, cli, pipeline
@@ -99,6 +100,34 @@ def test_a_batch_converts_films_as_the_quality_asks_for(tmp_path: Path, monkeypa
     )
     assert run(monkeypatch, "batch", "x.mp4", "-o", str(tmp_path / "b"), "--quality", "standard") == 0
     assert [(each.frames, each.size) for each in seen] == [FRAMES_AND_SIZE["standard"]]
+
+
+def test_numbers_of_processes_and_captures_are_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, message in (
+        (["batch", "x.mp4", "-o", "b", "--jobs", "-1"], "--jobs is out of range: -1"),
+        (["bench", "make", "smoke", "-o", "b", "--jobs", "-1"], "--jobs is out of range: -1"),
+        (["batch", "-o", "b"], "no captures are given"),
+        (["synth", "x.glb", "--env", "white", "-o", "b", "--seed", "-1"], "seed is out of range: -1"),
+    ):
+        monkeypatch.chdir(tmp_path)
+        assert run(monkeypatch, *words) == 1, words
+        assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_reader_that_stops_early_is_no_error() -> None:
+    words = [sys.executable, "-u", "-m", "tumble", "bench", "list", "paper-table1"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+def test_public_names_are_completed() -> None:
+    assert set(tumble.__all__) <= set(dir(tumble))
 
 
 def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(

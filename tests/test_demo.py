@@ -1,6 +1,7 @@
 """The bundled clip: it unpacks to a capture with ground truth, and its report page needs no network."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,17 @@ from tumble.synthetic import trajectories
 def test_the_bundled_folder_is_below_3_megabytes() -> None:
     size = sum(path.stat().st_size for path in demo.bundled_folder().rglob("*") if path.is_file())
     assert size < 3_000_000
+
+
+def test_a_package_that_is_installed_read_only_unpacks_to_files_that_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(demo.bundled_folder(), tmp_path / "locked")
+    for path in (tmp_path / "locked", *(tmp_path / "locked").rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    monkeypatch.setattr(demo, "bundled_folder", lambda: tmp_path / "locked")
+    out = demo.unpack(tmp_path / "capture")
+    assert all(path.stat().st_mode & 0o200 for path in (out, *out.rglob("*")))
 
 
 def test_the_clip_unpacks_to_a_pose_free_capture_with_truth(tmp_path: Path) -> None:

@@ -92,3 +92,8 @@ __getattr__ = lazy_getattr(
         "scene": ("Asset", "Camera", "Capture", "Environment", "Trajectory"),
     },
 )
+
+
+def __dir__() -> list[str]:
+    """The public names too, which are imported at first use: what completion offers."""
+    return sorted({*globals(), *__all__})

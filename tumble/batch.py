@@ -265,8 +265,10 @@ def run_batch(
     """Reconstruct captures or footage, each in `out/<its name>`; yields each with the path of its report.
 
     Raises:
-        ValueError: Two of them have the same name, or there is no such device.
+        ValueError: There are none, two of them have the same name, or there is no such device.
     """
+    if not captures:
+        raise ValueError("no captures are given: name videos, folders of images, or capture folders")
     _check_devices({device}, workers)
     paths = [path.absolute() for path in captures]
     names = [path.stem if path.is_file() else path.name for path in paths]

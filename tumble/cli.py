@@ -465,17 +465,22 @@ def main() -> None:
     """Entry point of the `tumble` command: errors print one line and exit with code 1, Ctrl-C and SIGTERM with 130."""
     from tumble import __version__
 
-    if sys.argv[1:] in (["--version"], ["version"]):
-        print(f"tumble {__version__}")
-        return
     warnings.formatwarning = lambda message, category, filename, lineno, line=None: f"tumble: {_line(message)}\n"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        if sys.argv[1:] in (["--version"], ["version"]):
+            print(f"tumble {__version__}", flush=True)
+            return
         _require_text(sys.argv[1:])
         about = "Recover motion, shape, material and light from one video of an object turned in the hand."
         commands = {command.__name__: command for command in COMMANDS}
         with _progress_lines():
             tyro.extras.subcommand_cli_from_dict(commands, prog="tumble", description=f"{about}\n\n{VERSION_HELP}")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Who reads the output, such as `head`, has seen enough; what is left goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except KeyboardInterrupt:
         print("tumble: interrupted; finished work is kept, repeat the command to resume", file=sys.stderr)
         raise SystemExit(130) from None

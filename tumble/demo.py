@@ -41,7 +41,12 @@ def unpack(out: Path) -> Path:
     """
     if (out / "transforms.json").exists():
         return out
-    shutil.copytree(bundled_folder(), out, dirs_exist_ok=True, ignore=shutil.ignore_patterns("transforms.json"))
+    # The package may be installed read-only: modes of its files and folders are not copied.
+    for path in bundled_folder().rglob("*"):
+        place = out / path.relative_to(bundled_folder())
+        if path.is_file() and path.name != "transforms.json":
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, place)
     document = files.read_json(bundled_folder() / "transforms.json")
     names = [frame["file_path"] for frame in document["frames"] if frame["split"] == "train"]
     for name, values in zip(names, video.read_clip(out / CLIP), strict=True):

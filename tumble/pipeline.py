@@ -97,9 +97,9 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
         BadFile: The footage cannot be converted, or `out` lies in it or holds a capture of other footage or other
             options.
     """
+    outputs.require_outside(out, path)
     if input_kind(path) not in FOOTAGE:
         return path
-    outputs.require_outside(out, path)
     made = out / run.CAPTURE
     with run.exclusive_access(out):
         if not made.exists():

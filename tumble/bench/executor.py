@@ -55,6 +55,12 @@ class Workers:
     gpu: bool = False
     """Whether a task on a Ray cluster occupies a GPU."""
 
+    def __post_init__(self) -> None:
+        if self.jobs < 0:
+            raise ValueError(
+                f"--jobs is out of range: {self.jobs}; give 1 or more, or 0 for as many as there are cores"
+            )
+
 
 def execute(function: Callable[[T], R], tasks: Sequence[T], workers: Workers, logs: Path) -> Iterator[Outcome[T, R]]:
     """Outcomes of `function(task)` for all tasks, in the order in which they finish.

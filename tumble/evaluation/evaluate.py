@@ -182,7 +182,8 @@ def score_prediction(predicted: Prediction, target: CaptureWithTruth, out: Path,
     Raises:
         BadFile: See `score`.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    with files.describe_write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=out) as scratch:
         # The report names a run by the folder above.
         partial, place = Path(scratch) / out.resolve().name / PREDICTION, out / PREDICTION

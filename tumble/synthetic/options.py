@@ -83,6 +83,7 @@ class SynthOptions:
             "roughness": self.roughness is None or 0 < self.roughness <= 1,
             "exposure": self.exposure is None or self.exposure > 0,
             "eval_shared": self.eval_shared >= 0 and self.eval_sphere >= 0,
+            "seed": 0 <= self.seed < 2**32,
             "skin": isinstance(self.skin, str) or 0 <= self.skin <= 1,
         }
         if invalid := [name for name, valid in in_range.items() if not valid]:
