@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tumble.engine import optim
 from tumble.engine.loop import State
 from tumble.inverse_rendering import densify, refine
 from tumble.inverse_rendering.refine import Params, Points
@@ -19,7 +20,7 @@ from tumble.maths.se3 import SE3, SO3, angle_between
 from tumble.maths.spherical_harmonics import basis as basis_of_harmonics
 from tumble.recipes import SMOKE
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, target_view
 from tumble.scene.gaussians import Gaussians, constant_sh, quats_from_normals
 from tumble.scene.trajectory import Trajectory
 
@@ -69,6 +70,39 @@ def test_an_object_that_more_pixels_show_has_more_gaussians(distance: float, fac
     grown = refine.for_resolution(cfg, refine.Inputs(capture, Trajectory(poses, "camera")))
     assert grown.densification.max_gaussians == factor * cfg.densification.max_gaussians
     assert (grown.points, grown.hull) == (100 * factor, round(20 * math.sqrt(factor)))
+
+
+def with_a_hand(capture: Capture) -> Capture:
+    """White pixels over the lower half of every image, which are unknown in the masks."""
+    images, masks = capture.images.clone(), capture.masks.clone()
+    images[:, 32:], masks[:, 32:] = 255, UNKNOWN
+    return replace(capture, images=images, masks=masks)
+
+
+def test_a_hand_has_no_residuals() -> None:
+    points, true, capture = textured_sphere()
+    params = Params(points, GAMMA, SHLight.constant(0.4, true.xyz), torch.zeros(4, 6))
+    held = with_a_hand(capture)
+    inputs = refine.Inputs(held, Trajectory(true, "camera"))
+    away = SE3(true[1].wxyz, true[1].xyz + torch.tensor([0.1, 0.0, 0.0]))
+    found = refine._residuals(params, inputs, 1, target_view(held, 1, GAMMA), None, away).reshape(64, 64, 4)
+    assert found[:32].abs().amax((0, 1)).min() > 0.1
+    assert not found[32:].any()
+
+
+def test_a_hand_splits_no_gaussians() -> None:
+    """The upper half of the images is as it is rendered; the lower one differs from it by nearly all."""
+    points, true, capture = textured_sphere()
+    cfg = replace(SMOKE.refine, densification=densify.Config(prune_opacity=0.0, prune_weight=-1.0))
+    counts = []
+    for masks in (with_a_hand(capture).masks, torch.full_like(capture.masks, OBJECT)):
+        inputs = refine.Inputs(replace(with_a_hand(capture), masks=masks), Trajectory(true, "camera"))
+        params = optim.leaves(Params(points, GAMMA, SHLight.constant(0.4, true.xyz), torch.zeros(4, 6)))
+        optimizer, rng = optim.adam(params, refine._rates(cfg)), torch.Generator().manual_seed(0)
+        state = State(0, params, optimizer, rng, {"max_weight": torch.zeros(600)})
+        refine._densify(cfg, inputs, state)
+        counts.append(len(state.params.points.albedo_logits))
+    assert counts == [600, 600 + 72]
 
 
 def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_pruned() -> None:
