@@ -4,21 +4,26 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from tests import turning
 from tests.inverse_rendering.test_refine import textured_sphere
 from tests.learning.scene import CAPTURE
 from tests.learning.true_asset import true_asset
 from tests.surfaces import GAMMA, MAJOR, MINOR, sphere, torus
 from tumble import recipes
 from tumble.datasets import folder
-from tumble.engine import loop
+from tumble.engine import loop, optim
 from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose, refine, specular_fit
+from tumble.inverse_rendering.pixel_sampling import PixelNumbers
 from tumble.inverse_rendering.sh_lighting import SHLight
-from tumble.rendering.shading import Surface
+from tumble.rendering.shading import Bounce, Surface
+from tumble.scene.capture import OBJECT, UNKNOWN, Capture
 from tumble.scene.environment import Environment
 from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
 from tumble.scene.trajectory import Trajectory
@@ -55,6 +60,92 @@ def test_an_object_without_a_specular_lobe_keeps_an_albedo_below_one() -> None:
     # The lobe is too faint for its colour to be used: still 0.6, 0.3, 0.05, scaled to the largest allowed albedo.
     torch.testing.assert_close(after.material.albedo[0, 0], torch.tensor([0.9, 0.45, 0.075]), rtol=1e-5, atol=0)
     assert after.material.f0.item() < 0.1 * DIELECTRIC
+
+
+QUICK = replace(recipes.known_poses(recipes.SMOKE).decompose, try_matte=False)
+
+
+@pytest.mark.parametrize("first", [0.3, 0.8])
+def test_the_first_state_has_the_lobes_of_stage_2_whatever_its_albedo(first: float) -> None:
+    """What the albedo gains the light loses, and the specular scale gains."""
+    inputs = turning.inputs("object", n=2)
+    albedo, scale = torch.tensor([0.4, 0.2, 0.1]), torch.tensor(0.7)
+    light = replace(inputs.refined.light, log_specular_scale=scale.log())
+    refined = replace(inputs.refined, albedo=albedo.expand(400, 3), light=light)
+    rates = replace(QUICK.rates, specular_scale=0.01)
+    cfg = replace(QUICK, initial_albedo=first, visibility=False, bounce="none", rates=rates)
+    state = decompose.init(cfg, replace(inputs, refined=refined), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(state.params.material.albedo[0, 0], albedo / 0.4 * first, rtol=1e-4, atol=0)
+    # The light of stage 2 is 0.4 everywhere.
+    for found, expected in zip(colours(state.params), (0.4 * albedo, 0.4 * DIELECTRIC * scale.expand(3)), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
+
+
+def recoloured(inputs: decompose.Inputs, where: Tensor, code: int) -> decompose.Inputs:
+    """Inputs with other colours in some pixels of the photographs."""
+    images = inputs.capture.images.clone()
+    images[where] = code
+    return replace(inputs, capture=replace(inputs.capture, images=images))
+
+
+def loss_of_a_step(inputs: decompose.Inputs, metal_logits: Tensor | None = None) -> float:
+    """Photometric term of a step on frame 0."""
+    state = decompose.init(QUICK, inputs, torch.Generator().manual_seed(0))
+    params = replace(state.params, material=replace(state.params.material, metal_logits=metal_logits))
+    state.params, rates = optim.leaves(params), decompose.learning_rates(QUICK, params.material)
+    state.optimizer = optim.adam(state.params, rates)
+    return float(decompose.advance(QUICK, inputs, state, PixelNumbers(0, 0.5, 0, is_fixed=True))["render"])
+
+
+def held(capture: Capture) -> Capture:
+    """The capture with something unknown over the lower half of every image."""
+    masks = capture.masks.clone()
+    masks[:, masks.shape[1] // 2 :] = UNKNOWN
+    return replace(capture, masks=masks)
+
+
+def test_the_colours_of_a_hand_do_not_count() -> None:
+    inputs = turning.inputs("object", n=2)
+    inputs = replace(inputs, capture=held(inputs.capture))
+    unknown, known = (inputs.capture.masks == label for label in (UNKNOWN, OBJECT))
+    before, under_hand, on_object = (
+        loss_of_a_step(each) for each in (inputs, recoloured(inputs, unknown, 255), recoloured(inputs, known, 255))
+    )
+    assert under_hand == before
+    assert on_object > before + 0.1
+
+
+def test_a_metalness_of_0_has_the_loss_of_an_object_without_metal() -> None:
+    """Operations of torch shade the first, the kernel the second, both also pixels that the object covers in part."""
+    inputs = turning.inputs("object", n=2)
+    assert loss_of_a_step(inputs, torch.full((400,), -200.0)) == pytest.approx(loss_of_a_step(inputs), rel=1e-4)
+
+
+def test_metal_lights_nothing_by_a_diffuse_lobe() -> None:
+    inputs = turning.inputs("object", n=2)
+    state = decompose.init(QUICK, inputs, torch.Generator().manual_seed(0))
+    is_metal = torch.arange(400) < 100
+    metal = torch.where(is_metal, 200.0, -200.0)
+    params = replace(state.params, material=replace(state.params.material, metal_logits=metal))
+    albedo = params.material.albedo.mean(1)
+    bounce = decompose._bounce(QUICK, state, params, albedo)
+    assert isinstance(bounce, Bounce)
+    assert (bounce.albedo[is_metal] < 1e-6).all()
+    assert torch.equal(bounce.albedo[~is_metal], albedo[~is_metal])
+
+
+def test_lobes_are_fitted_to_the_radiance_inside_of_the_object_alone() -> None:
+    """Pixels at the contour and beside unknown ones have another colour, which none of the samples has."""
+    inputs = turning.inputs("object", n=2)
+    inputs = replace(inputs, capture=held(inputs.capture))
+    inner = np.stack([cv2.erode((m == OBJECT).astype(np.uint8), np.ones((3, 3))) for m in inputs.capture.masks.numpy()])
+    painted = recoloured(inputs, torch.from_numpy(inner == 0), 20)
+    painted = recoloured(painted, torch.from_numpy(inner > 0), 188)
+    state = decompose.init(QUICK, painted, torch.Generator().manual_seed(0))
+    photo = decompose._samples(QUICK, painted, state).photo
+    assert len(photo) > 100
+    linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
+    torch.testing.assert_close(photo, torch.full_like(photo, linear), rtol=1e-4, atol=0)
 
 
 def test_the_smoothness_of_the_light_does_not_depend_on_its_scale() -> None:
