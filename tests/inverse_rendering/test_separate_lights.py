@@ -12,7 +12,9 @@ from tumble.engine.loop import drive
 from tumble.inverse_rendering import decompose, separate_lights
 from tumble.inverse_rendering.separate_lights import Config
 from tumble.io import tree
+from tumble.maths.directions import texel_directions
 from tumble.scene.asset import Asset
+from tumble.scene.environment import Environment
 
 BASE = replace(
     recipes.known_poses(recipes.SMOKE).decompose,
@@ -69,6 +71,23 @@ def test_each_block_finds_the_light_of_its_frames() -> None:
     assert asset.trajectory is inputs.refined.trajectory
     # Rotated to the env frame, the three are one light.
     assert correlation(asset.environment.lookup(d_obj @ held.R_env_obj[0].T), 0) > 0.75
+
+
+def test_the_lights_of_all_blocks_are_rotated_to_the_frame_in_which_they_are_one() -> None:
+    """Two halves of a light that turns once, each with its true map in the object frame; untrained."""
+    inputs = turning.inputs("object", n=4, turning=True)
+    turns = inputs.refined.trajectory.light_turns
+    assert turns is not None
+    held = replace(inputs.refined.trajectory, light_turns=turns[[0, 3]].repeat_interleave(2, 0))
+    inputs = replace(inputs, refined=replace(inputs.refined, trajectory=held))
+    cfg = Config(replace(BASE, rows=32), 2)
+    state = separate_lights.init(cfg, inputs, torch.Generator().manual_seed(0))
+    d_obj = texel_directions(32, 64)
+    maps = [Environment.from_radiance(0.5 * (1 + d_obj @ (turning.LAMP @ held.R_env_obj[i]).T)) for i in (0, 2)]
+    state.params = replace(state.params, environment=maps[0], others={"1": maps[1]})
+    found = separate_lights.finish(cfg, inputs, state).environment.radiance
+    true = 0.5 * (1 + d_obj @ turning.LAMP.T)
+    torch.testing.assert_close(found / found.mean((0, 1)), true / true.mean((0, 1)), atol=0.02, rtol=0)
 
 
 @pytest.mark.parametrize(("frames", "lights", "sizes"), [(12, 5, [3, 2, 3, 2, 2]), (12, 100, [1] * 12), (12, 1, [12])])
