@@ -16,7 +16,7 @@ from tumble.rendering import render_gbuffer, shade_split, surface, unoccluded
 from tumble.rendering.prefiltered_light import prefilter
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.scene.environment import Environment
 from tumble.scene.material import DIELECTRIC, Material
 from tumble.scene.trajectory import Trajectory
@@ -104,6 +104,18 @@ def test_a_light_object_under_a_directional_light_stays_light() -> None:
     assert darkened < -0.4
 
 
+def test_a_metal_has_the_reflectance_of_metals_and_no_highlight_tells_its_brightness() -> None:
+    """A paint of this albedo, with highlights under a directional light, is darker, and its brightness better known."""
+    rng, grey = torch.Generator().manual_seed(0), torch.full((4000, 3), 0.5)
+    shade = torch.rand(4000, 1, generator=rng).expand(-1, 3)
+    shaded = ShadedPixels(grey, shade, 0.1 * shade)
+    paint, metal = (absolute_colour.estimate(shaded, DIELECTRIC, metalness=metalness) for metalness in (0.0, 1.0))
+    torch.testing.assert_close(0.5 * metal.log_factor.exp(), torch.full((3,), 0.6), rtol=0.01, atol=0)
+    assert (paint.log_factor < metal.log_factor - 0.1).all()
+    # That of a typical object, which is all that is known of the metal's.
+    assert float(metal.deviation.mean()) > absolute_colour.MEAN_ALBEDO_SD > 2 * float(paint.deviation.mean())
+
+
 def test_of_an_object_that_no_frame_shows_nothing_is_changed() -> None:
     empty = torch.zeros(0, 3)
     found = absolute_colour.estimate(ShadedPixels(empty, empty, empty), DIELECTRIC)
@@ -157,6 +169,17 @@ def test_the_factor_leaves_pictures_as_they_are(asset: Asset) -> None:
         for frame in range(2):
             torch.testing.assert_close(picture(after, frame), picture(before, frame), atol=1e-5, rtol=1e-4)
     assert float(picture(dull, 0).max()) > 0.05
+
+
+def test_pixels_of_a_hand_are_none_of_the_object(asset: Asset, capture: Capture) -> None:
+    """All of the second frame is unknown: what is left are the pixels of the first one."""
+    masks = capture.masks.clone()
+    masks[1] = UNKNOWN
+    first = dataclasses.replace(asset, trajectory=asset.trajectory.select([0]))
+    alone = absolute_colour.shaded_pixels(first, capture.select([0]))
+    found = absolute_colour.shaded_pixels(asset, dataclasses.replace(capture, masks=masks))
+    assert len(found.albedo) > 100
+    assert all(torch.equal(x, y) for x, y in zip(astuple(found), astuple(alone), strict=True))
 
 
 def white_at(asset: Asset, capture: Capture, frame: int, place: int) -> torch.Tensor:
