@@ -1,4 +1,4 @@
-"""Light of the photographs: a convex object under uniform light, whose irradiance is known."""
+"""Light of the photographs: a convex object under uniform light, whose irradiance is known; metal beside paint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,13 +8,17 @@ import pytest
 import torch
 
 from tests.export.test_bake import RADIUS, painted
-from tests.surfaces import sphere
+from tests.surfaces import GAMMA, look_at, sphere, torus
 from tumble.export import asset as export
 from tumble.export.asset import Preset
-from tumble.rendering import lit_frames
+from tumble.maths.se3 import SE3
+from tumble.rendering import lit_frames, render_gbuffer
 from tumble.scene.asset import Asset
+from tumble.scene.camera import Camera
 from tumble.scene.capture import OBJECT, Capture
 from tumble.scene.environment import Environment
+from tumble.scene.material import Material
+from tumble.scene.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +50,23 @@ def test_a_convex_object_under_uniform_light_has_the_radiance_of_the_light(asset
         assert frame.specular[frame.usable].max() < 0.1
         # sRGB 188 is linear 0.503.
         assert np.allclose(frame.photo, 0.503, atol=1e-3)
+
+
+def test_metal_lights_its_surroundings_no_more_than_a_black_surface() -> None:
+    """A white torus, one half of which is white metal, or black: the other half lies in the same light."""
+    gaussians, T_cam_obj = torus(2000), look_at([1.5, 1.5, 4.0])
+    half = gaussians.means[:, 0] > 0
+    plain = Material.constant(2000, torch.full((3,), 0.9), 0.5)
+    metal = replace(plain, metal_logits=torch.where(half, 200.0, -200.0))
+    black = plain.with_albedo(torch.where(half[:, None, None], 1e-5, plain.albedo))
+    path = Trajectory(SE3(T_cam_obj.wxyz[None], T_cam_obj.xyz[None]), "camera")
+    light, camera = Environment.from_radiance(torch.ones(8, 16, 3)), Camera.from_fov(0.5, 48, 48)
+    assets = [Asset(gaussians, GAMMA, material, light, path, camera) for material in (metal, black)]
+    beside_metal, beside_black = (next(lit_frames.lit_frames(each, capture(each, 188))) for each in assets)
+    view = render_gbuffer(assets[0], T_cam_obj, camera)
+    white = beside_metal.usable & (view.features["metalness"][..., 0] < 1e-3).numpy()
+    assert white.sum() > 100
+    assert np.abs(beside_metal.diffuse - beside_black.diffuse)[white].max() < 1e-3
 
 
 def test_an_export_with_a_capture_has_the_colour_of_the_photographs(
