@@ -7,6 +7,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,7 +15,7 @@ import torch
 from tests.export.test_bake import RADIUS, colour, painted, roughness
 from tests.surfaces import sphere
 from tumble.export import asset as export
-from tumble.export import gltf, mesh, ply
+from tumble.export import atlas, bake, gltf, mesh, ply
 from tumble.export import poses as pose_files
 from tumble.export.asset import Preset
 from tumble.io import files
@@ -96,6 +97,36 @@ def test_the_glb_follows_the_gltf_layout(folder: Path) -> None:
     # The header of the compressed data (RFC 1950) tells the effort: 0 for runs only, 2 for level 6.
     assert all(binary[binary.index(b"IDAT", start) + 5] >> 6 == 0 for start in starts)
     assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
+
+
+def test_a_viewer_finds_the_true_normals_through_the_tangents_of_the_file(asset: Asset, tmp_path: Path) -> None:
+    """By the rule of glTF 2.0 (section 3.7.2.1): the bitangent is the normal x the tangent, times its fourth number."""
+    values = np.linalg.norm(np.stack(np.meshgrid(*[np.linspace(-1, 1, 25)] * 3, indexing="ij"), -1), axis=-1) - RADIUS
+    shape = mesh.simplify(mesh.marching_tetrahedra(values, -1.0, 2 / 24), 300)
+    flat = atlas.unwrap(shape, 96)
+    tilt = torch.tensor([0.3, -0.2, 0.25])
+    tilted = replace(asset, material=replace(asset.material, normal_offset=asset.material.normal_offset + tilt))
+    textures = bake.bake(tilted, flat, resolution=96, views=12, pixels=64)
+    gltf.write_glb(tmp_path / "x.glb", flat, textures, f0=0.04, metres=1.0)
+    document, binary = chunks(tmp_path / "x.glb")
+
+    def vertices(name: str, width: int) -> torch.Tensor:
+        accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"][name]]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        numbers = np.frombuffer(binary, "<f4", width * accessor["count"], start).reshape(-1, width)
+        return torch.from_numpy(numbers.copy())
+
+    view = document["bufferViews"][document["images"][2]["bufferView"]]
+    png = np.frombuffer(binary, np.uint8, view["byteLength"], view["byteOffset"])
+    normal_map = torch.from_numpy(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB)) / 127.5 - 1
+    normals, tangents, uv = vertices("NORMAL", 3), vertices("TANGENT", 4), vertices("TEXCOORD_0", 2)
+    column, row = (uv * 96).long().clamp(0, 95).unbind(-1)
+    bitangents = torch.linalg.cross(normals, tangents[:, :3]) * tangents[:, 3:]
+    found = (normal_map[row, column][:, None] * torch.stack([tangents[:, :3], bitangents, normals], -1)).sum(-1)
+    true = torch.nn.functional.normalize(vertices("POSITION", 3) / RADIUS + tilt, dim=-1)
+    cosine = (torch.nn.functional.normalize(found, dim=-1) * true).sum(-1)
+    # Texels are up to three degrees away from the vertices.
+    assert cosine.quantile(0.01) > math.cos(math.radians(5))
 
 
 def test_metalness_is_in_the_blue_channel_and_in_the_columns(
