@@ -9,7 +9,7 @@ import torch
 from tests.lopsided import DISTANCE, tumbling
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.contour_joints import Correspondences, contour_joint, fitted_to_both, moved_part
+from tumble.poses.sfm.contour_joints import ContourJoint, Correspondences, contour_joint, fitted_to_both, moved_part
 from tumble.poses.sfm.partial import Observed, Partial
 from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
 from tumble.scene import BACKGROUND
@@ -80,6 +80,20 @@ def test_parts_of_which_little_is_seen_are_not_joined(observed: Observed) -> Non
     assert joint is not None
     assert joint.cost < 0.2
     assert not joint.accepted
+
+
+@pytest.mark.parametrize(
+    ("cost", "seen", "second", "accepted"),
+    [
+        (0.05, 0.5, math.inf, True),
+        (0.05, 0.5, 0.11, True),
+        (0.05, 0.5, 0.09, False),  # another rotation agrees nearly as well, as half a revolution of a bottle does
+        (0.25, 0.5, math.inf, False),
+        (0.05, 0.2, math.inf, False),
+    ],
+)
+def test_a_joint_is_accepted_if_it_is_certain(cost: float, seen: float, second: float, accepted: bool) -> None:
+    assert ContourJoint(half(range(12)), cost, seen, second).accepted == accepted
 
 
 def test_contours_correct_a_joint_that_few_keypoints_suggest(observed: Observed) -> None:

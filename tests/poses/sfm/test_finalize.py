@@ -14,7 +14,7 @@ from tumble.poses.sfm import finalize, frontier_points
 from tumble.poses.sfm.finalize import Solution
 from tumble.poses.sfm.symmetry import mirror_symmetry
 from tumble.poses.sfm.tracks import Tracks, chain_matches
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.synthetic import trajectories
 
 
@@ -76,6 +76,36 @@ def test_frames_without_observations_are_lost_and_interpolated(result: PoseResul
     assert result.quality.overlap[kept].min() > 0.85
     assert result.quality.inliers[12] == 0
     assert result.quality.residual[12].isnan()
+
+
+def test_a_frame_whose_matches_contradict_its_pose_is_lost() -> None:
+    """Its contour agrees with those of the others."""
+    scene, rng = tumbling(24), torch.Generator().manual_seed(0)
+    matches = [scene.match(t - k, t, rng, noise=0.0, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
+    tracks = chain_matches(matches, torch.full((24,), 5.0))
+    shift = torch.tensor([14.0, -11.0]) * (tracks.frame == 9)[:, None]
+    R, t = scene.T_cam_obj.rotation.matrix(), scene.T_cam_obj.xyz / DISTANCE
+    quality = finalize.pose_result(
+        scene.capture,
+        replace(tracks, uv=tracks.uv + shift),
+        frontier_points.convex_contours(scene.capture),
+        mirror_symmetry(scene.capture.masks),
+        Solution(R, t, 0.9 / DISTANCE, torch.zeros(24)),
+    ).quality
+    assert torch.nonzero(quality.lost)[:, 0].tolist() == [9]
+    assert quality.tangency_gap[9] < 0.2
+    assert quality.overlap[9] > 0.9
+
+
+def test_a_hand_is_no_contradiction_to_the_hull(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Something unknown to the left of the object in all frames."""
+    monkeypatch.setattr(finalize, "HULL_RESOLUTION", 24)  # for speed
+    scene = tumbling(24)
+    masks = scene.capture.masks.clone()
+    masks[:, :, :64][masks[:, :, :64] == BACKGROUND] = UNKNOWN
+    trajectory = finalize._trajectory(scene.T_cam_obj, scene.capture)
+    held = replace(scene.capture, masks=masks)
+    assert finalize._hull_overlap(held, trajectory, torch.zeros(24, dtype=torch.bool), 0.0).min() > 0.9
 
 
 def test_a_long_run_of_wrong_frames_is_rejected_from_its_middle_to_its_ends(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,14 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.lopsided import Tumble, truth, tumbling
+from tests.lopsided import DISTANCE, Tumble, moving, truth, tumbling
 from tumble.engine import State
 from tumble.engine.loop import Progress, Stage, drive
 from tumble.evaluation import metrics
-from tumble.maths import SO3
+from tumble.maths import SE3, SO3
 from tumble.poses.result import PoseResult
 from tumble.poses.sfm import schedule, stage
 from tumble.poses.sfm.adjustment import adjust_windows, averaged_windows, deviation, grow_windows
+from tumble.poses.sfm.observations import focal_length, with_focal_length
 from tumble.scene.capture import Capture
 from tumble.scene.match import Match
 
@@ -88,6 +89,33 @@ def test_an_assumed_focal_length_is_estimated_and_a_known_one_kept(scene: Tumble
     assert torch.equal(tracked.camera.fx_fy_cx_cy, scene.capture.camera.fx_fy_cx_cy)
     medians = [metrics.rotation_scores(x.trajectory, truth(scene))["rotation_median_degrees"] for x in (assumed, known)]
     assert medians[0] < 1.5 < medians[1]
+
+
+def test_an_assumed_focal_length_returns_where_nothing_tells_another() -> None:
+    """An object that does not rotate, after a round that has made the focal length longer by a third."""
+    T = tumbling(8).T_cam_obj
+    still = SE3(T.wxyz[:1].expand(8, 4), T.xyz[:1].expand(8, 3))
+    scene, rng = moving(still, points=60), torch.Generator().manual_seed(0)
+    exact = tuple(scene.match(t - 1, t, rng, noise=0.0, wrong=0.0) for t in range(1, 8))
+    inputs = stage.gather(replace(scene.capture, focal_assumed=True), exact)
+    longer = torch.tensor(0.3, dtype=torch.float64)
+    poses = stage.Poses(still.rotation.matrix(), still.xyz / DISTANCE, longer)
+    state = State(0, poses, None, torch.Generator().manual_seed(0))
+    cfg = replace(QUICK, iterations=40)
+    for _ in range(3):
+        current = with_focal_length(inputs, state.params.log_focal)
+        state.params, _ = stage.adjust_all(cfg, current, state, 1.0)
+    assert abs(float(state.params.log_focal)) < 0.5 * longer
+
+
+def test_another_focal_length_changes_the_size_of_the_object_only(scene: Tumble) -> None:
+    """Its silhouettes keep their size in pixels, at the same distance."""
+    inputs = stage.gather(scene.capture, matches(scene))
+    longer = with_focal_length(inputs, torch.tensor(2.0, dtype=torch.float64).log())
+    assert focal_length(longer.capture) == pytest.approx(2 * focal_length(inputs.capture))
+    assert longer.radius == pytest.approx(inputs.radius / 2)
+    torch.testing.assert_close(longer.silhouettes.radius, inputs.silhouettes.radius / 2)
+    torch.testing.assert_close(longer.silhouettes.centre, inputs.silhouettes.centre)
 
 
 def test_a_frame_without_the_object_is_lost_and_the_others_are_not_affected(scene: Tumble) -> None:
