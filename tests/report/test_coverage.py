@@ -11,7 +11,7 @@ import torch
 from tests.export.test_bake import painted
 from tests.surfaces import flat
 from tumble.maths.directions import fibonacci_sphere
-from tumble.maths.se3 import SE3
+from tumble.maths.se3 import SE3, SO3
 from tumble.rendering.rasterizer import rasterize
 from tumble.report import coverage, figures
 from tumble.scene.asset import Asset
@@ -141,6 +141,19 @@ def test_what_floats_beside_the_object_is_not_its_surface() -> None:
     asset = replace(asset, gaussians=replace(asset.gaussians, means=means))
     found = coverage.coverage_of(asset, masks(asset))
     assert found.points.abs().max() < HALF + coverage.CELL
+
+
+def test_a_turn_about_the_line_of_sight_is_none_in_the_light_for_what_faces_the_camera() -> None:
+    """The light is fixed to the camera, which the right side faces in all frames."""
+    asset = cube()
+    towards = coverage.outside_view(torch.tensor([1.0, 0.0, 0.0]))[0]
+    rolls = SO3.exp(torch.linspace(0, 1.2, 4)[:, None] * torch.tensor([0.0, 0.0, 1.0]))
+    rolled = SE3.from_rotation(rolls @ towards.rotation, towards.xyz.expand(4, 3))
+    found = coverage.coverage_of(replace(asset, trajectory=Trajectory(rolled, "camera")), masks(asset))
+    right = (found.normals[:, 0] > 0.95) & (found.shown == 4)
+    assert right.sum() > 50
+    # Normals beside an edge are up to 11 degrees off those of the side.
+    assert found.turn[right].max() < 0.15
 
 
 def test_a_face_that_never_turns_in_the_light_is_named() -> None:

@@ -30,7 +30,7 @@ from tumble.report import page as report
 from tumble.report.worst_frames import AllFrames
 from tumble.scene.asset import Asset
 from tumble.scene.camera import Camera
-from tumble.scene.capture import BACKGROUND, OBJECT, Capture
+from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Trajectory
 from tumble.synthetic import trajectories
@@ -293,6 +293,28 @@ def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: 
     assert health_card.overall([photo, silhouette, exposure, lost_frames, match])[0] == "bad"
 
 
+@pytest.mark.parametrize(("count", "rating"), [(0, "good"), (1, "warn"), (4, "warn"), (5, "bad")])
+def test_more_than_a_tenth_of_lost_frames_is_bad(count: int, rating: str) -> None:
+    """Of 40 frames."""
+    ones, observability = torch.ones(40), Observability(torch.tensor([0.0, 1.0, 0.0]), torch.full((3,), 0.01))
+    lost = torch.arange(40) < count
+    quality = PoseQuality(ones, 50 * ones, ones, ones, 0.01 * ones, lost, torch.tensor(3.0), observability)
+    row = health_card._lost_row(quality)
+    assert (row.value, row.rating) == (f"{count} of 40", rating)
+    assert row.marks.count("bad") == count
+
+
+@pytest.mark.parametrize(("few", "rating"), [(10, "good"), (40, "warn"), (70, "bad")])
+def test_a_surface_that_is_lit_from_few_directions_is_named(few: int, rating: str) -> None:
+    """Percent of the visible points; lights that are fixed to the object light them from at most six directions."""
+    lights = torch.where(torch.arange(100) < few, 6.0, 7.0)
+    # What no frame shows does not count.
+    unseen = torch.zeros(300)
+    found = confidence.Confidence(torch.cat([torch.ones(100), unseen]), torch.cat([lights, unseen]), torch.zeros(400))
+    row = health_card._light_row(found)
+    assert (row.value, row.rating) == (f"{few}% of the surface", rating)
+
+
 @pytest.mark.parametrize(("degrees", "rating"), [(22, "bad"), (60, "warn"), (120, "good")])
 def test_an_object_that_was_hardly_turned_is_named(asset: Asset, degrees: float, rating: str) -> None:
     ones, observability = torch.ones(N), Observability(torch.tensor([0.0, 1.0, 0.0]), torch.full((3,), 0.01))
@@ -346,6 +368,22 @@ def test_a_good_run_has_no_worst_frames(asset: Asset, capture: Capture) -> None:
     assert re.fullmatch(r"0\.[23] times the area of the frames around it", frame.reasons[0])
 
 
+def test_a_mask_that_stage_1_has_repaired_is_no_fault(asset: Asset, capture: Capture) -> None:
+    """All of the image was object at first; the area that counts is that of the mask of the last round."""
+    masks = capture.masks.clone()
+    masks[5] = OBJECT
+    rendered = list(training_views.frames(training_views.prepare(asset), capture))
+    assert worst_frames.worst_frames(AllFrames(dataclasses.replace(capture, masks=masks), capture), rendered) == []
+
+
+def test_a_hand_is_no_error_of_the_silhouettes(asset: Asset, capture: Capture) -> None:
+    """It hides a part of the object, and is unknown in the masks."""
+    masks = capture.masks.clone()
+    masks[:, SIDE // 2 :] = UNKNOWN
+    held = training_views.frames(training_views.prepare(asset), dataclasses.replace(capture, masks=masks))
+    assert min(frame.iou for frame in held) > 0.95
+
+
 def test_the_advice_says_how_far_it_can_be_trusted() -> None:
     ones = torch.ones(N)
     observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.01, 0.01, 0.01]))
@@ -378,6 +416,21 @@ def test_light_that_is_fixed_to_the_object_comes_from_few_directions(asset: Asse
     assert handheld.lights[visible].mean() > 2 * static.lights[visible].mean()
     assert (handheld.views >= 0).all()
     assert (handheld.views <= 1).all()
+
+
+def test_a_lamp_to_the_right_of_the_camera_lights_the_right_side(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One frame, and one light, which is fixed to the camera; its direction is that of a texel of 11 degrees."""
+    monkeypatch.setattr(confidence, "N_LIGHTS", 1)
+    radiance = torch.full((32, 64, 3), 0.1)
+    radiance[15:17, 47:49] = 50.0  # right quarter: +x
+    lit = dataclasses.replace(asset, environment=Environment.from_radiance(radiance))
+    lit = dataclasses.replace(lit, trajectory=asset.trajectory.select([N // 2]))
+    found = confidence.confidence_of(lit, asset.camera)
+    x_cam = asset.trajectory.T_cam_obj[N // 2] @ asset.gaussians.means
+    visible, side = found.views > 0, x_cam[:, 0] / RADIUS
+    assert (found.lights[visible & (side > 0.2)] == 1).all()
+    assert (found.lights[visible & (side < -0.2)] == 0).all()
+    assert min((visible & (side * sign > 0.2)).sum() for sign in (1, -1)) > 100
 
 
 def test_the_brightest_directions_are_those_of_the_lights() -> None:
