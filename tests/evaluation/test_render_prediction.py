@@ -156,6 +156,25 @@ def test_without_the_alignment_each_part_scores_badly() -> None:
         }[part], part
 
 
+def test_relit_views_have_the_albedo_in_the_scale_of_the_truth() -> None:
+    """A run whose albedo is a half of the true one in red."""
+    asset, (capture, truth) = asset_under("camera"), mitsuba_truth("camera")
+    identity = Similarity(torch.ones(()), SO3.identity(), torch.zeros(3))
+    dark = asset.material.with_albedo(asset.material.albedo * torch.tensor([0.5, 1.0, 1.0]))
+    cfg = relight.Config(brdf_samples=8, light_samples=8)
+    found = [
+        render_prediction.predict_views(cfg, each, capture, truth, identity, names=NAMES)
+        for each in (asset, dataclasses.replace(asset, material=dark))
+    ]
+    albedo = [each.albedo for each in found]
+    assert albedo[0] is not None
+    assert albedo[1] is not None
+    torch.testing.assert_close(albedo[1][..., 0], 0.5 * albedo[0][..., 0], atol=0.01, rtol=0)
+    for name in truth.lights:
+        one, other = (each.relit[name].float() for each in found)
+        assert (one - other).abs().mean() < 0.5
+
+
 def test_under_drift_of_the_poses_the_object_is_rendered_in_its_place() -> None:
     """With orientations that drift by 12 degrees, the mean rotation, the scale and the shift are still right."""
     asset = asset_under("camera")
