@@ -12,7 +12,7 @@ import torch
 
 from tests.lopsided import Tumble, truth, tumbling
 from tests.poses.sfm.test_stage import QUICK, matches
-from tests.poses.test_background_removal import PRINT, film, result
+from tests.poses.test_background_removal import PRINT, N, film, result
 from tests.scene.test_visual_hull import silhouettes
 from tumble import actions, matching, pipeline, recipes
 from tumble.datasets import _capture_folder, folder
@@ -23,6 +23,7 @@ from tumble.export.asset import Preset
 from tumble.inverse_rendering import decompose, mean_colour_baseline, refine
 from tumble.io import files, tree, video
 from tumble.io.files import BadFile
+from tumble.maths.se3 import SE3
 from tumble.rendering import gbuffer
 from tumble.scene.asset import Asset
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, content_key, truth_without_views
@@ -293,6 +294,27 @@ def test_frames_of_a_film_are_found_in_its_capture_by_their_numbers(capture: Pat
     # Pictures with a model have names, not numbers.
     files.write_json(tmp_path / "capture" / "ingest.json", {"frames": [{"name": "0000.png", "source": "a.jpg"}]})
     assert actions.source_names(tmp_path, known) == tuple(kept)
+
+
+def test_stage_2_runs_again_from_other_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses that are given as a result of stage 1 are part of the key of stage 2, as are its camera and lost frames."""
+    scene = tumbling(N, size=64, points=10)
+    camera, T_cam_obj = scene.capture.camera, scene.T_cam_obj
+    moved = SE3(T_cam_obj.wxyz, T_cam_obj.xyz * 1.01)
+    first = result(camera, T_cam_obj)
+    others = result(camera, moved), result(camera.zoomed(1.01), T_cam_obj), result(camera, T_cam_obj, (3,))
+    keys: list[list[str]] = []
+
+    def stage(*arguments: Any) -> Any:
+        keys.append(arguments[-1])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "stage", stage)
+    for found in (first, first, *others):
+        with pytest.raises(KeyboardInterrupt):
+            pipeline.reconstruct(scene.capture, recipe=RECIPE, poses=found)
+    assert keys[0] == keys[1]
+    assert len({str(key) for key in keys}) == 4
 
 
 def test_background_in_the_masks_of_a_held_object_is_removed_after_stage_1(monkeypatch: pytest.MonkeyPatch) -> None:
