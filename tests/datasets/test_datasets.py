@@ -292,6 +292,15 @@ def test_masks_of_other_kinds_label_object_and_hand(masks: str, tmp_path: Path) 
         assert (labels[-12:][hand[-12:] & ~covered[-12:]] != BACKGROUND).all()
 
 
+def test_a_pixel_in_the_masks_of_both_object_and_hand_is_object(tmp_path: Path) -> None:
+    path = write_ho3d(tmp_path, ending=".png", masks="masks_XMem")
+    alone = ho3d.load(path).masks[2] == OBJECT
+    save(tmp_path / "masks_XMem" / "SM1_hand" / "0002.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    labels = ho3d.load(path).masks[2]
+    assert torch.equal(labels == OBJECT, alone)
+    assert torch.equal(labels == UNKNOWN, ~alone)
+
+
 def test_masks_beside_a_sequence_are_found_from_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_ho3d(tmp_path, ending=".png", masks="masks_XMem")
     monkeypatch.chdir(path)

@@ -19,6 +19,7 @@ from tumble.preprocess.check import Finding, check_footage, passes
 from tumble.preprocess.colour_model import hand_coloured_fraction
 from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.survey import Survey, survey_footage
+from tumble.preprocess.video_to_capture import select_frames
 from tumble.scene import BACKGROUND, OBJECT
 
 
@@ -125,6 +126,15 @@ def test_the_two_spoilt_frames_are_named(surveyed: Survey) -> None:
     assert "frame 6: the object is not found" in worst.state
     assert re.search(r"frame 14: 0\.\d times the area", worst.state)
     assert "--pick" in worst.advice
+
+
+def test_a_frame_with_a_doubtful_mask_is_not_selected(surveyed: Survey) -> None:
+    sure = select_frames(surveyed, OPTIONS)
+    confidence = surveyed.masks.confidence.copy()
+    confidence[sure[3]] = 0.1
+    found = select_frames(replace(surveyed, masks=replace(surveyed.masks, confidence=confidence)), OPTIONS)
+    assert sure[3] not in found
+    assert {sure[0], sure[-1]} <= set(found)
 
 
 def test_a_mask_with_a_hand_is_named(surveyed: Survey) -> None:
