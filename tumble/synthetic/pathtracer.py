@@ -71,14 +71,23 @@ def llvm_version(path: Path) -> int:
     return major.value
 
 
+def require_extra() -> None:
+    """Check that the extra `synth` is installed, without the import of Mitsuba, which writes into the home folder.
+
+    Raises:
+        ModuleNotFoundError: It is not; the message contains the command that installs it.
+    """
+    if any(importlib.util.find_spec(name) is None for name in ("mitsuba", "trimesh")):
+        raise ModuleNotFoundError("this needs Mitsuba: pip install 'tumble[synth]'")
+
+
 def mitsuba() -> Any:
     """The Mitsuba module with a variant set: LLVM if `find_llvm` finds a library, else scalar (about 7 times slower).
 
     Raises:
         ModuleNotFoundError: The extra `synth` is not installed; the message contains the command that installs it.
     """
-    if importlib.util.find_spec("mitsuba") is None:
-        raise ModuleNotFoundError("this needs Mitsuba: pip install 'tumble[synth]'")
+    require_extra()
     llvm = find_llvm()
     if llvm is not None:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(llvm[0])

@@ -109,11 +109,12 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
         ModuleNotFoundError: The extra `synth` is not installed.
     """
     outputs.claim_folder(out, SETTINGS_FILE, fix="choose another folder with -o")
-    pathtracer.mitsuba()
+    pathtracer.require_extra()
     # All inputs are read before anything is written.
     manifest = _manifest(model, options)
     parts = pathtracer.read_model(model, options.up)
     unexposed = _unexposed_lights(options)
+    pathtracer.mitsuba()
     context = _context(parts, out, options)
     resuming = _prepare_folder(out, manifest)
     frames = list(_frames(options, context.poses))
