@@ -5,7 +5,6 @@ line: they read the asset from the run and write their output into it.
 """
 
 import hashlib
-import importlib.util
 import itertools
 import math
 import tempfile
@@ -470,9 +469,6 @@ def export_run(
     folder = folder or out / run.EXPORT / preset
     asset = finished(out, device)
     names = run.frame_names(out, len(asset.trajectory))
-    if preset != "splat" and importlib.util.find_spec("xatlas") is None:
-        text = "this machine has no xatlas, which unwraps meshes: pip install xatlas, or use --preset splat"
-        raise ModuleNotFoundError(text)
     capture = None if preset == "splat" else _frames_of_run(out, asset)
     return export_asset(asset, folder, preset, names=names, scale_mm=scale_mm, capture=capture, overwrite=overwrite)
 

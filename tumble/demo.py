@@ -42,12 +42,13 @@ def unpack(out: Path) -> Path:
     if (out / "transforms.json").exists():
         return out
     # The package may be installed read-only: modes of its files and folders are not copied.
-    for path in bundled_folder().rglob("*"):
-        place = out / path.relative_to(bundled_folder())
+    bundled = bundled_folder()
+    for path in bundled.rglob("*"):
+        place = out / path.relative_to(bundled)
         if path.is_file() and path.name != "transforms.json":
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, place)
-    document = files.read_json(bundled_folder() / "transforms.json")
+    document = files.read_json(bundled / "transforms.json")
     names = [frame["file_path"] for frame in document["frames"] if frame["split"] == "train"]
     for name, values in zip(names, video.read_clip(out / CLIP), strict=True):
         files.write_png(files.path_inside(out, name), values)

@@ -50,6 +50,17 @@ ROTATIONS_TO_UP = {
 """Rotations of the object frame, row by row, that take each axis to +y."""
 
 
+class _WhitePixel(NamedTuple):
+    """A pixel that the user calls white or grey."""
+
+    column: int
+    row: int
+    name: str
+    """File name of its frame."""
+    shown: UInt8[Tensor, "3"]
+    """Its sRGB code values, also beside the object, where stages 2 and 3 see black."""
+
+
 def read_capture(path: Path | str) -> Capture:
     """Read the training frames of a capture folder, in any layout of `datasets` (docs/format.md).
 
@@ -73,17 +84,6 @@ def video_to_capture(path: Path | str, out: Path | str, options: FootageOptions 
         BadFile: The footage cannot be converted, or `out` exists; nothing is written then.
     """
     return to_capture(Path(path), Path(out), options or FootageOptions())
-
-
-class _WhitePixel(NamedTuple):
-    """A pixel that the user calls white or grey."""
-
-    column: int
-    row: int
-    name: str
-    """File name of its frame."""
-    shown: UInt8[Tensor, "3"]
-    """Its sRGB code values, also beside the object, where stages 2 and 3 see black."""
 
 
 def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
@@ -189,8 +189,9 @@ def reconstruct(
         return _upright(*_reconstruct(opened, capture, where, found, grey, device), up)
     out = Path(out)
     with run.exclusive_access(out):
-        keys = {"content": content_key(capture), "frames": content_key(replace(capture, trajectory=None))}
-        opened = run.open(out, where, recipe, **keys, report=progress)
+        content = content_key(capture)
+        frames = content if capture.trajectory is None else content_key(replace(capture, trajectory=None))
+        opened = run.open(out, where, recipe, content=content, frames=frames, report=progress)
         asset, names = _reconstruct(opened, capture, where, found, grey, device)
         asset = _upright(asset, names, up)
         _keep(asset, names, out)

@@ -57,9 +57,7 @@ class Workers:
 
     def __post_init__(self) -> None:
         if self.jobs < 0:
-            raise ValueError(
-                f"--jobs is out of range: {self.jobs}; give 1 or more, or 0 for as many as there are cores"
-            )
+            raise ValueError(f"--jobs is out of range: {self.jobs}; give 1 or more, or 0: as many as the cores allow")
 
 
 def execute(function: Callable[[T], R], tasks: Sequence[T], workers: Workers, logs: Path) -> Iterator[Outcome[T, R]]:

@@ -82,8 +82,11 @@ def write_asset(
 
     Raises:
         ValueError: A mesh is needed, but the Gaussians have no surface.
+        ModuleNotFoundError: A textured mesh is needed, but xatlas is not installed.
     """
     settings = PRESETS[preset]
+    if settings:
+        atlas.require_xatlas()
     with ThreadPoolExecutor(1) as beside:
         # The mesh is made by one thread most of the time.
         device = asset.gaussians.means.device

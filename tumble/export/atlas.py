@@ -6,6 +6,7 @@ they are placed one by one on a grid of *cells*, the largest first, each where i
 at the largest common scale at which all fit. Long charts are cut in two where this helps.
 """
 
+import importlib.util
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -68,6 +69,16 @@ class UnwrappedMesh:
     faces: Int[np.ndarray, "f 3"]
 
 
+def require_xatlas() -> None:
+    """Check that meshes can be unwrapped, before the work that would be lost.
+
+    Raises:
+        ModuleNotFoundError: xatlas is not installed; the message says how to go on.
+    """
+    if importlib.util.find_spec("xatlas") is None:
+        raise ModuleNotFoundError("xatlas, which unwraps meshes, is missing: pip install xatlas, or use --preset splat")
+
+
 def unwrap(mesh: Mesh, resolution: int) -> UnwrappedMesh:
     """The mesh with one set of texture coordinates without overlaps, of few charts that fill the texture.
 
@@ -105,6 +116,7 @@ class _Charts:
 
 
 def _charts(mesh: Mesh, resolution: int) -> _Charts:
+    require_xatlas()
     import xatlas
 
     atlas, normals, parts = xatlas.Atlas(), vertex_normals(mesh), []

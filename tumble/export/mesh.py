@@ -83,16 +83,18 @@ def surface(values: Float[np.ndarray, "a b c"], origin: float, cell: float) -> M
     from scipy import ndimage
 
     whole = remove_floaters(marching_tetrahedra(values, origin, cell))
+    tunnels = n_tunnels(whole)
     for sigma in SMOOTHED:
-        if n_tunnels(whole) <= MAX_TUNNELS:
+        if tunnels <= MAX_TUNNELS:
             break
         smoothed = ndimage.gaussian_filter(values, sigma)
         if smoothed.min() >= 0:
             break
         smoother = remove_floaters(marching_tetrahedra(smoothed, origin, cell))
-        if n_tunnels(smoother) > n_tunnels(whole) / 2:
+        left = n_tunnels(smoother)
+        if left > tunnels / 2:
             break
-        whole = smoother
+        whole, tunnels = smoother, left
     return whole
 
 

@@ -78,6 +78,11 @@ class FootageOptions:
     size: Suppress[int] = 256
     """Longer side of the capture's images [pixels]; they are never larger than in the video. Default: as for frames."""
 
+    @property
+    def first(self) -> int:
+        """Number of the first frame that is used."""
+        return self.part[0] if self.part else 0
+
     def __post_init__(self) -> None:
         if self.box is not None and self.click is not None:
             raise ValueError("--box and --click both mark the object: give only one of them")

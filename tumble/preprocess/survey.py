@@ -250,23 +250,22 @@ def _at_hands(images: np.ndarray, hands: Sequence[Sequence[Hand]]) -> Bool[np.nd
 def _read_scan(footage: Footage, options: FootageOptions) -> _Scan:
     small: list[tuple[FootageFrame, np.ndarray]] = []
     stride, lens, scale = 1, None, 1.0
-    first = options.part[0] if options.part else 0
     for frame in read_frames(footage, part=options.part, invert_masks=options.invert_masks):
         height, width = frame.image.shape[:2]
         if lens is None:
             lens, scale = lens_of(footage, options, height, width), min(SURVEY_SIDE / max(height, width), 1.0)
-        if frame.number - first >= MAX_FRAMES:
+        if frame.number - options.first >= MAX_FRAMES:
             raise BadFile(
                 footage.path, f"has more than {MAX_FRAMES} frames", "give --part, in which the object is turned"
             )
-        if (frame.number - first) % stride:
+        if (frame.number - options.first) % stride:
             continue
         small.append(_downsample(undistort_frame(frame, lens), scale))
         if len(small) > MAX_SURVEY_FRAMES:
             small, stride = small[::2], 2 * stride
     if lens is None:
         raise BadFile(footage.path, "has no frames")
-    _check_box_and_click(footage, options, lens.camera, range(first, small[-1][0].number + stride))
+    _check_box_and_click(footage, options, lens.camera, range(options.first, small[-1][0].number + stride))
     kept = [frame for frame, _ in small]
     with_masks = [frame.mask for frame in kept if frame.mask is not None]
     if with_masks and len(with_masks) < len(kept):

@@ -37,7 +37,15 @@ SHADED = (
     "The exposure was measured on the background and corrected, so that a hand or a person shades the object, or poses "
     "are wrong."
 )
-"""Why photos of a film are not as bright as their renders."""
+UNEVEN = {
+    True: {"warn": SHADED, "bad": f"{SHADED} Look at the frames with high bars."},
+    False: {
+        "warn": "Lock exposure and white balance when you record.",
+        "bad": "Exposure was automatic, or the light changed while recording. Lock exposure and white balance, and "
+        "record again.",
+    },
+}
+"""Why photos are not as bright as their renders, by whether their exposure was corrected, and by the rating."""
 MIN_LIGHT_DIRECTIONS = N_LIGHTS + 1
 """Number of light directions below which a point counts as lit from few directions: light that is fixed to the object
 gives at most one per bright light, `N_LIGHTS` in all."""
@@ -144,15 +152,8 @@ def _brightness_row(frames: Sequence[RenderedFrame], corrected: bool) -> Row:
     rating, median = _lower_is_better(drift, LIMITS["exposure"]), statistics.median(known)
     sentence = {
         "good": "All photos are about equally bright, compared with their renders.",
-        "warn": "Some photos are brighter than others, compared with their renders. "
-        + (SHADED if corrected else "Lock exposure and white balance when you record."),
-        "bad": "The photos are brighter and darker than their renders. "
-        + (
-            f"{SHADED} Look at the frames with high bars."
-            if corrected
-            else "Exposure was automatic, or the light changed while recording. Lock exposure and white balance, and "
-            "record again."
-        ),
+        "warn": f"Some photos are brighter than others, compared with their renders. {UNEVEN[corrected]['warn']}",
+        "bad": f"The photos are brighter and darker than their renders. {UNEVEN[corrected]['bad']}",
     }[rating]
     bars = tuple(abs(value - median) for value in values)
     marks: tuple[CardRating, ...] = tuple(

@@ -138,7 +138,7 @@ def capture_of_run(out: Path, asset: Asset, path: Path) -> RunCapture:
     whole, known = reader_for(path).load(path), run.frames_key(out)
     if known and content_key(replace(whole, trajectory=None)) != known:
         rule = "is not the capture of this run, or its images, masks or camera have changed since"
-        raise BadFile(path, rule, "give the right one with --capture, or run the capture again")
+        raise BadFile(path, rule, "run the capture again, or give `tumble report` the right one with --capture")
     tracked, masked = background_removal.stored_result(out, whole)
     frames = frames_of_run(masked, asset, run.frame_names(out, len(asset.trajectory)), path)
     return RunCapture(whole, tracked, masked, frames)

@@ -16,7 +16,7 @@ from torch import Tensor
 from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
 from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult
 from tumble.poses.sfm import bundle_adjustment, relocalization
-from tumble.poses.sfm.frontier_points import Contours, tangencies_of_pairs
+from tumble.poses.sfm.frontier_points import Contours, EpipolarTangencies, epipolar_tangencies, tracks_at
 from tumble.poses.sfm.relocalization import ContourConstraints
 from tumble.poses.sfm.symmetry import MirrorSymmetry, texture_information
 from tumble.poses.sfm.tracks import Tracks
@@ -34,6 +34,8 @@ MIN_INLIERS = 8
 """Number of inliers below which a frame is lost if its contour or its observations contradict its pose."""
 MAX_RESIDUAL = 6.0
 """Median reprojection error above which a frame's observations contradict its pose [pixels]."""
+MAX_PAIRS = 50_000
+"""Number of pairs of frames whose contours are compared at once, which takes 270 MiB."""
 MIN_TRIANGULATION_ANGLE = 0.5
 """Minimum angle between two optical axes, and between one and the reverse of the other, for their frontier points to
 be triangulated [radians]."""
@@ -189,7 +191,13 @@ def _frontier_points(
     n = len(solution.R)
     i, j = torch.triu_indices(n, n, 1)
     pairs = torch.stack([i, j], 1)
-    found = tangencies_of_pairs(solution.R, solution.t, capture.camera, contours, radius=solution.radius, pairs=pairs)
+    parts = []
+    for some in pairs.split(MAX_PAIRS):
+        pose_a, pose_b = ((solution.R[k], solution.t[k]) for k in some.T)
+        contours_a, contours_b = (contours[k] for k in some.T)
+        part = epipolar_tangencies(pose_a, pose_b, contours_a, contours_b, capture.camera, radius=solution.radius)
+        parts.append(vars(part).values())
+    found = EpipolarTangencies(*(torch.cat(each) for each in zip(*parts, strict=True)))
     table = torch.full((n, n, 2), torch.nan, dtype=torch.float64)
     table[i, j] = table[j, i] = torch.where(found.valid, found.gap.abs(), torch.nan)
     gap = table.flatten(1).nanmedian(1).values
@@ -198,11 +206,7 @@ def _frontier_points(
     wide = (angle > MIN_TRIANGULATION_ANGLE) & (angle < torch.pi - MIN_TRIANGULATION_ANGLE)
     max_gap = 2 * gap[~gap.isnan()].median().clamp_min(MIN_MEDIAN_GAP)
     chosen = found.valid & wide[:, None] & (found.gap.abs() < max_gap)
-    frames = pairs[:, None].expand(-1, 2, -1)[chosen]
-    uv_i, uv_j = contours.vertices[i[:, None], found.vertex_i], contours.vertices[j[:, None], found.vertex_j]
-    uv = torch.stack([uv_i, uv_j], 2)[chosen]
-    point = torch.arange(len(frames)).repeat_interleave(2)
-    tracks = Tracks(frames.reshape(-1), point, uv.reshape(-1, 2))
+    tracks = tracks_at(found, contours, pairs, chosen)
     radius = torch.full((n,), solution.radius, dtype=torch.float64)
     return gap, bundle_adjustment.triangulate(tracks, solution.R, solution.t, capture.camera, radius)
 

@@ -29,8 +29,6 @@ A closer baseline may pierce the object, which then has no tangent epipolar plan
 """
 MIN_VIEW_ANGLE = 0.15
 """Minimum angle between the optical axes of two frames [radians]; closer views hardly constrain each other."""
-MAX_PAIRS = 50_000
-"""Number of pairs of frames that are compared at once, which takes 270 MiB."""
 MARGIN = 2
 """Distance to the image border or to an unknown pixel within which a contour may be truncated [pixels]."""
 MAX_BAND = 3
@@ -148,23 +146,6 @@ def epipolar_tangencies(
     return EpipolarTangencies(extremes[0], extremes[1], gap, valid[:, None] & reliable)
 
 
-def tangencies_of_pairs(
-    R: Float[Tensor, "c 3 3"],
-    t: Float[Tensor, "c 3"],
-    camera: Camera,
-    contours: Contours,
-    *,
-    radius: float,
-    pairs: Int64[Tensor, "p 2"],
-) -> EpipolarTangencies:
-    """Tangent epipolar planes of pairs of frames; arguments as for `frontier_tracks`."""
-    parts = [
-        epipolar_tangencies((R[i], t[i]), (R[j], t[j]), contours[i], contours[j], camera, radius=radius)
-        for i, j in (some.T for some in pairs.split(MAX_PAIRS))
-    ]
-    return EpipolarTangencies(*(torch.cat(each) for each in zip(*(vars(part).values() for part in parts), strict=True)))
-
-
 def frontier_tracks(
     R: Float[Tensor, "c 3 3"],
     t: Float[Tensor, "c 3"],
@@ -185,9 +166,22 @@ def frontier_tracks(
         pairs: Indices into the frames; `Tracks.frame` has the same indices.
     """
     i, j = pairs.T
-    tangencies = tangencies_of_pairs(R, t, camera, contours, radius=radius, pairs=pairs)
-    frames = pairs[:, None].expand(-1, 2, -1)[tangencies.valid]
-    uv_i, uv_j = contours.vertices[i[:, None], tangencies.vertex_i], contours.vertices[j[:, None], tangencies.vertex_j]
-    uv = torch.stack([uv_i, uv_j], 2)[tangencies.valid]
+    found = epipolar_tangencies((R[i], t[i]), (R[j], t[j]), contours[i], contours[j], camera, radius=radius)
+    return tracks_at(found, contours, pairs, found.valid)
+
+
+def tracks_at(
+    found: EpipolarTangencies, contours: Contours, pairs: Int64[Tensor, "p 2"], chosen: Bool[Tensor, "p 2"]
+) -> Tracks:
+    """The chosen frontier points of pairs of frames, as tracks of two observations each.
+
+    Args:
+        contours: Contours of all frames.
+        pairs: Indices into the frames, for which the tangencies were found.
+    """
+    i, j = pairs.T
+    frames = pairs[:, None].expand(-1, 2, -1)[chosen]
+    uv_i, uv_j = contours.vertices[i[:, None], found.vertex_i], contours.vertices[j[:, None], found.vertex_j]
+    uv = torch.stack([uv_i, uv_j], 2)[chosen]
     point = torch.arange(len(frames)).repeat_interleave(2)
     return Tracks(frames.reshape(-1), point, uv.reshape(-1, 2))

@@ -124,7 +124,6 @@ def sharpest_frame(path: Path, options: FootageOptions) -> FootageFrame:
     """The undistorted frame `options.at`, or if that is 0 the sharpest of the first `N_CANDIDATES` that are used."""
     opened = footage.open_footage(path, options.masks)
     best, highest = None, -1.0
-    first = options.part[0] if options.part else 0
     for frame in footage.read_frames(opened, part=options.part):
         if frame.mask is not None:
             raise BadFile(path, "has masks, so no box is needed", "leave --pick out")
@@ -133,7 +132,7 @@ def sharpest_frame(path: Path, options: FootageOptions) -> FootageFrame:
         sharpness = float(cv2.Laplacian(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
         if sharpness > highest:
             best, highest = frame, sharpness
-        if frame.number >= (options.at or first + N_CANDIDATES - 1):
+        if frame.number >= (options.at or options.first + N_CANDIDATES - 1):
             break
     if best is None:
         raise BadFile(path, f"has no frame {options.at}" + (" in --part" if options.part else ""))
