@@ -69,9 +69,9 @@ class Adjustment:
     auto: up in the first frame, or the axis of a turntable. -y: turned over (write --up=-y); so x, -x, z, -z.
     FRAME: up in this frame, such as 0012.png."""
     white: Annotated[tuple[int, int, str] | None, arg(metavar="X Y FRAME", help_behavior_hint="")] = None
-    """A pixel of the capture's images that shows a neutral white or grey, on the object or (where the capture keeps the
-    whole photos, as of films with hands) on a card beside it that faces the camera: column, row [pixels], frame, such
-    as 0012.png. It sets the colour of the light, which else is taken to be about neutral."""
+    """A neutral white or grey pixel of the capture's images: column, row [pixels], frame, such as 0012.png. It is
+    on the object or, where the capture keeps whole photos (films with hands), on a card beside it that faces
+    the camera. It sets the colour of the light, which else is taken to be about neutral."""
 
 
 @dataclass(frozen=True)
