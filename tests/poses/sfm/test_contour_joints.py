@@ -83,17 +83,17 @@ def test_parts_of_which_little_is_seen_are_not_joined(observed: Observed) -> Non
 
 
 @pytest.mark.parametrize(
-    ("cost", "seen", "second", "accepted"),
+    ("second", "gaps", "gap_cost", "accepted"),
     [
-        (0.05, 0.5, math.inf, True),
-        (0.05, 0.5, 0.11, True),
-        (0.05, 0.5, 0.09, False),  # another rotation agrees nearly as well, as half a revolution of a bottle does
-        (0.25, 0.5, math.inf, False),
-        (0.05, 0.2, math.inf, False),
+        (math.inf, 120, 0.1, True),
+        (0.11, 120, 0.1, True),
+        (0.09, 120, 0.1, False),  # another rotation agrees nearly as well, as half a revolution of a bottle does
+        (math.inf, 120, 0.25, False),
+        (math.inf, 60, 0.1, False),
     ],
 )
-def test_a_joint_is_accepted_if_it_is_certain(cost: float, seen: float, second: float, accepted: bool) -> None:
-    assert ContourJoint(half(range(12)), cost, seen, second).accepted == accepted
+def test_a_joint_is_accepted_if_it_is_certain(second: float, gaps: int, gap_cost: float, accepted: bool) -> None:
+    assert ContourJoint(half(range(12)), 0.05, second, gaps, gap_cost).accepted == accepted
 
 
 def test_contours_correct_a_joint_that_few_keypoints_suggest(observed: Observed) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.lopsided import DISTANCE, Tumble, tumbling
-from tumble.maths.se3 import SO3
+from tumble.maths.se3 import SE3, SO3
 from tumble.poses.sfm import frontier_points, relocalization
 from tumble.poses.sfm.frontier_points import Contours
 from tumble.preprocess.segmentation import make_trimap
@@ -58,6 +58,49 @@ def test_a_wrong_rotation_increases_the_gaps(scene: Tumble) -> None:
     )
     gap_true, gap_wrong = constraints.gaps(torch.stack([R[5], wrong[5]]), t[[5, 5]]).abs().nanmedian(1).values
     assert gap_wrong > 3 * gap_true
+
+
+def dumbbell_in_a_hand(scene: Tumble) -> Capture:
+    """A large and a small ball on a stick; in every other frame a hand hides all of the large one."""
+    camera = scene.capture.camera
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack([columns, rows], -1) + 0.5
+
+    def disc(pose: SE3, centre: tuple[float, float, float], radius: float) -> torch.Tensor:
+        x = pose @ torch.tensor(centre, dtype=torch.float64)
+        return (pixels - camera.project(x)).norm(dim=-1) < radius * float(camera.fx_fy_cx_cy[0] / x[2])
+
+    masks = torch.zeros_like(scene.capture.masks)
+    for k, mask in enumerate(masks):
+        pose = scene.T_cam_obj[k]
+        for x, radius in ((-0.45, 0.2), (-0.25, 0.06), (-0.15, 0.06), (0.25, 0.45)):
+            mask[disc(pose, (x, 0.0, 0.0), radius)] = OBJECT
+        if k % 2:
+            mask[disc(pose, (0.25, 0.0, 0.0), 0.48)] = UNKNOWN
+    return replace(scene.capture, masks=masks)
+
+
+def test_tangents_beyond_which_a_hand_may_hide_the_object_do_not_count(scene: Tumble) -> None:
+    """The small ball has extremes in all directions, most of which the large one exceeds."""
+    R, t = poses(scene)
+    contours = frontier_points.convex_contours(dumbbell_in_a_hand(scene))
+    i, j = all_pairs(24).T
+
+    def tangencies(R: torch.Tensor, contours: Contours) -> frontier_points.EpipolarTangencies:
+        camera = scene.capture.camera
+        return frontier_points.epipolar_tangencies(
+            (R[i], t[i]), (R[j], t[j]), contours[i], contours[j], camera, radius=RADIUS
+        )
+
+    naive, found = tangencies(R, replace(contours, outer=None)), tangencies(R, contours)
+    assert naive.gap[naive.valid].abs().max() / DISTANCE > 20
+    assert found.valid.sum() > 200
+    assert found.gap[found.valid].abs().max() / DISTANCE < 1
+    assert found.conflict.nan_to_num().abs().max() / DISTANCE < 1
+    turned = R.clone()
+    turned[5] = SO3.exp(torch.tensor([0.0, 0.5, 0.3], dtype=torch.float64)).matrix() @ R[5]
+    conflict = tangencies(turned, contours).conflict[(i == 5) | (j == 5)]
+    assert conflict.nan_to_num().abs().max() / DISTANCE > 3
 
 
 def test_frontier_points_lie_on_both_contours(scene: Tumble) -> None:

@@ -76,12 +76,26 @@ def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
     assert gaps > 50
     assert right < 0.1
     assert wrong > 5 * right
-    assert Joint(second, 50, 0.6, 3, right, gaps, True).accepted
-    assert not Joint(second, 50, 0.6, 3, 2.0, gaps, True).accepted
-    assert not Joint(second, 30, 0.6, 3, right, gaps, True).accepted
-    assert not Joint(second, 50, 0.4, 3, right, gaps, True).accepted
-    assert Joint(second, 110, 0.4, 3, right, gaps, True).accepted
-    assert not Joint(second, 50, 0.6, 3, 0.0, 9, True).accepted
+
+
+@pytest.mark.parametrize(
+    ("keypoints", "share", "frames", "cost", "gaps", "accepted"),
+    [
+        (50, 0.6, 3, 0.5, 80, True),
+        (50, 0.6, 3, 2.0, 80, False),  # contours contradict it
+        (50, 0.6, 3, 2.0, 9, True),  # too few to contradict it
+        (50, 0.4, 3, 0.5, 80, False),
+        (110, 0.4, 3, 0.5, 80, True),
+        (50, 0.2, 1, 0.1, 80, True),  # contours confirm it
+        (50, 0.2, 1, 0.1, 70, False),  # too few to confirm it
+        (30, 0.6, 3, 0.1, 80, False),
+    ],
+)
+def test_keypoints_and_contours_decide_together(
+    keypoints: int, share: float, frames: int, cost: float, gaps: int, accepted: bool
+) -> None:
+    part = Partial((0,), torch.eye(3)[None].double(), torch.zeros(1, 3).double())
+    assert Joint(part, keypoints, share, frames, cost, gaps, True).accepted == accepted
 
 
 def test_a_jump_of_the_motion_is_the_last_resort() -> None:

@@ -1,6 +1,7 @@
 """Joining two parts of a capture that share no texture: by their contours, where one follows the other in time.
 
-The contours of all pairs of frames of two parts together leave few ways to put one into the other (epipolar tangency).
+The contours of all pairs of frames of two parts together leave few ways to put one into the other (epipolar tangency),
+and what one frame shows must be possible behind what hides the object in the other.
 They cannot tell a bottle from the same bottle after half a revolution, nor a box from one after a quarter; but the
 motion goes on where the first part ends, so that smaller rotations are likely there.
 
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
 from tumble.poses.sfm.bundle_adjustment import MIN_DEPTH
-from tumble.poses.sfm.frontier_points import epipolar_tangencies
+from tumble.poses.sfm.frontier_points import EpipolarTangencies, epipolar_tangencies
 from tumble.poses.sfm.partial import GAP_SCALE, Observed, Partial
 from tumble.poses.sfm.relocalization import JACOBIAN_STEP, candidate_rotations, damped_step, robust_cost
 
@@ -37,11 +38,11 @@ REFINED = 16
 STEPS = 16
 """Levenberg-Marquardt steps per hypothesis."""
 MAX_COST = 0.2
-"""Cost of contours above which they do not confirm a joint: that of gaps of 1.4 pixels. Within a part it is 0.02 to
-0.07; wrong joints of the synthetic film of the mustard bottle have 0.3 to 0.8."""
-MIN_SEEN = 0.25
-"""Fraction of valid gaps below which hands hide too much of the contours. A joint of the synthetic film of the knight
-with 0.21 costs 0.12 and is 25 degrees off; right ones of the bottle's have 0.28 to 0.32."""
+"""Cost of valid gaps above which contours do not confirm a joint: that of gaps of 1.4 pixels. Within a part it is 0.02
+to 0.07; wrong joints of the synthetic film of the mustard bottle have 0.3 to 0.8."""
+MIN_GAPS = 75
+"""Number of valid gaps below which hands hide too much of the contours. Joints of the synthetic films of the bottle and
+the knight with 45 to 55 of these are 12 to 20 degrees off, with 86 and 107 3 and 8 degrees."""
 MIN_RATIO = 2.0
 """Cost of the best joint with another rotation over that of the best, below which it is not certain which is right."""
 OTHER_ROTATION = math.radians(30)
@@ -58,11 +59,13 @@ class ContourJoint:
 
     part: Partial
     cost: float
-    """Mean robust cost of the tangency gaps between both parts."""
-    seen: float
-    """Fraction of the tangency gaps that are valid, as the contours on both sides are seen there."""
+    """Mean robust cost of the tangency gaps between both parts, and of conflicts where there is no valid gap."""
     second: float
     """Lowest cost with another rotation; infinite if there is none."""
+    gaps: int
+    """Number of tangency gaps that are valid, as the contours on both sides are seen there."""
+    gap_cost: float
+    """Mean robust cost of these alone."""
 
     @property
     def strength(self) -> float:
@@ -72,7 +75,7 @@ class ContourJoint:
     @property
     def accepted(self) -> bool:
         """Whether contours confirm that the two parts belong together in this way, and in no other."""
-        return self.seen >= MIN_SEEN and self.cost <= MAX_COST and self.second >= MIN_RATIO * self.cost
+        return self.gaps >= MIN_GAPS and self.gap_cost <= MAX_COST and self.second >= MIN_RATIO * self.cost
 
 
 def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJoint | None:
@@ -86,8 +89,8 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     R_new_obj = (turns @ other.R[q]).mT @ part.R[p]
     pairs = _Pairs.of(observed, part, other)
     start = R_new_obj, R_new_obj.new_zeros(len(turns), 4)
-    best = robust_cost(pairs.gaps(start), GAP_SCALE).argsort()[:REFINED]
-    (R_new_obj, rest), cost = _refined(pairs.gaps, (start[0][best], start[1][best]))
+    best = robust_cost(pairs.residuals(start), GAP_SCALE).argsort()[:REFINED]
+    (R_new_obj, rest), cost = _refined(pairs.residuals, (start[0][best], start[1][best]))
     step = angle_between(SO3.from_matrix(part.R[p] @ R_new_obj.mT), SO3.from_matrix(other.R[q]))
     cost = torch.where(step <= MAX_TURN, cost, torch.inf)
     k = int(cost.argmin())
@@ -95,9 +98,9 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
         return None
     differs = angle_between(SO3.from_matrix(R_new_obj), SO3.from_matrix(R_new_obj[k])) > OTHER_ROTATION
     second = float(torch.where(differs, cost, torch.inf).min())
-    moved = moved_part(part, (R_new_obj, rest), k)
-    seen = float((~pairs.gaps((R_new_obj[k : k + 1], rest[k : k + 1])).isnan()).double().mean())
-    return ContourJoint(moved, float(cost[k]), seen, second)
+    gaps = pairs.valid_gaps((R_new_obj[k : k + 1], rest[k : k + 1]))
+    gap_cost = float(robust_cost(gaps[None], GAP_SCALE)[0])
+    return ContourJoint(moved_part(part, (R_new_obj, rest), k), float(cost[k]), second, len(gaps), gap_cost)
 
 
 def moved_part(part: Partial, motion: Similarity, k: int) -> Partial:
@@ -146,7 +149,7 @@ def fitted_to_both(
 
     def residuals(motion: Similarity) -> Float[Tensor, "h n"]:
         errors = seen.errors(observed, part, motion) + of_others
-        return torch.cat([pairs.gaps(motion), errors.flatten(1)], 1)
+        return torch.cat([pairs.residuals(motion), errors.flatten(1)], 1)
 
     return _refined(residuals, start)[0]
 
@@ -169,8 +172,21 @@ class _Pairs:
         """Those of some frames of each, spread evenly."""
         return _Pairs(observed, *(each.select(_spread(len(each))) for each in (part, other)))
 
-    def gaps(self, motion: Similarity) -> Float[Tensor, "h n"]:
-        """Tangency gaps after each motion of the part [pixels]; NaN where they are not valid."""
+    def residuals(self, motion: Similarity) -> Float[Tensor, "h n"]:
+        """Tangency gaps after each motion of the part, or conflicts where they are not valid [pixels].
+
+        What one frame shows may contradict a motion also where the other frame's contour is hidden. NaN where two views
+        are not suitable.
+        """
+        return self._tangencies(motion).residual.reshape(len(motion[0]), -1)
+
+    def valid_gaps(self, motion: Similarity) -> Float[Tensor, " n"]:
+        """Valid tangency gaps after a single motion of the part [pixels]."""
+        found = self._tangencies(motion)
+        return found.gap[found.valid]
+
+    def _tangencies(self, motion: Similarity) -> EpipolarTangencies:
+        """The tangent planes of all pairs of frames, after each motion of the part."""
         (R, t), inputs = _moved(self.part, motion), self.observed.inputs
         h, a, b = len(R), len(self.part), len(self.other)
 
@@ -182,7 +198,7 @@ class _Pairs:
 
         frames_a = torch.tensor(self.part.frames)[:, None].expand(h, a, b).flatten()
         frames_b = torch.tensor(self.other.frames).expand(h, a, b).flatten()
-        found = epipolar_tangencies(
+        return epipolar_tangencies(
             (of_part(R), of_part(t)),
             (of_other(self.other.R), of_other(self.other.t)),
             inputs.contours[frames_a],
@@ -190,7 +206,6 @@ class _Pairs:
             inputs.capture.camera,
             radius=inputs.radius,
         )
-        return torch.where(found.valid, found.gap, torch.nan).reshape(h, -1)
 
 
 def _moved(part: Partial, motion: Similarity) -> tuple[Float[Tensor, "h f 3 3"], Float[Tensor, "h f 3"]]:

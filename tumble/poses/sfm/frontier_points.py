@@ -7,14 +7,18 @@ depend on shading or highlights.
 
 The tangent vertices are found for given poses and then treated as matches. As the poses change, the true tangent points
 slide along the contours, to first order along the epipolar lines, so that matches kept fixed add no first-order error.
+
+What is seen of an object behind a hand also has tangents, but the object may go on beyond them behind the hand. A
+tangent therefore only counts where it is also that of the object together with what may hide the rest of it.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 
 from tumble.poses.sfm.tracks import Tracks
@@ -30,7 +34,8 @@ A closer baseline may pierce the object, which then has no tangent epipolar plan
 MIN_VIEW_ANGLE = 0.15
 """Minimum angle between the optical axes of two frames [radians]; closer views hardly constrain each other."""
 MARGIN = 2
-"""Distance to the image border or to an unknown pixel within which a contour may be truncated [pixels]."""
+"""Distance to the image border or to an unknown pixel within which a contour may be truncated, and by which what may
+be hidden may reach beyond a tangent [pixels]."""
 MAX_BAND = 3
 """Maximum width of a band of unknown pixels that follows a silhouette [pixels]; an occluding hand is wider."""
 
@@ -43,10 +48,14 @@ class Contours:
     """Positions in the image [pixels]."""
     reliable: Bool[Tensor, "c v"]
     """Whether the object ends at the vertex, rather than being occluded or cut off by the image border."""
+    outer: Float[Tensor, "c v 2"] | None = None
+    """The same polygons of silhouettes together with unknown pixels that may hide more of the object [pixels]; None if
+    nothing does."""
 
     def __getitem__(self, frames: Tensor) -> "Contours":
         """The contours of some frames."""
-        return Contours(self.vertices[frames], self.reliable[frames])
+        outer = None if self.outer is None else self.outer[frames]
+        return Contours(self.vertices[frames], self.reliable[frames], outer)
 
 
 @dataclass(frozen=True)
@@ -60,7 +69,15 @@ class EpipolarTangencies:
     gap: Float[Tensor, "p 2"]
     """Signed distance at the object between the planes tangent to either contour, 0 for true poses [pixels]."""
     valid: Bool[Tensor, "p 2"]
-    """Whether the two views are suitable and both tangent vertices are reliable."""
+    """Whether the two views are suitable, both tangent vertices are reliable, and nothing may be hidden beyond them."""
+    conflict: Float[Tensor, "p 2"]
+    """Signed distance by which one frame shows more of the object than the other may hide [pixels]; 0 if all that is
+    seen is possible, NaN if the two views are not suitable."""
+
+    @property
+    def residual(self) -> Float[Tensor, "p 2"]:
+        """The gap where both tangents are known, else the conflict; NaN where neither is [pixels]."""
+        return torch.where(self.valid, self.gap, self.conflict)
 
 
 def fill_boundary_bands(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]:
@@ -85,22 +102,52 @@ def fill_boundary_bands(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]
 def convex_contours(capture: Capture) -> Contours:
     """Contours of all frames; no vertex is reliable in a frame without the object."""
     height, width = capture.camera.height, capture.camera.width
-    vertices, reliable = [], []
+    vertices, outer, reliable = [], [], []
+    reach = _reach(capture.masks.numpy())
     for mask in capture.masks.numpy():
-        pixels = np.argwhere(mask == OBJECT)[:, [1, 0]].astype(np.int32)
-        if len(pixels) < 3:
+        inside = mask == OBJECT
+        if inside.sum() < 3:
             vertices.append(torch.zeros(VERTICES, 2))
+            outer.append(torch.zeros(VERTICES, 2))
             reliable.append(torch.zeros(VERTICES, dtype=torch.bool))
             continue
-        hull: np.ndarray = np.asarray(cv2.convexHull(np.ascontiguousarray(pixels)))[:, 0]
-        hull = hull[np.linspace(0, len(hull) - 1, VERTICES).round().astype(int)]
+        hull = _hull(inside)
         kernel = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
         unknown: np.ndarray = np.asarray(cv2.dilate((mask == UNKNOWN).astype(np.uint8), kernel))
         occluded = unknown[hull[:, 1], hull[:, 0]] > 0
         cut_off = ((hull < MARGIN) | (hull >= np.array([width, height]) - MARGIN)).any(1)
         vertices.append(torch.from_numpy(hull + 0.5).float())
+        outer.append(torch.from_numpy(_hull(_possible(mask, reach)) + 0.5).float())
         reliable.append(torch.from_numpy(~occluded & ~cut_off))
-    return Contours(torch.stack(vertices).double(), torch.stack(reliable))
+    same = torch.equal(torch.stack(vertices), torch.stack(outer))
+    return Contours(
+        torch.stack(vertices).double(), torch.stack(reliable), None if same else torch.stack(outer).double()
+    )
+
+
+def _reach(masks: UInt8[np.ndarray, "t h w"]) -> float:
+    """Distance from what is seen of the object up to which more of it may be hidden [pixels].
+
+    Twice the diameter of a disc of the same area, as a bottle is longer than that and some of it is always hidden.
+    """
+    areas = [area for mask in masks if (area := int((mask == OBJECT).sum()))]
+    return 4 * math.sqrt(float(np.median(areas)) / math.pi) if areas else 0.0
+
+
+def _possible(mask: UInt8[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the object, and unknown ones behind which it may go on: connected to it and near."""
+    inside = mask == OBJECT
+    distance = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5))
+    either = inside | ((mask == UNKNOWN) & (distance <= reach))
+    component = np.asarray(cv2.connectedComponents(either.astype(np.uint8))[1])
+    return either & np.isin(component, np.unique(component[inside]))
+
+
+def _hull(inside: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "v 2"]:
+    """Convex hull of pixels, as a polygon of `VERTICES` of its corners."""
+    pixels = np.ascontiguousarray(np.argwhere(inside)[:, [1, 0]].astype(np.int32))
+    hull: np.ndarray = np.asarray(cv2.convexHull(pixels))[:, 0]
+    return hull[np.linspace(0, len(hull) - 1, VERTICES).round().astype(int)]
 
 
 def epipolar_tangencies(
@@ -132,18 +179,36 @@ def epipolar_tangencies(
     offset = offset / distance.clamp_min(1e-9)[:, None]
     plane_axes = torch.stack([torch.linalg.cross(baseline, offset), -offset], -1)
     focal, principal = camera.fx_fy_cx_cy.double().split(2)
-    angles = []
+    pixels = (distance * focal.prod().sqrt())[:, None]
+    vertices, inner, outer = [], [], []
+    suitable, reliable = valid[:, None], valid[:, None]
     for (R, _), contours in ((pose_i, contours_i), (pose_j, contours_j)):
-        xy = (contours.vertices - principal) / focal
-        # Angle of the epipolar plane of each vertex about the baseline; 0 is the plane through the object's centre.
         axes = R @ plane_axes
-        x = xy @ axes[:, :2] + axes[:, 2:]
-        angles.append(torch.atan2(x[..., 0], x[..., 1]))
-    extremes = [torch.stack([angle.argmax(1), angle.argmin(1)], 1) for angle in angles]
-    reliable = contours_i.reliable.gather(1, extremes[0]) & contours_j.reliable.gather(1, extremes[1])
-    extreme_angles = [angle.gather(1, extreme) for angle, extreme in zip(angles, extremes, strict=True)]
-    gap = (extreme_angles[0] - extreme_angles[1]) * (distance * focal.prod().sqrt())[:, None]
-    return EpipolarTangencies(extremes[0], extremes[1], gap, valid[:, None] & reliable)
+        angles = _plane_angles((contours.vertices - principal) / focal, axes)
+        vertices.append(torch.stack([angles.argmax(1), angles.argmin(1)], 1))
+        inner.append(angles.gather(1, vertices[-1]))
+        if contours.outer is not None:
+            angles = _plane_angles((contours.outer - principal) / focal, axes)
+        outer.append(torch.stack([angles.amax(1), angles.amin(1)], 1))
+        reliable = reliable & contours.reliable.gather(1, vertices[-1])
+        reliable = reliable & ((outer[-1] - inner[-1]).abs() * pixels <= MARGIN)
+        suitable = suitable & contours.reliable.any(1)[:, None]
+    side = torch.tensor([1.0, -1.0], dtype=pixels.dtype)
+    beyond = [(side * (inner[a] - outer[b])).clamp_min(0) for a, b in ((0, 1), (1, 0))]
+    conflict = torch.where(suitable, side * (beyond[0] - beyond[1]) * pixels, torch.nan)
+    return EpipolarTangencies(vertices[0], vertices[1], (inner[0] - inner[1]) * pixels, reliable, conflict)
+
+
+def _plane_angles(xy: Float[Tensor, "p v 2"], axes: Float[Tensor, "p 3 2"]) -> Float[Tensor, "p v"]:
+    """Angles about the baseline of the epipolar planes of contour vertices [radians].
+
+    Args:
+        xy: Their positions in the image plane at depth 1.
+        axes: Axes of the angles, camera frame; the second one points from the baseline to the object's centre, whose
+            plane has the angle 0.
+    """
+    x = xy @ axes[:, :2] + axes[:, 2:]
+    return torch.atan2(x[..., 0], x[..., 1])
 
 
 def frontier_tracks(

@@ -66,12 +66,11 @@ class ContourConstraints:
         h, n = len(R), len(self.reference_poses[0])
         candidate = torch.arange(h).repeat_interleave(n)
         reference = torch.arange(n).repeat(h)
-        contour = Contours(self.contour.vertices.expand(h * n, -1, -1), self.contour.reliable.expand(h * n, -1))
         reference_poses = (self.reference_poses[0][reference], self.reference_poses[1][reference])
         tangencies = epipolar_tangencies(
             (R[candidate], t[candidate]),
             reference_poses,
-            contour,
+            self.contour[torch.zeros_like(reference)],
             self.reference_contours[reference],
             self.camera,
             radius=self.radius,
