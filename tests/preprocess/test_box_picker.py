@@ -217,6 +217,21 @@ def test_a_run_requests_the_box_only_once(
     assert pipeline.capture_of(path, tmp_path / "run", again) == tmp_path / "run" / "capture"
 
 
+def test_marks_of_a_capture_never_replace_other_marks_of_the_user(tmp_path: Path) -> None:
+    """Clicks that the capture was made with may be repeated."""
+    path, click = video_of(tmp_path), (20, 30, 4)
+    saved = {"box": (1, 2, 30, 40), "at": 3, "object": [click, (9, 9, 9)], "not_object": []}
+    record = tmp_path / "run" / "capture" / PROVENANCE
+    files.write_json(record, {"options": saved})
+    options = box_picker.pick_box(path, FootageOptions(object=(click,)), record.parent)
+    assert (options.box, options.object) == ((1, 2, 30, 40), (click, (9, 9, 9)))
+    with pytest.raises(BadFile, match="run: holds a capture with other masks"):
+        box_picker.pick_box(path, FootageOptions(not_object=(click,)), record.parent)
+    files.write_json(record, {"options": saved | {"box": None}})
+    with pytest.raises(BadFile, match="run: holds a capture with other masks"):
+        box_picker.pick_box(path, FootageOptions(), record.parent)
+
+
 def test_no_box_is_requested_if_the_object_is_marked_already(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

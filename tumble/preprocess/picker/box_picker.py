@@ -92,11 +92,12 @@ def pick_box(
     """The options, completed with the user's box, the number of its frame, and clicks; waits for the user.
 
     Args:
-        capture: The capture to which the footage is converted. If it exists, its box is used and no page is opened.
+        capture: The capture to which the footage is converted. If it exists and was made from a box and at least the
+            clicks of `options`, its box and clicks are used and no page is opened.
         output: Called with the page's address, and then with the options that repeat the choice.
 
     Raises:
-        BadFile: The footage cannot be read, or has masks.
+        BadFile: The footage cannot be read, or has masks, or the capture was made without a box or without the clicks.
         ValueError: `options` mark the object already.
     """
     if options.box is not None or options.click is not None or options.masks is not None:
@@ -107,6 +108,11 @@ def pick_box(
         raise BadFile(path, "is neither a video nor a folder of images", "--pick works only for those: leave it out")
     if (capture / PROVENANCE).is_file():
         saved = files.read_json(capture / PROVENANCE, _Marked, WRONG_PROVENANCE).options
+        # The user may have clicked more on the page.
+        repeated = {*options.object} <= {*saved.object} and {*options.not_object} <= {*saved.not_object}
+        if saved.box is None or not repeated:
+            fix = "choose another folder with -o, or repeat the command that made it"
+            raise BadFile(capture.parent, "holds a capture with other masks, made without this box or click", fix)
         return replace(options, box=saved.box, at=saved.at, object=saved.object, not_object=saved.not_object)
     frame = sharpest_frame(path, options)
     options = replace(options, at=frame.number)
