@@ -74,6 +74,17 @@ def test_masks_may_be_opaque_images_or_coloured_labels(tmp_path: Path) -> None:
         assert mask[[0, 9], 0].tolist() == [OBJECT, BACKGROUND]
 
 
+def test_images_with_opaque_alpha_have_no_masks_unless_another_has_one(tmp_path: Path) -> None:
+    rgba = np.full((10, 10, 4), 255, np.uint8)
+    for i in range(2):
+        files.write_png(tmp_path / f"{i}.png", rgba)
+    assert [frame.mask for frame in opened(tmp_path)] == [None, None]
+    rgba[5:, :, 3] = 0
+    files.write_png(tmp_path / "2.png", rgba)
+    masks = [frame.mask for frame in opened(tmp_path)]
+    assert [mask is not None and int((mask == OBJECT).sum()) for mask in masks] == [100, 100, 50]
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_images_are_rotated_upright(tmp_path: Path, orientation: int) -> None:
     """Pillow's own transposition is the reference."""

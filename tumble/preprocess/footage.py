@@ -3,7 +3,8 @@
 The images of a folder are sorted by the numbers in their names, so that `frame10` follows `frame9`. If the folder has a
 subfolder `images/`, the images are taken from there, and the masks from `masks/` beside it. Masks of a video are a
 folder of images, one per frame in order. A mask of an image has the stem of its name (`0001.png`) or, as in COLMAP, its
-whole name (`0001.jpg.png`). Without other masks the alpha channel of an image is its mask.
+whole name (`0001.jpg.png`). Without other masks the alpha channel of an image is its mask, unless all images of the
+folder are opaque, as image editors save them.
 """
 
 import math
@@ -220,7 +221,8 @@ def _positive_number(text: object) -> float | None:
 def _list_images(path: Path) -> tuple[Path, ...]:
     if not path.is_dir():
         raise BadFile(path, "is missing" if not path.exists() else "is not a folder")
-    images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key)
+    shown = (p for p in path.iterdir() if not p.name.startswith("."))  # macOS writes ._0001.png beside 0001.png
+    images = sorted((p for p in shown if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key)
     if not images:
         raise BadFile(path, "holds no images", f"known file endings: {', '.join(IMAGE_SUFFIXES)}")
     for a, b in pairwise(images):
@@ -253,14 +255,24 @@ def _video_frames(footage: Footage) -> Iterator[tuple[float, np.ndarray, None]]:
 
 
 def _image_frames(footage: Footage, invert: bool) -> Iterator[tuple[float, np.ndarray, np.ndarray | None]]:
+    opaque = bool(footage.masks) or all(map(_is_opaque, footage.images))
     for number, path in enumerate(footage.images):
         values = _upright(path, files.read_image(path))
         mask = None
-        if values.shape[2] == 4:
+        if values.shape[2] == 4 and not opaque:
             alpha = np.ascontiguousarray(values[..., 3])
             mask = mask_from_alpha(255 - alpha if invert else alpha)
         image = np.repeat(values, 3, 2) if values.shape[2] == 1 else np.ascontiguousarray(values[..., :3])
         yield number / video.FPS, image, mask
+
+
+def _is_opaque(path: Path) -> bool:
+    """Whether an image has no pixel that its alpha channel makes transparent; images without one are not decoded."""
+    with files.open_image(path) as image:
+        if not image.has_transparency_data:
+            return True
+    values = files.read_image(path)
+    return values.shape[2] < 4 or bool((values[..., 3] == OPAQUE).all())
 
 
 def _upright(path: Path, values: np.ndarray) -> np.ndarray:
