@@ -230,6 +230,8 @@ def test_a_run_converts_the_folder_once_and_refuses_other_options(tmp_path: Path
     assert pipeline.capture_of(source, out, FootageOptions()) == path
     with pytest.raises(BadFile, match=r"options\.light is 'object' in the folder, 'camera' was requested"):
         pipeline.capture_of(source, out, FootageOptions(light="camera"))
+    with pytest.raises(BadFile, match="whose images have masks: --not-object does not change them"):
+        pipeline.capture_of(source, tmp_path / "other", FootageOptions(not_object=((1, 1, 0),)))
 
 
 def test_check_assesses_images_with_a_colmap_model(tmp_path: Path) -> None:

@@ -139,6 +139,11 @@ def test_all_images_of_a_folder_with_alpha_are_selected(tmp_path: Path) -> None:
         video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "out", FootageOptions(fov=40.0))
     )
     assert len(capture) == 5
+    for marks in ({"box": (40, 20, 60, 60)}, {"click": (60, 60)}, {"object": ((60, 60, 1),)}):
+        with pytest.raises(BadFile, match="has masks, which neither a box nor clicks change"):
+            video_to_capture.capture_from_video(tmp_path / "in", tmp_path / "other", FootageOptions(**marks))
+        with pytest.raises(ValueError, match="leave them out, or --masks"):
+            FootageOptions(masks=tmp_path, **marks)
 
 
 def test_a_frame_with_an_empty_mask_is_dropped_and_only_empty_masks_are_refused(tmp_path: Path) -> None:

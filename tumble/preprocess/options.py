@@ -86,8 +86,9 @@ class FootageOptions:
     def __post_init__(self) -> None:
         if self.box is not None and self.click is not None:
             raise ValueError("--box and --click both mark the object: give only one of them")
-        if (self.object or self.not_object) and self.masks is not None:
-            raise ValueError("--object and --not-object correct masks that are found: leave them out, or --masks")
+        if (self.box or self.click or self.object or self.not_object) and self.masks is not None:
+            marks = "--box, --click, --object and --not-object"
+            raise ValueError(f"{marks} are for masks that are found: leave them out, or --masks")
         if self.box is not None and min(self.box[2:]) < 2:
             raise ValueError(
                 f"--box is left, top, width, height, at least 2 x 2 pixels; this one is {self.box[2]} x {self.box[3]}"

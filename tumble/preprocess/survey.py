@@ -125,8 +125,9 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
     footage = open_footage(path, options.masks)
     scan = _read_scan(footage, options)
     if scan.masks is not None:
-        if options.object or options.not_object:
-            raise BadFile(path, "has masks, which clicks do not correct", "leave out --object and --not-object")
+        if options.box or options.click or options.object or options.not_object:
+            fix = "leave out --box, --click, --object and --not-object"
+            raise BadFile(path, "has masks, which neither a box nor clicks change", fix)
         covered = scan.masks != BACKGROUND
         gains, seed, masks = estimate_gains(scan.images, covered), None, _masks_from_labels(path, scan.masks)
         hands: list[list[Hand]] = [[] for _ in scan.images]
