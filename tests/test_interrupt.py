@@ -306,6 +306,26 @@ def test_a_run_takes_up_the_capture_of_its_own_film_and_options_alone(tmp_path: 
     assert finished_run(out) == before
 
 
+def test_masks_by_another_path_and_files_of_file_managers_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for i in range(6):
+        files.write_png(tmp_path / "in" / f"{i}.png", scene().pictures[i])
+        files.write_png(tmp_path / "m" / f"{i}.png", scene().object[i][..., None] * np.uint8(255))
+    monkeypatch.chdir(tmp_path)
+    options = FootageOptions(fov=40.0, masks=Path("m"))
+    made = pipeline.capture_of(tmp_path / "in", tmp_path / "run", options)
+    for name in (".DS_Store", "._0.png", "Thumbs.db", ".cache/0.png"):
+        files.write_atomically(tmp_path / "in" / name, lambda partial: partial.write_bytes(b"0"))
+    options = dataclasses.replace(options, masks=tmp_path / "m")
+    assert pipeline.capture_of(tmp_path / "in", tmp_path / "run", options) == made
+    with pytest.raises(BadFile, match=r"masks is .* in the folder, '' was requested"):
+        pipeline.capture_of(tmp_path / "in", tmp_path / "run", dataclasses.replace(options, masks=None))
+    files.write_png(tmp_path / "m" / "3.png", scene().object[2][..., None] * np.uint8(255))
+    with pytest.raises(BadFile, match="masks is"):
+        pipeline.capture_of(tmp_path / "in", tmp_path / "run", options)
+
+
 def test_a_folder_of_pictures_is_footage_unless_it_is_a_capture(capture: Path, tmp_path: Path) -> None:
     for i in range(6):
         alpha = np.where(scene().object[i], 255, 0).astype(np.uint8)

@@ -106,7 +106,10 @@ def capture_of(path: Path, out: Path, options: FootageOptions) -> Path:
             with progress.task(f"converting {path.name} to a capture"):
                 return to_capture(path, made, options)
     found, wanted = read_provenance(made), footage_fingerprint(path, options)
-    different = [line for name in wanted for line in run.differences(getattr(found, name, None), wanted[name], name)]
+    stored = {name: getattr(found, name, None) for name in wanted}
+    # The hash tells whether the masks are the same; their folder may be written otherwise, or be moved.
+    stored["options"] = (stored["options"] or {}) | {"masks": wanted["options"]["masks"]}
+    different = [line for name in wanted for line in run.differences(stored[name], wanted[name], name)]
     if different:
         rule = f"holds a capture of other footage or made with other options: {'; '.join(different)}"
         raise BadFile(out, rule, "choose another folder with -o, or remove this one")

@@ -44,6 +44,8 @@ KEPT_EDGE = (40, 200, 60)
 """Border colour of selected frames in the preview (green)."""
 DROPPED_EDGE = (60, 60, 60)
 """Border colour of the other frames in the preview (grey)."""
+LEFT_BY_WINDOWS = ("thumbs.db", "desktop.ini")
+"""Files that Windows leaves in folders at which somebody looks; those of other systems begin with a dot."""
 PREVIEW = "mask_preview.mp4"
 """File name of the preview of the masks."""
 
@@ -96,17 +98,22 @@ def footage_fingerprint(path: Path, options: FootageOptions) -> dict[str, Any]:
     """What a capture made from footage depends on: the hashes of footage and masks, and the options."""
     # Without clicks and part the options are those of captures made before there were any.
     stated = {name: value for name, value in vars(options).items() if value != () and (name, value) != ("part", None)}
-    masks = {} if options.masks is None else {"masks": _digest(options.masks)}
-    return {"footage": _digest(path), **masks, "options": json.loads(json.dumps(stated, default=str))}
+    masks = "" if options.masks is None else _digest(options.masks)
+    return {"footage": _digest(path), "masks": masks, "options": json.loads(json.dumps(stated, default=str))}
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files in a folder."""
+    """SHA-256 of a file, or of all files in a folder but those that a file manager leaves there."""
     digest = hashlib.sha256()
-    for each in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+    for each in sorted(p for p in path.rglob("*") if _is_footage(p, path)) if path.is_dir() else [path]:
         with each.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
+
+
+def _is_footage(path: Path, folder: Path) -> bool:
+    hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+    return path.is_file() and not hidden and path.name.lower() not in LEFT_BY_WINDOWS
 
 
 def select_frames(survey: Survey, options: FootageOptions) -> list[int]:
