@@ -10,7 +10,7 @@ import torch
 
 from tumble import demo, recipes
 from tumble.datasets import folder
-from tumble.io import video
+from tumble.io import BadFile, files, video
 from tumble.synthetic import trajectories
 
 
@@ -53,6 +53,14 @@ def test_the_clip_unpacks_to_a_pose_free_capture_with_truth(tmp_path: Path) -> N
     stamp = (path / "images" / "0000.png").stat().st_mtime_ns
     assert demo.unpack(path) == path
     assert (path / "images" / "0000.png").stat().st_mtime_ns == stamp
+
+
+def test_a_capture_of_somebody_else_is_not_taken_for_the_clip(tmp_path: Path) -> None:
+    document = files.read_json(demo.bundled_folder() / "transforms.json")
+    files.write_json(tmp_path / "capture" / "transforms.json", document | {"frames": document["frames"][1:]})
+    with pytest.raises(BadFile, match="capture: holds a capture other than the bundled clip"):
+        demo.reconstruct_clip(tmp_path)
+    assert [path.name for path in (tmp_path / "capture").iterdir()] == ["transforms.json"]
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from tumble import actions, pipeline
 from tumble.datasets import folder as capture_folder
 from tumble.engine import run
 from tumble.evaluation import Report
-from tumble.io import files, video
+from tumble.io import BadFile, files, video
 from tumble.recipes import DRAFT, Recipe
 from tumble.rendering import usable_device
 from tumble.report import write_report
@@ -37,9 +37,15 @@ def demo_clip(out: Path | str) -> Path:
 def unpack(out: Path) -> Path:
     """Copy the bundled clip to `out` as a capture folder, with the video's frames as its images; returns the folder.
 
-    A folder that holds a capture already is returned unchanged.
+    A folder that holds the clip already is returned unchanged.
+
+    Raises:
+        BadFile: `out` holds another capture.
     """
+    document = files.read_json(bundled_folder() / "transforms.json")
     if (out / "transforms.json").exists():
+        if files.read_json(out / "transforms.json") != document:
+            raise BadFile(out, "holds a capture other than the bundled clip", run.WRONG_FOLDER)
         return out
     # The package may be installed read-only: modes of its files and folders are not copied.
     bundled = bundled_folder()
@@ -48,7 +54,6 @@ def unpack(out: Path) -> Path:
         if path.is_file() and path.name != "transforms.json":
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, place)
-    document = files.read_json(bundled / "transforms.json")
     names = [frame["file_path"] for frame in document["frames"] if frame["split"] == "train"]
     for name, values in zip(names, video.read_clip(out / CLIP), strict=True):
         files.write_png(files.path_inside(out, name), values)
