@@ -367,9 +367,11 @@ def test_no_image_of_an_earlier_light_stays_under_the_name_of_another(
     actions.relight_run(whole, lights[0], out, fast=True, overwrite=True)
     numbered = [f"{i:04}.png" for i in range(8)]
     assert pictures() == [*numbered, *mine]
-    few = dataclasses.replace(asset, trajectory=asset.trajectory.select([0, 1, 2]))
+    few, names = dataclasses.replace(asset, trajectory=asset.trajectory.select([0, 1, 2])), run.frame_names(whole)
+    assert files.read_json(out / actions.LIGHT_FILE)["frames"] == names
     with monkeypatch.context() as patch:
         patch.setattr(actions, "finished", lambda *_: few)
+        patch.setattr(run, "frame_names", lambda *_: names[:3])
         actions.relight_run(whole, lights[1], out, fast=True)
     assert pictures() == [*numbered[:3], *mine]
     assert "night" in files.read_json(out / actions.LIGHT_FILE)["light"]

@@ -41,7 +41,8 @@ from tumble.rendering import relight as relighting
 from tumble.scene import Asset, Camera, Capture, Environment, Trajectory
 
 LIGHT_FILE = "relight.json"
-"""File in a folder of relit images that records the environment map, and by which the folder is recognised."""
+"""File in a folder of relit images that records the environment map and the frames, and by which the folder is
+recognised."""
 SCORES = Path("runs/evaluate")
 """Folder of the scores of prediction folders."""
 GLB_SCORES = "glb"
@@ -348,7 +349,7 @@ def relight_run(
 ) -> Path:
     """Render a run's object under another light, one image per training frame; returns the folder of the images.
 
-    The light is fixed to the object.
+    The light is fixed to the object. `relight.json` names the frame of each image.
 
     Args:
         images: Folder for `0000.png`, ... Default: `RUN/relit/<name of the map>`, numbered if another map has
@@ -366,7 +367,10 @@ def relight_run(
     images = images or _relit_folder(out, env.stem, sha256)
     outputs.claim_folder(images, LIGHT_FILE, overwrite=overwrite)
     _remove_images(images, n)
-    files.write_json(images / LIGHT_FILE, {"light": str(env.resolve()), "sha256": sha256, "images": n})
+    frames = run.frame_names(out, n)
+    files.write_json(
+        images / LIGHT_FILE, {"light": str(env.resolve()), "sha256": sha256, "images": n, "frames": frames}
+    )
     views = relight(asset, light, cfg=_relighting(out), fast=fast)
     for number, linear in enumerate(progress.track(views, f"relighting under {env.stem}", n)):
         files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).cpu().numpy())
@@ -381,7 +385,7 @@ def _remove_images(images: Path, n: int) -> None:
     note = images / LIGHT_FILE
     if note.is_file():
         # Others may be the user's, who insisted on this folder.
-        n = max(n, int(files.read_json(note, dict[str, str | int], f"remove {images}").get("images", 0)))
+        n = max(n, int(files.read_json(note, dict[str, Any], f"remove {images}").get("images", 0)))
     for path in images.glob("[0-9][0-9][0-9][0-9]*.png"):
         if path.stem.isdecimal() and int(path.stem) < n:
             with files.describe_write_errors(path):
