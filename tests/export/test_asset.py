@@ -256,6 +256,7 @@ def test_frames_without_distinct_numbers_are_numbered_from_0() -> None:
 
 def test_the_light_file_documents_its_orientation(folder: Path, asset: Asset) -> None:
     facts = files.read_json(folder / "light.json")
+    assert facts["first_frame"] == NAMES[0]
     assert facts["up"].startswith("+y")
     assert facts["zero_azimuth"].startswith("-z")
     for name, tolerance in (("light.exr", 1e-5), ("light.hdr", 0.01)):

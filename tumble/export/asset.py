@@ -117,7 +117,7 @@ def write_asset(
             files.write_png(partial / CONFIDENCE_FILE, texture[..., None])
         ply.write_ply(partial / "asset.ply", ply.splat_columns(asset, metres))
         ply.write_ply(partial / "asset_material.ply", ply.splat_columns(asset, metres) | ply.material_columns(asset))
-        _write_light(asset, partial)
+        _write_light(asset, names, partial)
         write_poses(asset, names, metres, partial)
 
 
@@ -200,7 +200,7 @@ def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float
     gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
 
 
-def _write_light(asset: Asset, out: Path) -> None:
+def _write_light(asset: Asset, names: list[str], out: Path) -> None:
     """Write `light.exr`, `light.hdr`, and `light.json`, which documents their projection and frame."""
     environment, trajectory = asset.environment, asset.trajectory
     environment.write(out / "light.exr")
@@ -217,6 +217,7 @@ def _write_light(asset: Asset, out: Path) -> None:
         "zero_azimuth": "-z, the centre column; +x is at three quarters of the width",
         "u": "atan2(x, -z) / (2 pi) + 1/2, from the left",
         "v": "acos(y) / pi, from the top",
+        "first_frame": names[0],
         "R_light_object_of_first_frame": trajectory.R_env_obj[0].tolist(),
     }
     files.write_json(out / "light.json", facts)

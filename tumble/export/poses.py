@@ -10,7 +10,7 @@ def write_poses(asset: Asset, names: list[str], metres: float, out: Path) -> Non
     """Write `poses.json`, `poses_tum.txt`, and `bop/scene_gt.json` with `bop/scene_camera.json`.
 
     JSON: camera to object, OpenGL camera axes, as in a capture. TUM: the camera in the object frame, OpenCV axes, the
-    frame number as time stamp. BOP: object to camera, OpenCV axes, millimetres.
+    number of the frame in the capture as time stamp. BOP: object to camera, OpenCV axes, millimetres, the same numbers.
 
     Args:
         names: Names of the frames, in the order of the trajectory.
@@ -22,7 +22,8 @@ def write_poses(asset: Asset, names: list[str], metres: float, out: Path) -> Non
     files.write_json(out / "poses.json", dict(zip(names, matrices.tolist(), strict=True)))
     numbers = _frame_numbers(names)
     T_obj_cam = trajectory.T_cam_obj.inverse()
-    lines = ["# timestamp tx ty tz qx qy qz qw: camera in the object frame; the timestamp is the frame number"]
+    columns = "timestamp tx ty tz qx qy qz qw: camera in the object frame"
+    lines = [f"# {columns}; the timestamp is the number of the frame in the capture"]
     for number, xyz, wxyz in zip(numbers, T_obj_cam.xyz.double() * metres, T_obj_cam.wxyz.double(), strict=True):
         w, x, y, z = wxyz.tolist()
         lines.append(" ".join([str(number), *(f"{value:.9g}" for value in [*xyz.tolist(), x, y, z, w])]))
