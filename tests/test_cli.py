@@ -204,19 +204,25 @@ def test_progress_goes_to_standard_error_and_the_result_to_standard_output(
         assert printed.out.strip() == str(tmp_path / out)
 
 
-def test_sigterm_ends_a_command_like_ctrl_c(
+def test_sigterm_ends_a_command_like_ctrl_c_and_only_what_resumes_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def doctor() -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(cli, "COMMANDS", (doctor, cli.demo))
-    found = signal.getsignal(signal.SIGTERM)
+    def demo() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "COMMANDS", (doctor, demo))
+    found, resumed = signal.getsignal(signal.SIGTERM), "finished work is kept, repeat the command to resume"
     try:
-        assert run(monkeypatch, "doctor") == 130
+        for command, advice in (("doctor", "repeat the command"), ("demo", resumed)):
+            assert run(monkeypatch, command) == 130
+            assert capsys.readouterr().err.endswith(f"tumble: interrupted; {advice}\n")
     finally:
         signal.signal(signal.SIGTERM, found)
-    assert "interrupted; finished work is kept" in capsys.readouterr().err
+    assert cli._resumes(["relight", "run", "--env", "x.hdr"])
+    assert not cli._resumes(["relight", "run", "--env", "x.hdr", "--turntable=x.mp4"])
 
 
 def test_the_help_names_the_option_for_the_version(

@@ -270,7 +270,7 @@ def test_a_full_disk_or_a_closed_folder_names_the_file_and_the_fix(
     light = tmp_path / "sun.hdr"
     Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
     before = finished_run(whole)
-    with full_disk(300), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
+    with full_disk(500), pytest.raises(OSError, match=r"0000\.png: cannot be written: File too large"):
         actions.relight_run(whole, light, tmp_path / "pictures", fast=True)
     assert [path.name for path in (tmp_path / "pictures").iterdir()] == [actions.LIGHT_FILE]
     with full_disk(3000), pytest.raises(OSError, match=r"asset\.ply: cannot be written"):
@@ -350,6 +350,23 @@ def test_lights_of_the_same_name_get_folders_of_their_own(whole: Path, tmp_path:
     assert bright > 1.2 * dark
 
 
+def test_relighting_goes_on_with_the_images_that_are_missing(whole: Path, tmp_path: Path) -> None:
+    """Of the same object, light, exposure and method; the light map may be moved."""
+    out, light = tmp_path / "pictures", tmp_path / "day.hdr"
+    Environment.from_radiance(torch.rand(8, 16, 3)).write(light)
+    actions.relight_run(whole, light, out, fast=True)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    for number in (2, 5):
+        (out / f"{number:04}.png").unlink()
+    files.write_png(out / "0000.png", np.zeros((2, 2, 1), np.uint8))
+    mark = (out / "0000.png").read_bytes()
+    actions.relight_run(whole, light.rename(tmp_path / "moved.hdr"), out, fast=True)
+    after = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert after | {actions.LIGHT_FILE: b""} == before | {"0000.png": mark, actions.LIGHT_FILE: b""}
+    actions.relight_run(whole, tmp_path / "moved.hdr", out, fast=True, exposure=0.5)
+    assert (out / "0000.png").read_bytes() not in (mark, before["0000.png"])
+
+
 def test_no_image_of_an_earlier_light_stays_under_the_name_of_another(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -376,7 +393,7 @@ def test_no_image_of_an_earlier_light_stays_under_the_name_of_another(
     assert pictures() == [*numbered[:3], *mine]
     assert "night" in files.read_json(out / actions.LIGHT_FILE)["light"]
     actions.relight_run(whole, lights[1], out, fast=True)
-    with full_disk(300), pytest.raises(OSError, match="cannot be written"):
+    with full_disk(500), pytest.raises(OSError, match=r"0000\.png: cannot be written"):
         actions.relight_run(whole, lights[0], out, fast=True)
     assert pictures() == mine
     assert "day" in files.read_json(out / actions.LIGHT_FILE)["light"]

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from tumble import pipeline
+from tumble import __version__, pipeline
 from tumble.engine import run
 from tumble.evaluation import (
     SHEET,
@@ -349,7 +349,8 @@ def relight_run(
 ) -> Path:
     """Render a run's object under another light, one image per training frame; returns the folder of the images.
 
-    The light is fixed to the object. `relight.json` names the frame of each image.
+    The light is fixed to the object. `relight.json` names the frame of each image. Of an interrupted output only the
+    missing images are rendered.
 
     Args:
         images: Folder for `0000.png`, ... Default: `RUN/relit/<name of the map>`, numbered if another map has
@@ -363,33 +364,56 @@ def relight_run(
     """
     gain = _gain(exposure)
     asset, light = finished(out, device), Environment.read(env)
-    sha256, n = hashlib.sha256(env.read_bytes()).hexdigest(), len(asset.trajectory)
+    sha256, n = _sha256(env), len(asset.trajectory)
     images = images or _relit_folder(out, env.stem, sha256)
     outputs.claim_folder(images, LIGHT_FILE, overwrite=overwrite)
-    _remove_images(images, n)
-    frames = run.frame_names(out, n)
-    files.write_json(
-        images / LIGHT_FILE, {"light": str(env.resolve()), "sha256": sha256, "images": n, "frames": frames}
-    )
-    views = relight(asset, light, cfg=_relighting(out), fast=fast)
-    for number, linear in enumerate(progress.track(views, f"relighting under {env.stem}", n)):
-        files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).cpu().numpy())
+    about = {
+        "light": str(env.resolve()),
+        "sha256": sha256,
+        "asset": _sha256(out / run.ASSET),
+        "fast": fast,
+        "exposure": exposure,
+        "images": n,
+        "frames": run.frame_names(out, n),
+        "tumble": __version__,
+    }
+    missing = _missing_images(images, about)
+    if missing:
+        files.write_json(images / LIGHT_FILE, about)
+        poses = Trajectory(asset.trajectory.T_cam_obj, "object").select(missing)
+        views = progress.track(
+            relight(asset, light, poses, cfg=_relighting(out), fast=fast), f"relighting under {env.stem}", len(missing)
+        )
+        for number, linear in zip(missing, views, strict=True):
+            files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).cpu().numpy())
     return images
 
 
-def _remove_images(images: Path, n: int) -> None:
-    """Remove the images that `n` new ones will replace, and all of an earlier output.
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _missing_images(images: Path, about: dict[str, Any]) -> list[int]:
+    """Numbers of the images to render: those that are missing of the same output, else all; earlier ones are removed.
 
     If the new ones are fewer, or the command is interrupted, the others would stay under the name of another light.
+
+    Args:
+        about: What `LIGHT_FILE` says of the output.
     """
-    note = images / LIGHT_FILE
-    if note.is_file():
-        # Others may be the user's, who insisted on this folder.
-        n = max(n, int(files.read_json(note, dict[str, Any], f"remove {images}").get("images", 0)))
+    note, n = images / LIGHT_FILE, about["images"]
+    earlier = files.read_json(note, dict[str, Any], f"remove {images}") if note.is_file() else {}
+    if earlier | {"light": about["light"]} == about:  # the map may have been moved
+        return [number for number in range(n) if not (images / f"{number:04}.png").is_file()]
+    # Images with higher numbers may be the user's, who insisted on this folder.
+    written = earlier.get("images")
+    owned = max(n, written) if isinstance(written, int) else n
     for path in images.glob("[0-9][0-9][0-9][0-9]*.png"):
-        if path.stem.isdecimal() and int(path.stem) < n:
+        if path.stem.isdecimal() and int(path.stem) < owned:
             with files.describe_write_errors(path):
                 path.unlink()
+    return list(range(n))
 
 
 def _relit_folder(out: Path, name: str, sha256: str) -> Path:

@@ -459,6 +459,8 @@ def demo(out: Folder = Path("runs/demo"), device: Device = "cpu") -> None:
 VERSION_HELP = "tumble --version prints the version."
 """End of the help text, about an option that is not one of a command."""
 COMMANDS = (doctor, synth, check, run, view, relight, export, report, evaluate, bench, batch, demo, weights)
+RESUMED = ("synth", "run", "relight", "bench", "batch", "demo")
+"""Commands that go on where they were interrupted."""
 
 
 def main() -> None:
@@ -482,13 +484,21 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        print("tumble: interrupted; finished work is kept, repeat the command to resume", file=sys.stderr)
+        advice = (
+            "finished work is kept, repeat the command to resume" if _resumes(sys.argv[1:]) else "repeat the command"
+        )
+        print(f"tumble: interrupted; {advice}", file=sys.stderr)
         raise SystemExit(130) from None
     except (ValueError, OSError, ModuleNotFoundError) as error:
         if os.environ.get("TUMBLE_DEBUG"):
             raise
         print(f"tumble: {_line(error)}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def _resumes(words: Sequence[str]) -> bool:
+    """Whether a command goes on where it was interrupted; a video of `relight` is written anew."""
+    return any(word in RESUMED for word in words[:1]) and not any(word.startswith("--turntable") for word in words)
 
 
 def _require_text(words: Sequence[str]) -> None:

@@ -89,7 +89,7 @@ def describe_write_errors(path: Path) -> Iterator[None]:
         number = getattr(error, "errno", None)
         advice = f"{fixes[number]}, " if number in fixes else ""
         reason = f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}"
-        fix = f"{advice}then run the same command again: it continues from the last saved state"
+        fix = f"{advice}then run the same command again; a run continues from the last saved state"
         write_error = WriteError(f"{reason} ({fix})")
         write_error.errno = number
         raise write_error from error
