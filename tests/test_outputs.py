@@ -1,7 +1,9 @@
 """Outputs of all commands: nothing is overwritten silently, and every refusal is one line that names the fix."""
 
 import contextlib
+import errno
 import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,6 +51,7 @@ def command(
         "export": ["export", str(whole), "--preset", "splat"],
         "relight": ["relight", str(whole), "--env", str(light), "--fast"],
         "evaluate": ["evaluate", str(whole)],
+        "report": ["report", str(whole)],
         "check": ["check", str(film), "--box", *map(str, scene().box())],
         "run": ["run", str(film), "--box", *map(str, scene().box())],
         "synth": ["synth", str(film), "--env", "white"],
@@ -188,6 +191,29 @@ def test_an_interrupted_evaluation_does_not_block_the_next(
     report = actions.evaluate_folder(whole, capture, tmp_path / "scores")
     assert report["prediction"] == "scores"
     assert {path.name for path in (tmp_path / "scores").iterdir()} == {"prediction", "report.json", "sheet.png"}
+
+
+def test_a_folder_that_cannot_be_written_is_noticed_before_any_work(
+    command: Callable[..., str],
+    whole: Path,  # noqa: F811
+    capture: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    for work in ("actions.write_asset", "actions.relight", "actions._scored", "report.page.capture_of_run"):
+        monkeypatch.setattr(f"tumble.{work}", lambda *_, **__: pytest.fail("there was work"))
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    message = "cannot be written: Read-only file system (choose a folder that can be written"
+    for name in ("export", "relight", "evaluate", "report"):
+        assert message in command(name)
+    for words in (("export", "-o", tmp_path / "new" / "x"), ("relight", "--turntable", tmp_path / "x.mp4")):
+        assert message in command(*words)
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse)
+    with pytest.raises(OSError, match="scores: cannot be written"), files.partial_folder(tmp_path / "scores"):
+        pass
 
 
 def test_the_output_may_not_lie_in_the_footage(tmp_path: Path, command: Callable[..., str]) -> None:

@@ -277,7 +277,9 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     Raises:
         BadFile: There is no finished run in `out`, or the capture has no ground truth.
     """
-    asset, known = finished(out, device), read_with_truth(capture or run.capture_source(out))
+    asset = finished(out, device)
+    outputs.require_writable(where or out)
+    known = read_with_truth(capture or run.capture_source(out))
     names = source_names(out, known.capture)
     return _scored(asset, known, _aligned(out, asset, known), names, where or out, _relighting(out))
 

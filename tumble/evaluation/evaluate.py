@@ -5,7 +5,6 @@ metric, docs/metrics.md gives the reasons. A region's score is the mean over its
 """
 
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -182,11 +181,9 @@ def score_prediction(predicted: Prediction, target: CaptureWithTruth, out: Path,
     Raises:
         BadFile: See `score`.
     """
-    with files.describe_write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=out) as scratch:
+    with files.partial_folder(out) as scratch:
         # The report names a run by the folder above.
-        partial, place = Path(scratch) / out.resolve().name / PREDICTION, out / PREDICTION
+        partial, place = scratch / out.resolve().name / PREDICTION, out / PREDICTION
         predicted.write(partial)
         report = score(partial, target, out, notes=notes)
         shutil.rmtree(place, ignore_errors=True)

@@ -5,7 +5,6 @@ fourth view's albedo is albedo/0003.exr. Every part is optional. Maps have the c
 """
 
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,11 +70,10 @@ class Prediction:
 
         All parts are written to a temporary folder first, so that no part is ever incomplete. Other files stay.
         """
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=path) as partial:
-            _write_parts(self, Path(partial))
+        with files.partial_folder(path) as partial:
+            _write_parts(self, partial)
             for part in PARTS:
-                old, new = path / part, Path(partial) / part
+                old, new = path / part, partial / part
                 shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
                 if new.exists():
                     new.rename(old)

@@ -5,7 +5,6 @@ the object's size is given, else the object radius.
 """
 
 import contextlib
-import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -126,19 +125,16 @@ def _replacing(out: Path) -> Iterator[Path]:
     """A partial folder in `out`, whose files at last replace those of an earlier export; other files stay."""
     # In a folder without the mark such files are not ours.
     own = MESH_FILES if (out / EXPORT_FILE).is_file() else ()
-    with files.describe_write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=files.partial_prefix(), dir=out) as name:
-            partial = Path(name)
-            yield partial
-            written = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
-            # The mark comes first: by it the folder is recognised if the process is killed here.
-            for path in sorted(written, key=lambda path: path.name != EXPORT_FILE):
-                (out / path).parent.mkdir(parents=True, exist_ok=True)
-                (partial / path).replace(out / path)
-            for path in map(Path, own):
-                if path not in written:
-                    (out / path).unlink(missing_ok=True)
+    with files.describe_write_errors(out), files.partial_folder(out) as partial:
+        yield partial
+        written = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
+        # The mark comes first: by it the folder is recognised if the process is killed here.
+        for path in sorted(written, key=lambda path: path.name != EXPORT_FILE):
+            (out / path).parent.mkdir(parents=True, exist_ok=True)
+            (partial / path).replace(out / path)
+        for path in map(Path, own):
+            if path not in written:
+                (out / path).unlink(missing_ok=True)
 
 
 def extract_mesh(asset: Asset, preset: Preset) -> Mesh:

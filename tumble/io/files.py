@@ -114,6 +114,20 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
             partial.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def partial_folder(parent: Path) -> Iterator[Path]:
+    """A temporary folder in a folder, which is created if it is missing.
+
+    Raises:
+        WriteError: It cannot be made.
+    """
+    with describe_write_errors(parent):
+        parent.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.TemporaryDirectory(prefix=partial_prefix(), dir=parent)
+    with folder as name:
+        yield Path(name)
+
+
 def partial_prefix() -> str:
     """Start of the names of this process's partial files."""
     return f"{PARTIAL_PREFIX}{os.getpid()}-"

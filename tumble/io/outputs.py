@@ -5,10 +5,11 @@ the command always writes first, its *mark*. It writes a file only where none is
 """
 
 import os
+import tempfile
 from collections.abc import Collection
 from pathlib import Path
 
-from tumble.io.files import PARTIAL_PREFIX, BadFile
+from tumble.io.files import PARTIAL_PREFIX, BadFile, describe_write_errors, partial_prefix
 
 OTHER_PLACE = "choose another place, or insist with --overwrite (overwrite=True in Python)"
 """Fix for an output that would replace something."""
@@ -25,16 +26,33 @@ def claim_folder(folder: Path, mark: str, *, overwrite: bool = False, fix: str =
     Raises:
         BadFile: The path or a part of it is a file, or the folder holds something other than the command's output, or
             a link out of it.
+        WriteError: The folder cannot be written.
     """
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    existing = _existing(folder)
     if not existing.is_dir():
         raise BadFile(existing, "is a file, where a folder is to be written", "choose another folder with -o")
     if (folder / mark).is_file():
         require_no_links(folder)
+    require_writable(folder)
     if overwrite or existing != folder or (folder / mark).is_file():
         return
     if any(not path.name.startswith(PARTIAL_PREFIX) for path in folder.iterdir()):
         raise BadFile(folder, f"holds other files, and no {mark} of an earlier output of this command", fix)
+
+
+def require_writable(folder: Path) -> None:
+    """Check that files can be written into a folder, or that it can be made: before hours of work, not after them.
+
+    Raises:
+        WriteError: They cannot.
+    """
+    with describe_write_errors(folder), tempfile.TemporaryFile(prefix=partial_prefix(), dir=_existing(folder)):
+        pass
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the innermost part of its path that exists."""
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def require_no_links(folder: Path) -> None:
@@ -60,11 +78,13 @@ def claim_file(path: Path, suffixes: Collection[str], *, overwrite: bool = False
 
     Raises:
         BadFile: The format is not among them, or the file exists and may not be overwritten.
+        WriteError: Its folder cannot be written.
     """
     if path.suffix.lower() not in suffixes:
         raise BadFile(path, f"has the extension {path.suffix!r}", f"these can be written: {', '.join(suffixes)}")
     if path.exists() and not (overwrite and path.is_file()):
         raise BadFile(path, "exists already", OTHER_PLACE)
+    require_writable(path.parent)
 
 
 def require_outside(out: Path, source: Path) -> None:

@@ -83,8 +83,9 @@ def write_folder(out: Path, write: Callable[[Path], None]) -> Path:
 
     So an interruption leaves no incomplete `out`.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=files.partial_prefix(), dir=out.parent))
+    with files.describe_write_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=files.partial_prefix(), dir=out.parent))
     try:
         write(partial)
         partial.chmod(0o755)

@@ -29,7 +29,7 @@ from tumble import __version__
 from tumble.datasets import reader_for
 from tumble.engine import run
 from tumble.export import Preset, confidence_of, extract_mesh, write_textured_mesh
-from tumble.io import BadFile, begin, files, progress, tree
+from tumble.io import BadFile, begin, files, outputs, progress, tree
 from tumble.maths import fibonacci_sphere
 from tumble.poses import PoseQuality, PoseResult, background_removal
 from tumble.preprocess import read_provenance
@@ -93,10 +93,12 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
 
     Raises:
         BadFile: The run is not finished, its capture is missing, or `capture` is not the capture of the run.
+        OSError: The folder cannot be written.
     """
     asset, path = run.asset(out, Asset), capture or run.capture_source(out)
     if not path.exists():
         raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
+    outputs.require_writable(out)
     used = capture_of_run(out, asset, path)
     made = read_provenance(path) if path.is_dir() else None
     hand_coloured = {frame.name: frame.hand_coloured for frame in made.frames} if made else {}
