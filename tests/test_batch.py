@@ -213,7 +213,25 @@ def test_captures_of_a_batch_need_different_names(tmp_path: Path) -> None:
     captures = [tmp_path / "mug.mp4", tmp_path / "mug.v2", tmp_path / "mug"]
     with pytest.raises(ValueError, match="several captures have the name mug:"):
         batch.run_batch(captures, tmp_path, SMOKE, FootageOptions(), batch.Workers())
-    assert batch.run_batch(captures[:2], tmp_path, SMOKE, FootageOptions(), batch.Workers()), "not started yet"
+    assert batch.run_batch(captures[:2], tmp_path / "out", SMOKE, FootageOptions(), batch.Workers()), "not started yet"
+
+
+def test_a_batch_goes_into_a_folder_of_its_own(tmp_path: Path) -> None:
+    """Which may be one of an earlier version, without a mark; logs clash with no capture, not even with "logs"."""
+    own, other = tmp_path / "own", tmp_path / "other"
+    (own / "mug" / "capture").mkdir(parents=True)
+    for folder in (own, other):
+        (folder / "logs").mkdir(parents=True)
+    (other / "logs.txt").write_text("mine")
+    how = SMOKE, FootageOptions(), batch.Workers(jobs=1)
+    with pytest.raises(BadFile, match=r"other: holds other files.*choose another folder"):
+        batch.run_batch([tmp_path / "logs"], other, *how)
+    assert sorted(path.name for path in other.iterdir()) == ["logs", "logs.txt"]
+    for _ in range(2):
+        (outcome,) = batch.run_batch([tmp_path / "logs"], own, *how)
+        assert "logs" in outcome.error
+    assert sorted(path.name for path in own.iterdir()) == [".logs", "batch.json", "logs", "mug"]
+    assert (own / ".logs" / "logs.log").is_file()
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:

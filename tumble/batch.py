@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tumble import actions, bench, pipeline
+from tumble import __version__, actions, bench, pipeline
 from tumble.bench import CaptureTask, Case, Outcome, SuiteRow, Workers
 from tumble.engine import loop, run
 from tumble.evaluation import PREDICTION, read_with_truth
@@ -26,6 +26,10 @@ RUNS = "runs"
 """Folder of the runs in the folder of a benchmark."""
 LOGS = "logs"
 """Folder of what the processes have printed."""
+BATCH_MARK = "batch.json"
+"""File by which the folder of a batch is recognised."""
+BATCH_LOGS = ".logs"
+"""As `LOGS`, in the folder of a batch: a name that no capture has."""
 RECIPES = {"smoke": SMOKE, **QUALITIES}
 """Recipes by the name that a suite gives."""
 MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024
@@ -265,6 +269,7 @@ def run_batch(
     """Reconstruct captures or footage, each in `out/<its name>`; yields each with the path of its report.
 
     Raises:
+        BadFile: `out` holds something else than runs.
         ValueError: There are none, two of them have the same name, or there is no such device.
     """
     if not captures:
@@ -274,9 +279,17 @@ def run_batch(
     names = [path.stem if path.is_file() else path.name for path in paths]
     if repeated := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"several captures have the name {min(repeated)}: rename them, or run them one by one")
+    outputs.claim_folder(out, BATCH_MARK, overwrite=_holds_runs_only(out), fix="choose another folder with -o")
+    files.write_json(out / BATCH_MARK, {"tumble": __version__})
     folders = [out.absolute() / name for name in names]
     tasks = [RunTask(*each, recipe, options, poses, device) for each in zip(paths, folders, strict=True)]
-    return progress.track(bench.execute(reconstruct_one, tasks, workers, out / LOGS), "captures", len(tasks))
+    return progress.track(bench.execute(reconstruct_one, tasks, workers, out / BATCH_LOGS), "captures", len(tasks))
+
+
+def _holds_runs_only(out: Path) -> bool:
+    """Whether a folder is a batch of earlier versions, which had no mark: runs, and their logs in `LOGS`."""
+    content = out.iterdir() if out.is_dir() else ()
+    return all(path.name == LOGS or any((path / x).exists() for x in (run.RECIPE, run.CAPTURE)) for path in content)
 
 
 def reconstruct_one(task: RunTask) -> Path:

@@ -83,8 +83,11 @@ def execute(function: Callable[[T], R], tasks: Sequence[T], workers: Workers, lo
 
 def in_processes(function: Callable[[T], R], tasks: Sequence[T], jobs: int, logs: Path) -> Iterator[Outcome[T, R]]:
     """See `execute`; a new process for each task, so that its peak memory is its own, and at most `jobs` at a time."""
+    from tumble.io import files  # not above, as in `_outcome`
+
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // jobs)))
-    logs.mkdir(parents=True, exist_ok=True)
+    with files.describe_write_errors(logs):
+        logs.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("spawn")
     waiting = deque((task, 0) for task in tasks)
     running: dict[Any, tuple[Any, T, int]] = {}
