@@ -66,7 +66,7 @@ def compiled(sources: Sequence[str], folder: Path) -> ctypes.CDLL:
     """
     compiler = _native.find_compiler()
     emulation = [(HERE / f"warp_emulation.{suffix}").read_text("utf-8") for suffix in ("h", "cpp")]
-    common = [warp.__version__, compiler, *FLAGS, *KERNEL_FLAGS, *emulation]
+    common = [warp.__version__, *compiler, *FLAGS, *KERNEL_FLAGS, *emulation]
 
     def named(suffix: str, *parts: str) -> Path:
         return folder / f"emulated-{hashlib.sha256(chr(0).join([*common, *parts]).encode()).hexdigest()[:16]}{suffix}"
@@ -78,7 +78,7 @@ def compiled(sources: Sequence[str], folder: Path) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory(dir=folder) as name:
         build = Path(name)
         _write_headers(build)
-        command = [compiler, *FLAGS, "-c", "-o"]
+        command = [*compiler, *FLAGS, "-c", "-o"]
         runs = [subprocess.Popen([*command, build / "emulation.o", "-O2", HERE / "warp_emulation.cpp"])]
         missing = {path: source for path, source in zip(objects, sources, strict=True) if not path.exists()}
         for path, source in missing.items():
@@ -93,7 +93,7 @@ def compiled(sources: Sequence[str], folder: Path) -> ctypes.CDLL:
         partial = build / library.name
         # Modules define the same operators of the same structs.
         link = "-shared", "-Wl,--allow-multiple-definition"
-        subprocess.run([compiler, *link, build / "emulation.o", *objects, "-o", partial], check=True)
+        subprocess.run([*compiler, *link, build / "emulation.o", *objects, "-o", partial], check=True)
         partial.rename(library)
     return ctypes.CDLL(str(library))
 

@@ -55,6 +55,17 @@ def test_without_a_compiler_the_reference_is_used_with_one_warning(
     assert backends.choose(CPU, torch.float32) is reference
 
 
+def test_the_compiler_may_have_arguments_or_a_wrapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrapper = _script(tmp_path / "my wrapper", "exit 0")
+    for given, command in (
+        (f"'{wrapper}' g++ -pipe", [wrapper, "g++", "-pipe"]),
+        (wrapper, [wrapper]),
+        (" ", [_real_compiler()]),
+    ):
+        monkeypatch.setenv("CXX", given)
+        assert _native.find_compiler() == command
+
+
 @pytest.mark.usefixtures("no_library", "no_warp")
 def test_the_error_of_a_failing_compiler_contains_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -162,7 +173,7 @@ def test_a_library_that_others_could_have_written_is_never_loaded(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setenv("CXX", compiler)
     _cache._process_folder.cache_clear()
-    planted = folder / f"kernels-{_native._build_hash(compiler)}.so"
+    planted = folder / f"kernels-{_native._build_hash([compiler])}.so"
     subprocess.run([_real_compiler(), "-x", "c", tmp_path / "planted.c", "-shared", "-fPIC", "-o", planted], check=True)
     planted.chmod(0o700)
     spoil(folder, planted)
@@ -307,13 +318,13 @@ def test_the_kernels_access_their_own_memory_only(tmp_path: Path) -> None:
         compiler = _native.find_compiler()
     except _native.CannotCompile as reason:
         pytest.skip(str(reason))
-    runtime = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True).stdout.strip()
+    runtime = subprocess.run([*compiler, "-print-file-name=libasan.so"], capture_output=True, text=True).stdout.strip()
     if not Path(runtime).is_file():
         pytest.skip("the compiler has no address sanitizer")
     library = tmp_path / "kernels.so"
     sanitize = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-march=native", "-O1"]
     source = str(_native.SOURCES / "kernels.cpp")
-    subprocess.run([compiler, *_native.FLAGS, *sanitize, source, "-o", str(library)], check=True)
+    subprocess.run([*compiler, *_native.FLAGS, *sanitize, source, "-o", str(library)], check=True)
     program = (
         "import ctypes, torch; from tumble.backends import _native, load; "
         f"kernels = ctypes.CDLL({str(library)!r}); _native.library = lambda: kernels; "

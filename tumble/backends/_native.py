@@ -11,15 +11,15 @@ import ctypes
 import hashlib
 import os
 import platform
-import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 from tumble.backends._cache import SOURCES, NoCache, is_private, user_folder, writable
-from tumble.backends._prebuilt import COMPILERS, FLAGS, choose, processor_features
+from tumble.backends._prebuilt import COMPILERS, FLAGS, choose, compiler_command, processor_features
 from tumble.backends._prebuilt import FOLDER as PREBUILT
 from tumble.backends._structs import STRUCTURES
 
@@ -71,7 +71,7 @@ def origin() -> str:
     if not isinstance(kernels, ctypes.CDLL):
         return "compiled by the Clang of Warp"
     wheel = Path(kernels._name).parent == PREBUILT
-    return f"{Path(kernels._name).stem} of the wheel" if wheel else f"compiled by {find_compiler()}"
+    return f"{Path(kernels._name).stem} of the wheel" if wheel else f"compiled by {' '.join(find_compiler())}"
 
 
 def _of_wheel() -> ctypes.CDLL | None:
@@ -115,24 +115,21 @@ def _by_warp(no_compiler: CannotCompile) -> SimpleNamespace:
         raise CannotCompile(f"{no_compiler}; {failure}") from reason
 
 
-def find_compiler() -> str:
-    """Path of the C++ compiler: $CXX if set, else that of the system.
+def find_compiler() -> list[str]:
+    """The C++ compiler, $CXX if set, else that of the system: its path and the arguments of $CXX.
 
     Raises:
         CannotCompile: There is no compiler.
     """
-    candidates = [os.environ["CXX"]] if os.environ.get("CXX") else COMPILERS
-    for name in candidates:
-        path = shutil.which(name)
-        if path:
-            return path
+    if command := compiler_command(COMPILERS):
+        return command
     raise CannotCompile(
-        f"no C++ compiler ({', '.join(candidates)}) on the PATH; install one "
+        f"no C++ compiler ({os.environ.get('CXX') or ', '.join(COMPILERS)}) on the PATH; install one "
         "(Debian: apt install g++; macOS: xcode-select --install; conda: conda install cxx-compiler)"
     )
 
 
-def compile_to(path: Path, compiler: str) -> None:
+def compile_to(path: Path, compiler: Sequence[str]) -> None:
     """Compile the kernels to a shared library, which is written atomically.
 
     Raises:
@@ -143,7 +140,7 @@ def compile_to(path: Path, compiler: str) -> None:
     try:
         output = ""
         for variant in VARIANTS:
-            command = [compiler, *FLAGS, *variant, str(SOURCES / "kernels.cpp"), "-o", partial]
+            command = [*compiler, *FLAGS, *variant, str(SOURCES / "kernels.cpp"), "-o", partial]
             run = subprocess.run(command, capture_output=True, text=True, check=False)
             if run.returncode == 0:
                 Path(partial).chmod(0o700)  # linkers create the file anew, with the mode of the umask
@@ -151,15 +148,15 @@ def compile_to(path: Path, compiler: str) -> None:
                 return
             output = run.stderr
         raise CannotCompile(
-            f"{compiler} cannot compile the kernels; set CXX to another compiler. Its output: {output[-400:]}"
+            f"{' '.join(compiler)} cannot compile the kernels; set CXX to another compiler. Its output: {output[-400:]}"
         )
     finally:
         Path(partial).unlink(missing_ok=True)
 
 
-def _build_hash(compiler: str) -> str:
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    parts = [version, compiler, *FLAGS, str(VARIANTS), platform.platform(), platform.processor(), _cpu_features()]
+def _build_hash(compiler: Sequence[str]) -> str:
+    version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    parts = [version, *compiler, *FLAGS, str(VARIANTS), platform.platform(), platform.processor(), _cpu_features()]
     parts += [path.name + path.read_text() for path in sorted(SOURCES.iterdir()) if path.suffix in (".h", ".cpp")]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 

@@ -7,6 +7,7 @@ has none. Only the standard library is imported, because the build has nothing e
 import os
 import platform
 import re
+import shlex
 import shutil
 import subprocess
 import sysconfig
@@ -53,20 +54,29 @@ def processor_features() -> frozenset[str]:
     return frozenset(next((line.partition(":")[2].split() for line in lines if line.startswith("flags")), ()))
 
 
+def compiler_command(names: Iterable[str]) -> list[str] | None:
+    """The C++ compiler, $CXX or else the first of the names that there is; None if there is none.
+
+    $CXX may have arguments, or begin with a wrapper: `ccache g++`.
+    """
+    given = os.environ.get("CXX", "")
+    commands = [[given], shlex.split(given)] if given.strip() else [[name] for name in names]
+    return next(([path, *arguments] for name, *arguments in commands if (path := shutil.which(name))), None)
+
+
 def compile_all(folder: Path) -> list[Path]:
     """Compile the kernels for every variant of this machine into a folder.
 
     Returns:
         The libraries; none if there is no compiler or it fails, as a wheel without kernels is valid too.
     """
-    names = [os.environ["CXX"]] if os.environ.get("CXX") else COMPILERS
-    compiler = next((path for name in names if (path := shutil.which(name))), None)
+    compiler = compiler_command(COMPILERS)
     if compiler is None:
         return []
     libraries = []
     for march, _ in VARIANTS.get(platform.machine(), ()):
         library = folder / f"kernels-{march}.so"
-        command = [compiler, *FLAGS, f"-march={march}", str(SOURCE), "-o", str(library)]
+        command = [*compiler, *FLAGS, f"-march={march}", str(SOURCE), "-o", str(library)]
         if subprocess.run(command, check=False).returncode == 0:
             libraries.append(library)
     return libraries
