@@ -257,6 +257,18 @@ def test_renders_equal_photos_that_are_renders(asset: Asset, capture: Capture) -
     assert [row.rating for row in rows[:6]] == ["good", "good", "good", "none", "none", "none"]
 
 
+def test_large_photos_are_averaged_in_linear_light(
+    asset: Asset, capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which keeps the mean: of black and white stripes it is half of white, not 0.21 of it."""
+    monkeypatch.setattr(training_views, "MAX_SIDE", SIDE // 4)
+    images = torch.zeros_like(capture.images)
+    images[:, :, ::2] = 255
+    frame = next(training_views.frames(training_views.prepare(asset), dataclasses.replace(capture, images=images)))
+    assert max(frame.photo.shape[:2]) == SIDE // 4
+    assert float(linear_from_srgb(frame.photo).mean()) == pytest.approx(0.5, abs=0.02)
+
+
 def test_the_card_reports_drift_lost_frames_and_outliers(asset: Asset, capture: Capture) -> None:
     images = capture.images.clone()
     half = srgb_from_linear(0.5 * linear_from_srgb(images[: N // 2].float() / 255))

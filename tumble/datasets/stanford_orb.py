@@ -205,7 +205,7 @@ def _elsewhere(root: Path, frame: ObjectFrame) -> RelitViews | None:
 
 
 def _downsized(pixels: np.ndarray, path: Path) -> Float32[np.ndarray, "h w c"]:
-    """An image of a width above `SIDE`, averaged down to it."""
+    """Pixels of an image of a width above `SIDE`, averaged down to it; the benchmark averages sRGB albedo."""
     height, width, channels = pixels.shape
     if height != width or (width > SIDE and width % SIDE):
         raise BadFile(path, f"has {width} x {height} pixels", f"expected squares of a multiple of {SIDE} pixels")
@@ -247,7 +247,8 @@ def _photos(split: _Split, masks: UInt8[np.ndarray, "t h w"]) -> UInt8[Tensor, "
 def _photo(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     if path.suffix == ".exr":
         return to_srgb8(torch.from_numpy(_radiance_of(path))).numpy()
-    return _downsized(_three_channels(files.read_image(path), path), path).round().astype(np.uint8)
+    linear = linear_from_srgb(torch.from_numpy(_three_channels(files.read_image(path), path) / 255).float())
+    return to_srgb8(torch.from_numpy(_downsized(linear.numpy(), path))).numpy()
 
 
 def _radiance(split: _Split, masks: UInt8[np.ndarray, "t h w"]) -> Float[Tensor, "t h w 3"] | None:

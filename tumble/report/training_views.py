@@ -146,11 +146,12 @@ def frames(scene: LitScene, capture: Capture) -> Iterator[RenderedFrame]:
         is_object, unknown = (
             resize_area((crop(mask, box) == value).float()[..., None], *size)[..., 0] for value in (OBJECT, UNKNOWN)
         )
+        photo = linear_from_srgb(crop(capture.images[number], box).float() / 255)
         yield RenderedFrame(
             number=number,
             name=name,
             camera=camera,
-            photo=resize_area(crop(capture.images[number], box).float() / 255, *size),
+            photo=srgb_from_linear(resize_area(photo, *size)).clamp(0, 1),
             mask=is_object >= MIN_OBJECT_COVERAGE,
             valid=unknown == 0,
             rendered=srgb_from_linear(linear).clamp(0, 1).cpu(),
