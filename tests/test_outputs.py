@@ -175,6 +175,25 @@ def test_a_capture_that_has_changed_is_not_taken_for_that_of_the_run(
         actions.export_run(run_folder, tmp_path / "out", "game", None)
 
 
+def test_a_run_whose_capture_was_moved_says_how_to_go_on(
+    whole: Path,  # noqa: F811
+    capture: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    out, moved, gone = tmp_path / "run", tmp_path / "moved", tmp_path / "gone"
+    shutil.copytree(whole, out)
+    shutil.copytree(capture, moved)
+    recipe = out / "recipe.json"
+    recipe.write_text(recipe.read_text().replace(str(capture.resolve()), str(gone)))
+    advice = rf"{gone}: is the run's capture but does not exist \(.*repeat `tumble run NEW_CAPTURE -o {out}`"
+    with pytest.raises(BadFile, match=advice):
+        actions.evaluate_run(out)
+    with pytest.warns(UserWarning, match=rf"{advice}.*baked from the Gaussians"):
+        assert actions._frames_of_run(out, actions.finished(out)) is None
+    pipeline.reconstruct(moved, out, RECIPE)
+    assert actions._frames_of_run(out, actions.finished(out)) is not None
+
+
 def test_an_interrupted_evaluation_does_not_block_the_next(
     whole: Path,  # noqa: F811
     capture: Path,  # noqa: F811

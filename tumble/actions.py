@@ -279,7 +279,7 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     """
     asset = finished(out, device)
     outputs.require_writable(where or out)
-    known = read_with_truth(capture or run.capture_source(out))
+    known = read_with_truth(capture or _capture_path(out))
     names = source_names(out, known.capture)
     return _scored(asset, known, _aligned(out, asset, known), names, where or out, _relighting(out))
 
@@ -300,10 +300,25 @@ def evaluate_glb(
             holds something else.
         ModuleNotFoundError: Mitsuba is not installed.
     """
-    asset, known = finished(out), read_with_truth(capture or run.capture_source(out))
+    asset, known = finished(out), read_with_truth(capture or _capture_path(out))
     where = where or out / GLB_SCORES
     outputs.claim_folder(where, SHEET, overwrite=overwrite)
     return score_glb(glb, asset, known, _aligned(out, asset, known), where)
+
+
+def _capture_path(out: Path) -> Path:
+    """Path of the capture of a run.
+
+    Raises:
+        BadFile: It is not there any more.
+    """
+    path = run.capture_source(out)
+    if not path.exists():
+        fix = (
+            f"if it was moved, repeat `tumble run NEW_CAPTURE -o {out}` with its options: that only notes the new place"
+        )
+        raise BadFile(path, "is the run's capture but does not exist", fix)
+    return path
 
 
 def _aligned(out: Path, asset: Asset, known: CaptureWithTruth) -> tuple[Any, str]:
@@ -507,9 +522,8 @@ def _frames_of_run(out: Path, asset: Asset) -> Capture | None:
     """The frames of a run's trajectory, with its masks; None with a warning if the capture is gone or has changed."""
     from tumble.report import capture_of_run
 
-    path = run.capture_source(out)
     try:
-        return capture_of_run(out, asset, path).frames
+        return capture_of_run(out, asset, _capture_path(out)).frames
     except BadFile as error:
         text = f"{error}; the base colour is baked from the Gaussians, not solved from the photographs"
         warnings.warn(text, stacklevel=3)
