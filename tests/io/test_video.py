@@ -201,8 +201,10 @@ def test_errors_name_files_that_are_not_videos(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match="is not a file"):
         video.probe(tmp_path)
     (tmp_path / "x.mp4").write_bytes(b"not a video at all" * 100)
-    with pytest.raises(BadFile, match="is not a readable video"):
+    with pytest.raises(BadFile, match="is not a readable video") as refused:
         video.probe(tmp_path / "x.mp4")
+    assert "Errno" not in str(refused.value)
+    assert str(refused.value).count("x.mp4") == 1
 
 
 def test_frames_over_the_size_limit_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,7 +154,7 @@ def probe(path: Path) -> VideoHeader:
             tags = {**container.metadata, **stream.metadata}
             return VideoHeader(stream.frames, codec.width, codec.height, codec.name, hdr, tags)
     except av.error.FFmpegError as error:
-        raise BadFile(path, f"is not a readable video: {error}", "tumble reads mp4, mov, mkv, webm") from None
+        raise BadFile(path, f"is not a readable video: {error.strerror}", "tumble reads mp4, mov, mkv, webm") from None
 
 
 def _open(path: Path) -> InputContainer:
