@@ -37,6 +37,8 @@ Device = Annotated[
     Literal["auto", "cpu", "cuda"],
     arg(help="Where to compute. cuda: on an NVIDIA GPU (benchmarks/gpu.md). auto: on one if there is one."),
 ]
+OCCUPIES_GPU = {"auto": None, "cpu": False, "cuda": True}
+"""Whether a task on a cluster occupies a GPU, by device; None: if the cluster has any."""
 OptionalCapture = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 OptionalData = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 Frames = Annotated[
@@ -245,7 +247,7 @@ def batch(
     from tumble.bench import Workers
     from tumble.recipes import QUALITIES
 
-    workers = Workers(jobs, address, gpu=device == "cuda")
+    workers = Workers(jobs, address, gpu=OCCUPIES_GPU[device])
     options = at_quality(options, quality, frames=None, size=None)
     recipe = replace(QUALITIES[quality], seed=seed)
     failed = 0
@@ -408,7 +410,7 @@ def bench(
         print(batch.report_suite(suite, out, **selection))
         return
     cases = bench.cases_of(bench.read_suite(suite), **selection)
-    workers, data = bench.Workers(jobs, address, gpu=device == "cuda"), bench.data_folder(data)
+    workers, data = bench.Workers(jobs, address, gpu=OCCUPIES_GPU[device]), bench.data_folder(data)
     failed = 0
     if action == "list":
         print("\n".join(case.name for case in cases))

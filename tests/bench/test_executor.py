@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -135,6 +136,23 @@ def test_ray_on_this_machine_returns_results_errors_and_replaces_killed_processe
     assert by_name["wrong"].error == r"ValueError: two\nlines"
     assert "WorkerCrashedError" in by_name["doomed"].error
     assert {task.name: attempts(task) for task in tasks} == {"good": 1, "wrong": 1, "killed": 2, "doomed": 2}
+
+
+@pytest.mark.parametrize(("gpu", "has", "occupied"), [(None, 2.0, 1), (None, 0.0, 0), (False, 2.0, 0), (True, 0.0, 1)])
+def test_a_task_occupies_a_gpu_if_it_must_or_may(
+    gpu: bool | None, has: float, occupied: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[dict] = []
+    ray = SimpleNamespace(
+        init=lambda *_, **__: None,
+        cluster_resources=lambda: {"CPU": 8.0, **({"GPU": has} if has else {})},
+        remote=lambda **options: asked.append(options) or (lambda function: function),
+        shutdown=lambda: None,
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setitem(sys.modules, "ray.exceptions", SimpleNamespace(RayError=RuntimeError))
+    assert list(executor.execute(work, [], Workers(address="local", gpu=gpu), tmp_path)) == []
+    assert [options["num_gpus"] for options in asked] == [occupied]
 
 
 def test_a_cluster_without_ray_is_refused_with_the_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

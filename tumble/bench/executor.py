@@ -52,8 +52,8 @@ class Workers:
     """Number of tasks at the same time on this machine; 0: one per `CORES_PER_TASK` cores."""
     address: str = ""
     """Address of a Ray cluster, or "local" for one that is started on this machine; empty: no Ray."""
-    gpu: bool = False
-    """Whether a task on a Ray cluster occupies a GPU."""
+    gpu: bool | None = False
+    """Whether a task on a Ray cluster occupies a GPU, which hides the others from it; None: if the cluster has any."""
 
     def __post_init__(self) -> None:
         if self.jobs < 0:
@@ -169,10 +169,11 @@ def _on_ray(function: Callable[[T], R], tasks: Sequence[T], workers: Workers) ->
     address = None if workers.address == "local" else workers.address
     ray.init(address, log_to_driver=False, configure_logging=False)
     try:
+        gpu = ray.cluster_resources().get("GPU", 0) > 0 if workers.gpu is None else workers.gpu
         # A process serves one task, so that its peak memory is its own.
         remote = ray.remote(
             num_cpus=min(CORES_PER_TASK, os.cpu_count() or 1),
-            num_gpus=int(workers.gpu),
+            num_gpus=int(gpu),
             max_retries=RETRIES,
             max_calls=1,
         )(_attempt)
