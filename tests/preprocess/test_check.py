@@ -12,7 +12,7 @@ import pytest
 from tests.films import scene, written
 from tests.preprocess.test_held_object import landmarks
 from tumble import cli
-from tumble.io import files
+from tumble.io import BadFile, files
 from tumble.preprocess import check as checking
 from tumble.preprocess import survey
 from tumble.preprocess.check import Finding, check_footage, passes
@@ -193,3 +193,17 @@ def test_the_command_prints_the_result_and_sets_the_exit_code(
     assert ended == code
     assert out.splitlines()[-1].startswith(word)
     assert "focal length 300 pixels (given)" in out
+
+
+def test_the_preview_of_another_film_is_not_replaced(tmp_path: Path) -> None:
+    """Films of the same name in two folders have the same default folder; overwrite insists."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    films = [written(scene(8).pictures, tmp_path / name / "x.mp4") for name in "ab"]
+    options = FootageOptions(box=scene(8).box(), focal=300.0)
+    for _ in range(2):
+        check_footage(films[0], tmp_path / "out", options)
+    with pytest.raises(BadFile, match=rf"out: holds the preview of {films[0]} \(choose another place"):
+        check_footage(films[1], tmp_path / "out", options)
+    check_footage(films[1], tmp_path / "out", options, overwrite=True)
+    assert files.read_json(tmp_path / "out" / checking.SOURCE_FILE) == {"footage": str(films[1])}

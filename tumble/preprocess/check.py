@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from tumble.io import outputs, progress, video
+from tumble.io import BadFile, files, outputs, progress, video
 from tumble.preprocess import colmap_to_capture, keyframes, segmentation, video_to_capture
 from tumble.preprocess.camera_motion import MAX_CAMERA_MOTION
 from tumble.preprocess.options import FootageOptions
@@ -20,6 +20,8 @@ from tumble.preprocess.picker import pick_box
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey_footage
 
+SOURCE_FILE = "check.json"
+"""File beside the preview that names the footage that it is of."""
 CAMERA_MOTION = (0.004, MAX_CAMERA_MOTION)
 """Limits of the motion of the background [longer side of the image]; 8 and 38 of 1920 pixels."""
 EDGE_BLUR = (1.2, 2.5)
@@ -89,12 +91,27 @@ def check_footage(
         overwrite: Write into `out` even if it holds something else than an earlier preview.
 
     Raises:
-        BadFile: The footage cannot be read, no moving object is found in it, or `out` holds something else.
+        BadFile: The footage cannot be read, no moving object is found in it, or `out` holds something else, which may
+            be the preview of other footage.
     """
     outputs.require_outside(out, path)
     outputs.claim_folder(out, video_to_capture.PREVIEW, overwrite=overwrite)
+    source, known = {"footage": str(path.resolve())}, out / SOURCE_FILE
+    if (
+        known.is_file()
+        and not overwrite
+        and (other := files.read_json(known, dict[str, str], outputs.OTHER_PLACE)) != source
+    ):
+        raise BadFile(out, f"holds the preview of {other.get('footage')}", outputs.OTHER_PLACE)
     options = options or FootageOptions()
     options = pick_box(path, options, out / "capture") if pick else options
+    findings = _findings(path, out, options)
+    files.write_json(known, source)
+    return findings
+
+
+def _findings(path: Path, out: Path, options: FootageOptions) -> list[Finding]:
+    """Write the preview, and find what there is to say."""
     if input_kind(path) == "posed images":
         return _check_posed(colmap_to_capture.collect_silhouettes(path, options), out, options)
     with progress.task(f"surveying {path.name}"):
