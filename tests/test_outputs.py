@@ -154,6 +154,8 @@ def test_the_functions_for_notebooks_follow_the_same_rule(
         actions.evaluate(asset, capture, out=tmp_path)
     assert content(tmp_path) == {"poses.json": b"of somebody else"}
     actions.export_asset(asset, tmp_path, "splat", overwrite=True)
+    with pytest.raises(ValueError, match=r"the capture has 1 frames, the trajectory 8: select those"):
+        actions.export_asset(asset, tmp_path / "few", capture=pipeline.read_capture(capture).select([0]))
 
 
 def test_a_capture_that_has_changed_is_not_taken_for_that_of_the_run(

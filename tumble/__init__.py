@@ -4,7 +4,7 @@
 
     asset = tumble.reconstruct("captures/mug", "runs/mug")
     images = list(tumble.relight(asset, "studio.hdr"))
-    tumble.export_asset(asset, "runs/mug/export")
+    tumble.export_asset(asset, "runs/mug/export", capture=tumble.read_capture("captures/mug"))
 
 Each folder is a room: one part of the method, whose `__init__` lists what other rooms use. In the order of the data:
 

@@ -118,12 +118,16 @@ def export_asset(
         scale_mm: Largest distance between two points of the object, measured with a ruler [mm]; the files are then in
             metres.
         capture: The frames of the asset's trajectory. With them, the base colour of the mesh is solved from the
-            photographs; otherwise it is baked from the Gaussians alone.
+            photographs; otherwise it is baked from the Gaussians alone, which is blurred.
         overwrite: Write into the folder even if it holds something else than an earlier export.
 
     Raises:
         BadFile: The folder holds something else.
+        ValueError: The capture has another number of frames than the trajectory.
     """
+    if capture is not None and len(capture) != len(asset.trajectory):
+        fix = "select those in the poses.json of the run: capture.select([...])"
+        raise ValueError(f"the capture has {len(capture)} frames, the trajectory {len(asset.trajectory)}: {fix}")
     outputs.claim_folder(Path(folder), EXPORT_FILE, overwrite=overwrite)
     names = names or [f"{number:04}.png" for number in range(len(asset.trajectory))]
     write_asset(asset, names, Path(folder), preset, scale_mm, capture=capture)
