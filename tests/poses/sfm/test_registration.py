@@ -83,6 +83,7 @@ def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
     [
         (50, 0.6, 3, 0.5, 80, True),
         (50, 0.6, 3, 2.0, 80, False),  # contours contradict it
+        (500, 0.85, 3, 2.0, 80, True),  # but a mask may be wrong
         (50, 0.6, 3, 2.0, 9, True),  # too few to contradict it
         (50, 0.4, 3, 0.5, 80, False),
         (110, 0.4, 3, 0.5, 80, True),
