@@ -199,7 +199,10 @@ def _part(mesh: Any, T: Float[np.ndarray, "4 4"]) -> Part:
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
     uv = getattr(mesh.visual, "uv", None)
     uv = np.zeros((len(vertices), 2)) if uv is None else np.stack([uv[:, 0], 1 - uv[:, 1]], 1)
-    return Part(vertices, normals, np.asarray(mesh.faces), uv, *_textures(mesh.visual))
+    faces = np.asarray(mesh.faces)
+    if np.linalg.det(T[:3, :3]) < 0:  # a mirrored node: without this, the outward side of its faces would be inside
+        faces = faces[:, ::-1]
+    return Part(vertices, normals, faces, uv, *_textures(mesh.visual))
 
 
 def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
