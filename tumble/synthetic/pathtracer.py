@@ -338,7 +338,8 @@ def radiance(
     to_world[:3, :3] = R_env_obj.double().numpy().T
     params["light.to_world"] = mi.Transform4f(to_world)
     params.update()
-    pixels = np.array(mi.render(scene, sensor=_sensor(T_cam_obj, camera), spp=samples, seed=seed))
+    # Mitsuba takes seeds of 32 bits; the number of a frame is added to a multiple of the seed of the options.
+    pixels = np.array(mi.render(scene, sensor=_sensor(T_cam_obj, camera), spp=samples, seed=seed % 2**32))
     return pixels[..., :3], pixels[..., 3]
 
 
