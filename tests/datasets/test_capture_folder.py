@@ -149,6 +149,34 @@ def test_saving_over_a_folder_is_refused(written: Path) -> None:
         _capture_folder.save_capture(written, *example_capture())
 
 
+def test_true_poses_are_stored_with_the_names_that_they_belong_to(tmp_path: Path) -> None:
+    capture, truth = example_capture()
+    assert truth.poses is not None
+    posed = replace(truth, poses=truth.poses.select([2, 0, 1]), pose_names=("c.png", "a.png", "b.png"), units="m")
+    _capture_folder.save_capture(tmp_path / "capture", capture, posed)
+    loaded = folder.load_truth(tmp_path / "capture")
+    assert loaded is not None
+    assert_same_poses(loaded.poses, truth.poses)
+    assert loaded.units == "m"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": ("d.png", "b.png")}, r"several frames b\.png"),
+        ({"pose_names": ("a.png", "b.png", "x.png")}, r"no true pose of the frame c\.png"),
+        ({"pose_names": ("a.png", "b.png")}, "3 true poses for 2 frames"),
+    ],
+)
+def test_frames_without_names_or_poses_of_their_own_are_refused_before_anything_is_written(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    capture, truth = example_capture()
+    with pytest.raises(BadFile, match=message):
+        _capture_folder.save_capture(tmp_path / "capture", capture, replace(truth, **change))
+    assert not (tmp_path / "capture").exists()
+
+
 # Folders of other tools -----------------------------------------------------------------------------------------------
 
 

@@ -13,14 +13,20 @@ import numpy as np
 from torch import Tensor
 
 from tumble.io import BadFile, files
-from tumble.scene import Camera, Capture, Truth
+from tumble.scene import Camera, Capture, Truth, Units
 
 MAPS = ("albedo", "roughness", "metalness", "normal", "depth")
 """Ground-truth maps of an evaluation view; a map is a folder of truth/ and the key `<map>_path` of a frame."""
 
 
 def capture_document(
-    camera: Camera, light: str, frames: list[dict[str, Any]], *, setting: str | None, with_light: bool
+    camera: Camera,
+    light: str,
+    frames: list[dict[str, Any]],
+    *,
+    setting: str | None,
+    with_light: bool,
+    units: Units = "arbitrary",
 ) -> dict[str, Any]:
     """Content of a transforms.json.
 
@@ -29,12 +35,13 @@ def capture_document(
         frames: Entries from `training_frame` and `evaluation_frame`.
         setting: Label of the capture setting; None writes none.
         with_light: Whether there is a truth/light.hdr.
+        units: Unit of the poses.
     """
     fx, fy, cx, cy = camera.fx_fy_cx_cy.tolist()
     intrinsics = {"w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
     label = {} if setting is None else {"setting": setting}
     light_path = {"light_path": "truth/light.hdr"} if with_light else {}
-    head = {"camera_model": "OPENCV", **intrinsics, "light": light, **label, **light_path, "units": "arbitrary"}
+    head = {"camera_model": "OPENCV", **intrinsics, "light": light, **label, **light_path, "units": units}
     return head | {"frames": frames}
 
 
@@ -67,10 +74,11 @@ def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, se
     """Write a capture, and optionally its ground truth, as a new folder.
 
     Raises:
-        BadFile: `path` exists and is not an empty folder.
+        BadFile: `path` exists and is not an empty folder, or the frames have no files or poses of their own.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise BadFile(path, "exists already", "choose a new folder")
+    _require_storable(path, capture, truth)
     for name, image, mask in zip(capture.names, capture.images, capture.masks, strict=True):
         _save_image_and_mask(path, name, image, mask)
     if capture.full_images is not None:
@@ -85,8 +93,30 @@ def save_capture(path: Path, capture: Capture, truth: Truth | None = None, *, se
     if truth is not None:
         frames += _save_truth(path, capture, truth)
     with_light = truth is not None and truth.light is not None
-    fields = capture_document(capture.camera, capture.light, frames, setting=setting, with_light=with_light)
+    fields = capture_document(
+        capture.camera,
+        capture.light,
+        frames,
+        setting=setting,
+        with_light=with_light,
+        units="arbitrary" if truth is None else truth.units,
+    )
     files.write_json(path / "transforms.json", fields | ({"focal_source": "guess"} if capture.focal_assumed else {}))
+
+
+def _require_storable(path: Path, capture: Capture, truth: Truth | None) -> None:
+    """Check that all frames have different names, and that there are true poses of all training frames or of none."""
+    names = [*capture.names, *(() if truth is None else truth.names)]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise BadFile(path, f"would have several frames {repeated[0]}", "training and evaluation frames need own names")
+    if truth is None or truth.poses is None:
+        return
+    posed = truth.pose_names or capture.names
+    if len(posed) != len(truth.poses):
+        raise BadFile(path, f"would have {len(truth.poses)} true poses for {len(posed)} frames", "give pose_names")
+    if missing := [name for name in capture.names if name not in posed]:
+        rule = f"would have no true pose of the frame {missing[0]}, but of others"
+        raise BadFile(path, rule, "select the frames that have one, or leave out the true poses")
 
 
 def _save_image_and_mask(path: Path, name: str, image: Tensor, mask: Tensor) -> None:
@@ -100,7 +130,7 @@ def _save_truth(path: Path, capture: Capture, truth: Truth) -> list[dict[str, An
     for light, environment in truth.lights.items():
         environment.write(path / "truth" / "lights" / f"{light}.hdr")
     if truth.poses is not None:
-        poses = dict(zip(capture.names, truth.poses.camera_to_object().tolist(), strict=True))
+        poses = dict(zip(truth.pose_names or capture.names, truth.poses.camera_to_object().tolist(), strict=True))
         files.write_json(path / "truth" / "poses.json", poses)
     if truth.trajectory is None:
         return []
