@@ -144,12 +144,13 @@ def test_the_hand_turns_with_the_object_and_changes_its_place(box: Path) -> None
         assert (end_cam[:, 0].abs() / end_cam[:, 2]).min() * poses[t].xyz[2] > 1.9
 
 
-@pytest.mark.parametrize("length", [0.2, 0.26, 0.4])
+@pytest.mark.parametrize("length", [0.03, 0.2, 0.26, 0.4])
 def test_an_arm_of_any_length_has_the_same_topology(length: float) -> None:
     hand = rig.read_rig()
     wrist, along = hand.bind[0, :3, 3], torch.tensor([0.36, 0.48, 0.8], dtype=torch.float64)
     parts = arm.forearm_parts(hand, torch.eye(4, dtype=torch.float64), wrist + length * along, 1.0, 0.5, 0)
     assert {name: len(part.vertices) for name, part in parts.items()} == {"forearm": 15 * 29, "sleeve": 48 * 29}
+    assert all(np.isfinite(part.vertices).all() for part in parts.values())
     end = parts["sleeve"].vertices[-29:].mean(0) - wrist.numpy()
     assert end @ along.numpy() > length, "the sleeve reaches beyond the elbow"
 

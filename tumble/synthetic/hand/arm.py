@@ -30,6 +30,8 @@ CUFF = 0.055
 """Length of the forearm that the sleeve leaves bare [metres]."""
 ELBOW_RADIUS = 0.047
 """Radius of the forearm at the elbow [metres]."""
+SHORTEST = 0.1
+"""Minimum distance of the elbow from the wrist [metres]: a shorter forearm has no room for cuff and sleeve."""
 BEND_LENGTH = 0.07
 """Distance behind the wrist over which the forearm turns to the elbow [metres]."""
 
@@ -124,6 +126,19 @@ def hand_part(rig: Rig, vertices: Float[Tensor, "v 3"], tone: float) -> Part:
     return Part(points, normals, faces, rig.uv.numpy(), skin_texture(tone), rough)
 
 
+def distant_elbow(wrist: Float[Tensor, "*b 3"], elbow: Float[Tensor, "*b 3"], metre: float) -> Float[Tensor, "*b 3"]:
+    """The position of the elbow, moved away from the wrist if it is nearer than `SHORTEST`.
+
+    Args:
+        wrist: Position of the wrist.
+        elbow: Position of the elbow.
+        metre: Length of a metre in the unit of the positions.
+    """
+    offset = elbow - wrist
+    distance = offset.norm(dim=-1, keepdim=True)
+    return torch.where(distance < SHORTEST * metre, wrist + offset / distance * SHORTEST * metre, elbow)
+
+
 def forearm_curve(
     wrist: Float[Tensor, "*b 3"], back: Float[Tensor, "*b 3"], elbow: Float[Tensor, "*b 3"], metre: float
 ) -> Float[Tensor, "*b n 3"]:
@@ -159,6 +174,7 @@ def forearm_parts(
     half = (end.amax(0) - end.amin(0))[:2].numpy() / 2
     middle = torch.cat([(end.amax(0) + end.amin(0))[:2] / 2, end.new_tensor([-INSIDE * metre])])
     start = axes[:, 3] + axes[:, :3] @ middle
+    elbow = distant_elbow(axes[:, 3], elbow, metre)
     curve = forearm_curve(start, axes[:, 2], elbow, metre).numpy()
     length = np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
     # The same number of rings at every length: the path tracer moves vertices, it does not add any.
