@@ -5,6 +5,7 @@ millimetres in BOP), and the poses that are read are projected by `Camera`.
 """
 
 import json
+import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -508,6 +509,23 @@ def test_frames_with_lenses_of_their_own_are_resampled_to_one_camera(tmp_path: P
     assert capture.masks[0, 3, 3] == BACKGROUND
     assert (capture.masks[1, :, -1] == UNKNOWN).all()
     assert (capture.masks == OBJECT).flatten(1).any(1).all()
+
+
+@pytest.mark.parametrize("own", [{"fl_x": 90.0}, {"camera_angle_x": 2 * math.atan(32 / 90)}])
+def test_the_focal_length_of_a_frame_takes_precedence_under_each_of_its_names(own: Any, tmp_path: Path) -> None:
+    save(tmp_path / "0.png", np.full((48, 64, 3), 99, np.uint8))
+    for general in ({"fl_x": 60.0, "fl_y": 61.0}, {"camera_angle_x": 1.0, "fl_y": 61.0}):
+        files.write_json(tmp_path / "transforms.json", {**general, "frames": [{"file_path": "0.png", **own}]})
+        assert folder.load(tmp_path).camera.fx_fy_cx_cy[:2].tolist() == pytest.approx([90, 90])
+
+
+def test_a_frame_with_an_impossible_principal_point_is_refused(tmp_path: Path) -> None:
+    for name in ("0.png", "1.png"):
+        save(tmp_path / name, np.full((48, 64, 3), 99, np.uint8))
+    frames = [{"file_path": "0.png"}, {"file_path": "1.png", "cx": 1e308}]
+    files.write_json(tmp_path / "transforms.json", {"fl_x": 60.0, "frames": frames})
+    with pytest.raises(BadFile, match=r"transforms\.json: has its principal point at \(1e\+308, 24\)"):
+        folder.load(tmp_path)
 
 
 def test_a_scene_with_two_camera_matrices_is_resampled_to_one(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Captures from images and masks, shared by the readers of third-party layouts."""
 
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import torch
 from jaxtyping import UInt8
 
 from tumble.datasets._lens import FrameLens, common_lens, resample
-from tumble.datasets._plausibility import plausible_focal
+from tumble.datasets._plausibility import plausible_centre, plausible_focal
 from tumble.io import BadFile, files, limits
 from tumble.scene import BACKGROUND, Capture, Light
 
@@ -21,7 +20,8 @@ def opencv_lens(path: Path, K: np.ndarray, height: int, width: int) -> FrameLens
         BadFile: The matrix in `path` is not that of a camera.
     """
     fx, fy, cx, cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
-    if not (plausible_focal(fx, height, width) and plausible_focal(fy, height, width) and math.isfinite(cx + cy)):
+    plausible = plausible_focal(fx, height, width) and plausible_focal(fy, height, width)
+    if not (plausible and plausible_centre(cx, cy, height, width)):
         raise BadFile(path, f"has the camera matrix {K.tolist()} for images of {width} x {height}", "it is in pixels")
     return FrameLens((fx, fy, cx, cy), height, width)
 

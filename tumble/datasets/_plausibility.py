@@ -58,6 +58,12 @@ def plausible_focal(focal: float, height: int, width: int) -> bool:
     return bool(low <= focal <= high)
 
 
+def plausible_centre(cx: float, cy: float, height: int, width: int) -> bool:
+    """Whether a principal point [pixels] may be that of a crop of a photo; no infinity and no NaN."""
+    limit = MAX_CENTRE_OFFSET * max(height, width)
+    return abs(cx) <= limit and abs(cy) <= limit
+
+
 def check_plausible(capture: Capture, where: Path) -> None:
     """Check a capture against all rules; warns if the object is not in the unit sphere or has no mask.
 
@@ -93,8 +99,8 @@ def _impossible_focal(capture: Capture) -> str | None:
 
 def _impossible_centre(capture: Capture) -> str | None:
     cx, cy = capture.camera.fx_fy_cx_cy[2:].tolist()
-    limit = MAX_CENTRE_OFFSET * max(capture.camera.height, capture.camera.width)
-    return None if abs(cx) <= limit and abs(cy) <= limit else f"({cx:.3g}, {cy:.3g})"
+    plausible = plausible_centre(cx, cy, capture.camera.height, capture.camera.width)
+    return None if plausible else f"({cx:.3g}, {cy:.3g})"
 
 
 def _no_motion(capture: Capture) -> str | None:

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -76,6 +76,12 @@ class TransformsRecord(Intrinsics, frozen=True, kw_only=True):
     def split(self, name: str) -> list[FrameRecord]:
         """The frames of a split."""
         return [frame for frame in self.frames if frame.split == name]
+
+
+def stated_intrinsics(record: Intrinsics) -> dict[str, Any]:
+    """The values of a document or frame that are not null, by name."""
+    values = {name: getattr(record, name) for name in Intrinsics.__struct_fields__}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def read(root: Path) -> TransformsRecord:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tumble.datasets import _transforms
 from tumble.datasets._lens import FrameLens, common_lens, resample
-from tumble.datasets._plausibility import MAX_DISTORTION, plausible_focal
+from tumble.datasets._plausibility import MAX_DISTORTION, plausible_centre, plausible_focal
 from tumble.datasets._transforms import TRANSFORMS, FrameRecord, Matrix, TransformsRecord
 from tumble.io import BadFile, files, limits
 from tumble.maths import linear_from_srgb, to_srgb8
@@ -123,14 +123,14 @@ def _lenses(folder: _Folder, frames: Sequence[FrameRecord]) -> _Lenses:
 
 
 def _intrinsics(frame: FrameRecord, document: TransformsRecord | None) -> dict[str, Any]:
-    """The intrinsics that are stated in a frame or else in the document, by name."""
-    values = {}
-    for name in _transforms.Intrinsics.__struct_fields__:
-        value = getattr(frame, name)
-        value = getattr(document, name) if value is None and document is not None else value
-        if value is not None:
-            values[name] = value
-    return values
+    """The intrinsics that are stated in a frame or else in the document, by name.
+
+    The focal length has several names: a frame that states it under one of them does not take it from the document.
+    """
+    own, general = ({} if record is None else _transforms.stated_intrinsics(record) for record in (frame, document))
+    if own.keys() & {"fl_x", "camera_angle_x"}:
+        general = {name: value for name, value in general.items() if name not in ("fl_x", "fl_y", "camera_angle_x")}
+    return general | own
 
 
 def _lens(folder: _Folder, frame: FrameRecord) -> FrameLens:
@@ -155,6 +155,9 @@ def _lens(folder: _Folder, frame: FrameRecord) -> FrameLens:
     if max(map(abs, distortion)) > MAX_DISTORTION:
         raise BadFile(folder.path, f"has the distortion coefficients {distortion}", f"the limit is {MAX_DISTORTION:g}")
     centre = stated.get("cx", width / 2), stated.get("cy", height / 2)
+    if not plausible_centre(*centre, height, width):
+        rule = f"has its principal point at ({centre[0]:.3g}, {centre[1]:.3g}) for images of {width} x {height}"
+        raise BadFile(folder.path, rule, '"cx" and "cy" are in pixels')
     return FrameLens((*focals, *centre), height, width, distortion if fisheye or any(distortion) else (), fisheye)
 
 
