@@ -302,6 +302,15 @@ def test_a_pixel_in_the_masks_of_both_object_and_hand_is_object(tmp_path: Path) 
     assert torch.equal(labels == UNKNOWN, ~alone)
 
 
+def test_a_mask_of_the_hand_of_another_size_than_that_of_the_object_is_refused(tmp_path: Path) -> None:
+    path = write_ho3d(tmp_path, ending=".png", masks="masks_XMem")
+    save(tmp_path / "masks_XMem" / "SM1_hand" / "0002.png", np.full((4, 5), 255, np.uint8))
+    with pytest.raises(
+        BadFile, match=rf"SM1_hand/0002\.png: has 5 x 4 pixels, but .*00002\.png has {WIDTH} x {HEIGHT}"
+    ):
+        ho3d.load(path)
+
+
 def test_masks_beside_a_sequence_are_found_from_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_ho3d(tmp_path, ending=".png", masks="masks_XMem")
     monkeypatch.chdir(path)

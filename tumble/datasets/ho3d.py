@@ -146,17 +146,24 @@ def _mask(root: Path, image: Path) -> UInt8[np.ndarray, "h w"] | None:
         mask = decode_nonempty_mask(values, mask_file) if values.any() else values
     elif (path := xmem / root.name / f"{int(image.stem):05}.png").exists():
         hand = xmem / f"{root.name}_hand" / f"{int(image.stem):04}.png"
-        mask = _from_parts(files.read_image(path), files.read_image(hand) if hand.exists() else None)
+        mask = _from_parts(path, hand)
     elif seg.exists():
         mask = _from_colours(files.read_image(seg), image)
     return mask if mask is not None and (mask == OBJECT).any() else None
 
 
-def _from_parts(
-    object_: UInt8[np.ndarray, "h w c"], hand: UInt8[np.ndarray, "h w d"] | None
-) -> UInt8[np.ndarray, "h w"]:
-    is_hand = np.zeros_like(object_[..., 0]) if hand is None else hand[..., :3].max(-1)
-    return np.select([object_[..., :3].max(-1) > 0, is_hand > 0], [OBJECT, UNKNOWN], 0).astype(np.uint8)
+def _from_parts(object_file: Path, hand_file: Path) -> UInt8[np.ndarray, "h w"]:
+    """Mask from the file of the object's mask and that of the hand's, which may be missing; object where they overlap.
+
+    Raises:
+        BadFile: They have different sizes.
+    """
+    is_object = files.read_image(object_file)[..., :3].max(-1) > 0
+    is_hand = files.read_image(hand_file)[..., :3].max(-1) > 0 if hand_file.exists() else np.zeros_like(is_object)
+    if is_hand.shape != is_object.shape:
+        sizes = [f"{x.shape[1]} x {x.shape[0]}" for x in (is_hand, is_object)]
+        raise BadFile(hand_file, f"has {sizes[0]} pixels, but {object_file} has {sizes[1]}", "they must agree")
+    return np.select([is_object, is_hand], [OBJECT, UNKNOWN], 0).astype(np.uint8)
 
 
 def _from_colours(seg: UInt8[np.ndarray, "h w c"], image: Path) -> UInt8[np.ndarray, "H W"]:
