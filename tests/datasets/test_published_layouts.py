@@ -102,10 +102,12 @@ def test_without_maps_and_test_views_only_poses_are_known(tmp_path: Path) -> Non
 
 
 def test_of_many_test_views_evenly_spaced_ones_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tensoir, "MAX_VIEWS", 2)
-    truth = tensoir.load_truth(spheres.write_tensoir(tmp_path, n_test=5))
-    assert truth is not None
-    assert truth.names == ("test_000.png", "test_002.png")
+    path = spheres.write_tensoir(tmp_path, n_test=5)
+    for n, numbers in ((2, (0, 2)), (3, (0, 1, 3)), (4, (0, 1, 2, 3)), (5, range(5))):
+        monkeypatch.setattr(tensoir, "MAX_VIEWS", n)
+        truth = tensoir.load_truth(path)
+        assert truth is not None
+        assert truth.names == tuple(f"test_{i:03}.png" for i in numbers)
 
 
 def test_views_elsewhere_have_lenses_and_lights_of_their_own(written: Any) -> None:

@@ -161,12 +161,12 @@ def load_truth(path: Path | str) -> Truth | None:
 
 
 def _split(root: Path, name: str) -> _Views:
-    """The training views, or `MAX_VIEWS` of the test views."""
+    """The training views, or `MAX_VIEWS` evenly spaced ones of the test views."""
     if not recognises(root):
         raise BadFile(root, "is not a scene of TensoIR-Synthetic", f"expected {LAYOUT}")
     folders = sorted(path for path in root.glob(f"{name}_[0-9]*") if path.is_dir())
-    step = max(1, len(folders) // MAX_VIEWS)
-    return _Views(root, tuple(folders if name == "train" else folders[::step][:MAX_VIEWS]))
+    n = len(folders) if name == "train" else min(len(folders), MAX_VIEWS)
+    return _Views(root, tuple(folders[i * len(folders) // n] for i in range(n)))
 
 
 def _matrix(path: Path, metadata: _Metadata) -> Float[Tensor, "1 4 4"]:
