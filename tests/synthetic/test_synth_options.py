@@ -26,3 +26,18 @@ def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_capture_is_rendered_with_the_largest_seed(box: Path, tmp_path: Path) -> None:
     out = synthesize.render_capture(box, tmp_path / "out", SynthOptions(env="white", film=True, seed=2**32 - 1, **TINY))
     assert (out / "transforms.json").is_file()
+
+
+def test_a_capture_is_not_resumed_if_one_of_two_lights_of_the_same_name_has_changed(box: Path, tmp_path: Path) -> None:
+    env, relight = tmp_path / "a" / "room.hdr", tmp_path / "b" / "room.hdr"
+    for i, path in enumerate((env, relight)):
+        path.parent.mkdir()
+        path.write_bytes(bytes([i]))
+    options = SynthOptions(env=str(env), relight=(str(relight),), **TINY)
+    before = synthesize._manifest(box, options)
+    assert list(before["sources"]) == ["box.glb", "room.hdr", "relight/room.hdr"]
+    env.write_bytes(b"2")
+    after = synthesize._manifest(box, options)
+    assert after != before
+    env.write_bytes(relight.read_bytes())
+    assert list(synthesize._manifest(box, options)["sources"]) == ["box.glb", "room.hdr"]

@@ -143,7 +143,11 @@ def _manifest(model: Path, options: SynthOptions) -> dict[str, Any]:
         return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16]
 
     option_values = dataclasses.asdict(options) | {"relight": [Path(name).name for name in options.relight]}
-    sources = {Path(name).name: digest(name) for name in (str(model), options.env, *options.relight)}
+    sources: dict[str, str] = {}
+    for role, name in (("model", str(model)), ("env", options.env), *(("relight", name) for name in options.relight)):
+        key, value = Path(name).name, digest(name)
+        # Two files of one name are told apart by what they are for.
+        sources[key if sources.get(key, value) == value else f"{role}/{key}"] = value
     return {
         "tumble": __version__,
         "model": model.name,
