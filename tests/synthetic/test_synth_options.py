@@ -1,5 +1,6 @@
 """Unusual options of synthetic captures: large seeds, lights and names that clash, and what is refused."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,35 @@ def test_a_capture_is_not_resumed_if_one_of_two_lights_of_the_same_name_has_chan
     assert after != before
     env.write_bytes(relight.read_bytes())
     assert list(synthesize._manifest(box, options)["sources"]) == ["box.glb", "room.hdr"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"material": "diffuse", "roughness": 0.3}, "a diffuse material has no roughness"),
+        ({"exposure": math.inf}, "exposure is out of range"),
+        ({"exposure": math.nan}, "exposure is out of range"),
+        ({"env_rotation": math.nan}, "env_rotation is out of range"),
+        ({"relight": ("a\\b.hdr",)}, "which no folder can have"),
+        ({"relight": ("maps/...hdr",)}, "which no folder can have"),
+    ],
+)
+def test_options_without_meaning_are_refused(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SynthOptions(env="white", **change)
+
+
+def test_an_unknown_skin_is_refused() -> None:
+    options = SynthOptions(env="white")
+    object.__setattr__(options, "skin", "pale")  # because tests check the types of arguments
+    with pytest.raises(ValueError, match="skin is out of range: pale"):
+        options.__post_init__()
+
+
+@pytest.mark.parametrize("values", [(0.5, 0.0), (0.201, 0.204)])
+def test_a_roughness_sweep_is_checked_before_anything_is_rendered(
+    box: Path, tmp_path: Path, values: tuple[float, ...]
+) -> None:
+    with pytest.raises(ValueError, match="roughness"):
+        synthesize.render_captures(box, tmp_path / "out", SynthOptions(env="white", **TINY), values)
+    assert not (tmp_path / "out").exists()

@@ -1,12 +1,14 @@
 """Options of `tumble synth`. The module imports nothing heavy, so that `--help` is fast."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from tyro.conf import arg
 
 Setting = Literal["dome", "turntable", "handheld", "turned"]
+Skin = Literal["light", "medium", "dark"]
 Background = Literal["none", "wall", "desk", "clutter", "torso"]
 
 
@@ -60,7 +62,7 @@ class SynthOptions:
     hand: bool = False
     """A hand holds the object on the training frames and takes it anew from time to time. Only with --setting handheld.
     Without it all else stays the same."""
-    skin: Annotated[Literal["light", "medium", "dark"] | float, arg(metavar="light|medium|dark|VALUE")] = "medium"
+    skin: Annotated[Skin | float, arg(metavar="light|medium|dark|VALUE")] = "medium"
     """Skin tone of the hand, or a number from 0 (light) to 1 (dark)."""
     background: Background = "none"
     """What is behind the object on the training frames. none: black; clutter: a desk with boxes; torso: a person who
@@ -81,10 +83,11 @@ class SynthOptions:
             "samples": self.samples >= 1 and self.truth_samples >= 1,
             "path_depth": self.path_depth >= 2,
             "roughness": self.roughness is None or 0 < self.roughness <= 1,
-            "exposure": self.exposure is None or self.exposure > 0,
+            "exposure": self.exposure is None or 0 < self.exposure < math.inf,
+            "env_rotation": math.isfinite(self.env_rotation),
             "eval_shared": self.eval_shared >= 0 and self.eval_sphere >= 0,
             "seed": 0 <= self.seed < 2**32,
-            "skin": isinstance(self.skin, str) or 0 <= self.skin <= 1,
+            "skin": self.skin in get_args(Skin) if isinstance(self.skin, str) else 0 <= self.skin <= 1,
         }
         if invalid := [name for name, valid in in_range.items() if not valid]:
             raise ValueError(f"{invalid[0]} is out of range: {getattr(self, invalid[0])} (see tumble synth --help)")
@@ -98,8 +101,16 @@ class SynthOptions:
             raise ValueError("the turns of the light are known only together with the poses: leave out --pose-free")
         if self.setting in ("dome", "turned") and (self.film or self.background != "none"):
             raise ValueError("the camera of a dome moves: a film or a background needs another --setting")
-        stems = [Path(name).stem for name in self.relight]
-        if len(set(stems)) < len(stems):
-            raise ValueError(
-                f"the file names of the relight maps must differ, these are {', '.join(stems)}: rename one of them"
-            )
+        if self.roughness is not None and self.material == "diffuse":
+            raise ValueError("a diffuse material has no roughness: leave out --roughness, or use another --material")
+        _require_light_names([Path(name).stem for name in self.relight])
+
+
+def _require_light_names(names: list[str]) -> None:
+    """Check that the names of the relight maps differ and that folders can have them, as docs/format.md requires."""
+    if len(set(names)) < len(names):
+        raise ValueError(
+            f"the file names of the relight maps must differ, these are {', '.join(names)}: rename one of them"
+        )
+    if invalid := [name for name in names if name in ("", ".", "..") or "\\" in name]:
+        raise ValueError(f"a relight map has the name {invalid[0]!r}, which no folder can have: rename the file")

@@ -412,10 +412,13 @@ def render_captures(
 
     Returns:
         The capture folders.
+
+    Raises:
+        ValueError: A roughness is out of range, or two would have the same folder; nothing is rendered then.
     """
     if not roughness_sweep:
         return [render_capture(model, out, options)]
-    return [
-        render_capture(model, out / f"r{value:.2f}", dataclasses.replace(options, roughness=value))
-        for value in roughness_sweep
-    ]
+    captures = {f"r{value:.2f}": dataclasses.replace(options, roughness=value) for value in roughness_sweep}
+    if len(captures) < len(roughness_sweep):
+        raise ValueError(f"the roughnesses {roughness_sweep} must differ in their first two decimals")
+    return [render_capture(model, out / name, each) for name, each in captures.items()]
