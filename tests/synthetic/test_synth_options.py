@@ -3,11 +3,14 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba", reason="needs the extra `synth`")
 trimesh = pytest.importorskip("trimesh", reason="needs the extra `synth`")
 
+from tumble.io import files  # noqa: E402
+from tumble.io.files import BadFile  # noqa: E402
 from tumble.synthetic import synthesize  # noqa: E402
 from tumble.synthetic.options import SynthOptions  # noqa: E402
 
@@ -74,3 +77,11 @@ def test_a_roughness_sweep_is_checked_before_anything_is_rendered(
     with pytest.raises(ValueError, match="roughness"):
         synthesize.render_captures(box, tmp_path / "out", SynthOptions(env="white", **TINY), values)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_black_light_is_refused(box: Path, tmp_path: Path) -> None:
+    files.write_hdr(tmp_path / "night.hdr", np.zeros((8, 16, 3), np.float32))
+    for lights in ({"env": str(tmp_path / "night.hdr")}, {"env": "white", "relight": (str(tmp_path / "night.hdr"),)}):
+        with pytest.raises(BadFile, match=r"night\.hdr: is black"):
+            synthesize.render_capture(box, tmp_path / "out", SynthOptions(**lights, **TINY))
+        assert not (tmp_path / "out").exists()

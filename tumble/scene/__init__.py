@@ -23,7 +23,7 @@ from tumble.scene.capture import (
     target_view,
     truth_without_views,
 )
-from tumble.scene.environment import Environment, bilinear
+from tumble.scene.environment import MIN_RADIANCE, Environment, bilinear
 from tumble.scene.gaussians import Gaussians, constant_sh, opacity, quats_from_normals, sdf_from_opacity
 from tumble.scene.match import Match, View, empty_match
 from tumble.scene.material import DIELECTRIC, TEMPERATURE, Material
@@ -40,6 +40,7 @@ __all__ = [
     "Gaussians",
     "Light",
     "Match",
+    "MIN_RADIANCE",
     "Material",
     "OBJECT",
     "REGIONS",

@@ -21,7 +21,17 @@ from tumble import __version__
 from tumble.datasets import MAPS, capture_document, evaluation_frame, training_frame
 from tumble.io import BadFile, files, outputs, progress, video
 from tumble.maths import SE3, SO3, to_srgb8
-from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Environment, Light, env_from_obj, opengl_from_opencv
+from tumble.scene import (
+    BACKGROUND,
+    MIN_RADIANCE,
+    OBJECT,
+    UNKNOWN,
+    Camera,
+    Environment,
+    Light,
+    env_from_obj,
+    opengl_from_opencv,
+)
 from tumble.synthetic import film, pathtracer
 from tumble.synthetic.options import SynthOptions
 from tumble.synthetic.surroundings import Surroundings, surroundings
@@ -206,10 +216,16 @@ def _frames(options: SynthOptions, poses: SE3) -> Iterator[_Frame]:
 
 
 def _read_light(name: str) -> Environment:
-    """The environment map in a file, at most `LIGHT_ROWS` high; for "white" a uniform one of radiance 1."""
+    """The environment map in a file, at most `LIGHT_ROWS` high; for "white" a uniform one of radiance 1.
+
+    Raises:
+        BadFile: The file is no environment map, or black everywhere.
+    """
     if name == "white":
         return Environment.from_radiance(torch.ones(16, 32, 3))
     light = Environment.read(Path(name))
+    if light.radiance.max() < 1.01 * MIN_RADIANCE:  # the exposure would make a white light of the lower limit
+        raise BadFile(Path(name), f"is black: no radiance is above {MIN_RADIANCE:g}", "choose or scale up another map")
     return light if light.log_radiance.shape[0] <= LIGHT_ROWS else light.resampled(LIGHT_ROWS, 2 * LIGHT_ROWS)
 
 
