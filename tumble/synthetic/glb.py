@@ -24,6 +24,10 @@ NODE_BYTES = 1 << 15
 """Memory of a node, which limits their number to 16000 [bytes]."""
 INDEX_BYTES = 24
 """Memory of an index of one instance of a mesh [bytes]."""
+EXTENSIONS = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_xmp_json_ld")
+"""Extensions that a file may require: they are read, or change nothing that is read."""
+MATERIAL_EXTENSIONS = "KHR_materials_"
+"""Beginning of the names of extensions of materials, which may be required, too."""
 
 Index = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -69,6 +73,7 @@ class _Gltf(msgspec.Struct, frozen=True):
     buffers: list[_Buffer] = []
     bufferViews: list[_View] = []
     images: list[_Image] = []
+    extensionsRequired: list[str] = []
 
 
 def require_glb(path: Path) -> None:
@@ -88,6 +93,10 @@ def require_glb(path: Path) -> None:
     document = files.parse_json(path, content[20 : 20 + length], _Gltf)
     if any(part.uri is not None for part in (*document.buffers, *document.images)):
         raise BadFile(path, "refers to other files", "save it with all data inside")
+    required = [name for name in document.extensionsRequired if not name.startswith(MATERIAL_EXTENSIONS)]
+    if unknown := [name for name in required if name not in EXTENSIONS]:
+        known = f"only {', '.join(EXTENSIONS)} and {MATERIAL_EXTENSIONS}* may be required"
+        raise BadFile(path, f"requires the extension {unknown[0]}", f"save it without; {known}")
     try:
         _require_tree(path, document)
         geometry = _geometry_bytes(document)
