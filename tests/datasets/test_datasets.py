@@ -537,6 +537,18 @@ def test_a_frame_with_an_impossible_principal_point_is_refused(tmp_path: Path) -
         folder.load(tmp_path)
 
 
+def test_pixels_beyond_a_distorted_image_are_unknown_if_it_has_no_mask(tmp_path: Path) -> None:
+    save(tmp_path / "0.png", np.full((48, 64, 3), 99, np.uint8))
+    save(tmp_path / "mask.png", np.full((48, 64), 255, np.uint8))
+    frames = [{"file_path": "0.png"}]
+    for label in (UNKNOWN, BACKGROUND):
+        files.write_json(tmp_path / "transforms.json", {"fl_x": 60.0, "k1": 0.3, "frames": frames})
+        mask = folder.load(tmp_path).masks[0]
+        assert mask[0, 0] == label
+        assert mask[24, 32] == OBJECT
+        frames = [{"file_path": "0.png", "mask_path": "mask.png"}]
+
+
 def test_a_scene_with_two_camera_matrices_is_resampled_to_one(tmp_path: Path) -> None:
     """Of BOP: the disks of the frame with the longer lens are where the common camera projects the points."""
     path = write_bop(tmp_path)

@@ -74,13 +74,23 @@ def common_lens(path: Path, lenses: Sequence[FrameLens]) -> FrameLens:
 
 
 def resample(
-    image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], lens: FrameLens, common: FrameLens
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: UInt8[np.ndarray, "h w"],
+    lens: FrameLens,
+    common: FrameLens,
+    *,
+    beyond: int = BACKGROUND,
 ) -> tuple[UInt8[np.ndarray, "i j 3"], UInt8[np.ndarray, "i j"]]:
-    """Image and mask of a frame as the common lens sees them."""
+    """Image and mask of a frame as the common lens sees them.
+
+    Args:
+        beyond: Label of pixels outside the image of a lens that differs from the common one by distortion only; with
+            other lenses they are unknown.
+    """
     if lens == common:
         return image, mask
     remap = _remapping(lens, common)
-    unseen = BACKGROUND if lens.pinhole == common else UNKNOWN
+    unseen = beyond if lens.pinhole == common else UNKNOWN
     labels = remap(mask, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT, unseen)
     return remap(image, cv2.INTER_LINEAR), labels
 

@@ -25,6 +25,7 @@ from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.scene import (
     BACKGROUND,
     OBJECT,
+    UNKNOWN,
     Camera,
     Capture,
     Environment,
@@ -194,7 +195,9 @@ def _read_image_and_mask(
         mask_path = files.path_inside(folder.root, frame.mask_path)
         mask = decode_nonempty_mask(_require_size(files.read_image(mask_path), mask_path, lens)[..., 0], mask_path)
         image = blacken_background(image, mask)
-    image, mask = resample(image, mask, lens, common)
+    # The object of a mask ends before the border of the image; without a mask, nothing is known beyond.
+    masked = bool(frame.mask_path) or pixels.shape[2] == 4
+    image, mask = resample(image, mask, lens, common, beyond=BACKGROUND if masked else UNKNOWN)
     if not (mask == OBJECT).any():
         raise BadFile(
             folder.root / (frame.mask_path or frame.file_path),
