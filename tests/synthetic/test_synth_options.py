@@ -1,5 +1,6 @@
 """Unusual options of synthetic captures: large seeds, lights and names that clash, and what is refused."""
 
+import itertools
 import math
 from pathlib import Path
 
@@ -11,8 +12,8 @@ trimesh = pytest.importorskip("trimesh", reason="needs the extra `synth`")
 
 from tumble.io import files  # noqa: E402
 from tumble.io.files import BadFile  # noqa: E402
-from tumble.synthetic import synthesize  # noqa: E402
-from tumble.synthetic.options import SynthOptions  # noqa: E402
+from tumble.synthetic import backgrounds, film, synthesize, trajectories  # noqa: E402
+from tumble.synthetic.options import MAX_FOV, SynthOptions  # noqa: E402
 
 # Dr.Jit emits deprecation warnings about its own code when it is imported.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -51,6 +52,8 @@ def test_a_capture_is_not_resumed_if_one_of_two_lights_of_the_same_name_has_chan
     ("change", "message"),
     [
         ({"material": "diffuse", "roughness": 0.3}, "a diffuse material has no roughness"),
+        ({"background": "torso", "fov": 60.0}, "at most 55 degrees"),
+        ({"background": "desk", "fov": 80.0}, "at most 52 degrees"),
         ({"exposure": math.inf}, "exposure is out of range"),
         ({"exposure": math.nan}, "exposure is out of range"),
         ({"env_rotation": math.nan}, "env_rotation is out of range"),
@@ -85,3 +88,20 @@ def test_a_black_light_is_refused(box: Path, tmp_path: Path) -> None:
         with pytest.raises(BadFile, match=r"night\.hdr: is black"):
             synthesize.render_capture(box, tmp_path / "out", SynthOptions(**lights, **TINY))
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("kind", "wider"), [("wall", film.WIDER), ("torso", film.WIDER), ("desk", (1, 1))])
+def test_a_background_fills_the_largest_field_of_view_that_is_allowed(kind: str, wider: tuple[float, float]) -> None:
+    for fov in (30.0, MAX_FOV[kind]):
+        tangent = math.tan(math.radians(fov) / 2)
+        parts = backgrounds.background_parts(kind, trajectories.distance_for(math.radians(fov)), 0)
+        corners = parts["desk" if kind == "desk" else "wall"].vertices
+        sides = corners[1:] - corners[0]
+        lengths = np.linalg.norm(sides, axis=1)
+        across, down = sides[lengths < 1.1 * lengths.min()]
+        for x, y in itertools.product((-1, 1), repeat=2):
+            ray = np.array([x * wider[0] * tangent, y * wider[1] * tangent, 1.0])
+            a, b, depth = np.linalg.solve(np.stack([across, down, -ray], 1), -corners[0])
+            assert depth > 0
+            assert min(a, b) >= 0
+            assert max(a, b) <= 1

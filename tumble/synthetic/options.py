@@ -10,6 +10,9 @@ from tyro.conf import arg
 Setting = Literal["dome", "turntable", "handheld", "turned"]
 Skin = Literal["light", "medium", "dark"]
 Background = Literal["none", "wall", "desk", "clutter", "torso"]
+MAX_FOV = {"none": 120.0, "wall": 70.0, "desk": 52.0, "clutter": 52.0, "torso": 55.0}
+"""Maximum field of view with each background [degrees]: a wall or a desk would end inside a wider image, and a wall
+inside the film of a wider image."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,11 @@ class SynthOptions:
             raise ValueError("the turns of the light are known only together with the poses: leave out --pose-free")
         if self.setting in ("dome", "turned") and (self.film or self.background != "none"):
             raise ValueError("the camera of a dome moves: a film or a background needs another --setting")
+        if self.fov > MAX_FOV[self.background]:
+            limit = f"a field of view of at most {MAX_FOV[self.background]:g} degrees"
+            raise ValueError(
+                f"the background {self.background} fills {limit}, not {self.fov:g}: choose a smaller --fov"
+            )
         if self.roughness is not None and self.material == "diffuse":
             raise ValueError("a diffuse material has no roughness: leave out --roughness, or use another --material")
         _require_light_names([Path(name).stem for name in self.relight])
