@@ -195,6 +195,12 @@ def test_a_scaled_recipe_has_the_same_rates_weights_and_switches(name: str, fact
     assert part[".refine.steps"] == whole[".refine.steps"] * factor
 
 
+def test_closing_rounds_are_scaled_like_all_steps() -> None:
+    track = recipes.scaled(recipes.progressive_poses(recipes.DRAFT), 0.1).track
+    assert isinstance(track, progressive.Config)
+    assert track.closing_steps == 15
+
+
 @pytest.mark.parametrize("name", ["draft", "standard", "full"])
 def test_the_ladder_leads_from_the_paper_to_the_recipe(name: str) -> None:
     """No setting departs twice, each rung changes something, and nothing is left at its end."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
-from tumble.engine import Progress, Stage, run
+from tumble.engine import Progress, Stage, loop, run
 from tumble.inverse_rendering import absolute_colour, albedo_solve, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
 from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours
@@ -302,10 +302,13 @@ def _track(
                 if capture.focal_assumed:
                     text = "the focal length is a guess, which the progressive route does not refine"
                     warnings.warn(f"{text}: give --focal or --fov", stacklevel=2)
-                inputs = progressive.gather(capture, matches, partial(sfm.assess, inputs))
+                inputs = progressive.gather(capture, inputs.matches, partial(sfm.assess, inputs))
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]
+    if route is progressive:
+        # Stage `sfm` assesses the poses of both routes.
+        keys.append(loop.fingerprint(sfm.VERSION, run.constants(sfm)))
     return run.stage(opened, mask_refinement.folder(number), route, recipe.track, inputs, keys)
 
 

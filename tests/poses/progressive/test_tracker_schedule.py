@@ -1,6 +1,11 @@
 """The schedule of the tracker, counted by hand."""
 
+from typing import Any
+
+import pytest
+
 from tumble.poses.progressive import tracker
+from tumble.poses.progressive.registration import Motion
 from tumble.poses.progressive.tracker import Phases
 
 
@@ -27,3 +32,19 @@ def test_a_phase_may_have_no_steps() -> None:
 def test_frames_are_tracked_in_both_directions_from_the_start() -> None:
     assert tracker.tracking_order(0, 4) == [0, 1, 2, 3]
     assert tracker.tracking_order(2, 5) == [2, 3, 4, 1, 0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"motion": Motion()},  # the default of poses are networks
+        {"closing": 1},
+        {"motion": "steady", "closing": 1},
+        {"start": "matched"},
+        {"window": 1},
+        {"pose_steps": 0, "joint_steps": 0},
+    ],
+)
+def test_settings_that_cannot_work_are_refused_at_once(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"set|needed"):
+        tracker.Config(**changes)

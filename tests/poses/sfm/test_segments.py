@@ -185,3 +185,13 @@ def test_windows_are_used_if_they_are_certain_and_agree_with_a_neighbour() -> No
     assert segments._runs(windows([certain] * 4, [0.0] * 4)) == [[0, 1, 2, 3]]
     assert segments._runs(windows([certain, certain, doubtful, certain, certain], [0.0] * 5)) == [[0, 1], [3, 4]]
     assert segments._runs(windows([certain] * 4, [0.0, 0.0, 30.0, 30.0])) == [[0, 1], [2, 3]]
+
+
+def test_poses_of_another_method_are_not_confirmed_by_matches(scene: Tumble, inputs: stage.Inputs) -> None:
+    """One frame is turned by 60 degrees; with all frames confirmed, none would be lost."""
+    right, wrong = truth(scene), 8
+    turned = replace(right, T_cam_obj=SE3(right.T_cam_obj.wxyz.clone(), right.T_cam_obj.xyz))
+    turn = SO3.exp(torch.tensor([0.6, 0.8, 0.3]))
+    turned.T_cam_obj.wxyz[wrong] = (turn @ right.T_cam_obj.rotation[wrong]).wxyz
+    assert not stage.assess(inputs, right).quality.lost[wrong]
+    assert stage.assess(inputs, turned).quality.lost[wrong]

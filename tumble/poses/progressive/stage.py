@@ -15,7 +15,7 @@ from tumble.poses.progressive import tracker, virtual_camera
 from tumble.poses.result import PoseResult
 from tumble.scene import Capture, Match, Trajectory
 
-VERSION = 8
+VERSION = 9
 VIRTUAL_SIZE = 128
 """Height and width of the virtual frames [pixels]."""
 PNP_POINTS = 1000

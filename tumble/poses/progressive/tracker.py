@@ -195,6 +195,17 @@ class Config:
     rates: Rates = field(default_factory=Rates)
     """Learning rates."""
 
+    def __post_init__(self) -> None:
+        registers = isinstance(self.motion, Motion)
+        if registers and self.poses != "vectors":
+            raise ValueError('motion=Motion(...) registers frames, whose poses cannot be networks: set poses="vectors"')
+        if not registers and (self.closing or self.start == "matched"):
+            raise ValueError('closing rounds and start="matched" need a registration: set motion=Motion(...)')
+        if self.window < 2:
+            raise ValueError(f"window is {self.window}: at least the newest frame and the one before it are needed")
+        if not (registers or self.pose_steps + self.joint_steps):
+            raise ValueError("without a registration, poses need steps: set pose_steps or joint_steps above 0")
+
     @property
     def phases(self) -> Phases:
         """Number of steps of each phase of a frame."""

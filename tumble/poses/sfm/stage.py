@@ -575,9 +575,8 @@ def finish(cfg: Config, inputs: Inputs, state: State) -> PoseResult:
         # Matches and contours agree on either side of a gap, but not on the turn between both sides.
         disagreement = disagreement.clamp_min(turns.doubt)
     parts = None if turns is None or turns.is_better else turns.confirmed
-    solution = Solution(
-        state.params.R, state.params.t, inputs.radius, disagreement, posed if inputs.hidden else None, parts
-    )
+    confirmed = state.memory.get("posed") if inputs.hidden else None  # None as well for poses of another method
+    solution = Solution(state.params.R, state.params.t, inputs.radius, disagreement, confirmed, parts)
     tracks = _steady_tracks(inputs, state)
     contours = replace(inputs.contours, reliable=inputs.contours.reliable & posed[:, None])
     tracks = tracks.select(posed[tracks.frame])
