@@ -84,9 +84,9 @@ class Tracking:
     """given: use the capture's poses if it has any, else estimate them. estimate: always estimate them."""
     route: Annotated[Literal["graph", "progressive"] | None, arg(help_behavior_hint="")] = None
     """graph: matches and silhouettes of all frames at once. progressive: the paper's, a neural field that grows frame
-    by frame; with quality paper at the paper's size, which takes days on a CPU, else with voxel grids, which takes
-    minutes: 1 to 3 degrees on four objects, lost on a duck with little texture (benchmarks/poses.md). Default: graph;
-    progressive with quality paper."""
+    by frame, on the CPU whatever the device; with quality paper at the paper's size, which takes days, else with voxel
+    grids, which takes minutes: 1 to 3 degrees on four objects, lost on a duck with little texture
+    (benchmarks/poses.md). Default: graph; progressive with quality paper."""
     matcher: str = "mixed"
     """Finds corresponding pixels in two frames.
     mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations.

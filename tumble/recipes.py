@@ -209,7 +209,7 @@ QUICK_TRACK = progressive.Config(
     inside=1.0,
     block=2,
     reset=360.0,
-    weights=progressive.Weights(mask=2.0, match=0.2),
+    weights=progressive.Weights(mask=2.0),
     rates=progressive.Rates(poses=1e-4, poses_decay=0.3, fields=5e-3, sharpness=2e-3, ramp=1),
 )
 """The progressive stage for two CPU cores: voxel grids in place of the paper's networks, initial poses from matches

@@ -178,9 +178,10 @@ def drive(
                 scalars = _step(step, cfg, inputs, state, checkpoint)
                 state.step += 1
                 show(state.step, scalars)
-                if state.step % every == 0 or state.step == total or interrupted():
+                stop = interrupted()  # once, lest a signal in between stops the stage without a save
+                if state.step % every == 0 or state.step == total or stop:
                     save()
-                if interrupted():
+                if stop:
                     raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
         return stage.finish(cfg, inputs, state)
 

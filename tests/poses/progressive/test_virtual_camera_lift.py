@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 
 from tests.oracles.virtual_camera import disagreement
@@ -65,3 +66,12 @@ def test_disagreement_of_a_translation_is_its_length() -> None:
     _, _, truth = scene()
     shifted = Trajectory(SE3(truth.T_cam_obj.wxyz, truth.T_cam_obj.xyz + torch.tensor([0.0, 0.3, 0.4])), "camera")
     assert abs(disagreement(shifted, truth)[1] - 0.5) < 1e-5
+
+
+def test_a_shape_without_a_surface_is_named() -> None:
+    """Its radius is negative."""
+    rng = torch.Generator().manual_seed(0)
+    sizes = Sizes(width=48, depth=3, skip=0, features=4, octaves=2, colour_width=8, colour_depth=1, radius=-0.5)
+    net = sdf_field.sphere_initialised(sizes, rng)
+    with pytest.raises(ValueError, match="tracking has failed"):
+        virtual_camera.surface_points(net.sdf, 500, rng, resolution=16)

@@ -119,7 +119,7 @@ class Weights:
     mask: float = 5.0
     """Weight of the mask loss."""
     match: float = 0.1
-    """Weight of the match loss."""
+    """Weight of the match loss, of either direction."""
 
 
 @dataclass(frozen=True)
@@ -480,7 +480,8 @@ def _loss_terms(cfg: Config, inputs: Inputs, state: State, now: SchedulePoint, k
         terms["eikonal"] = cfg.weights.eikonal * neus.eikonal_loss(rendered)
     if match is not None:
         residual, weight = _match_residual(inputs, rendered, (batches[-2].T_aim_obj, batches[-1].T_aim_obj), match)
-        terms["match"] = cfg.weights.match * neus.huber_loss(residual, weight, threshold=cfg.huber)
+        # FMOV adds the means of both directions; here one mean is over both.
+        terms["match"] = 2 * cfg.weights.match * neus.huber_loss(residual, weight, threshold=cfg.huber)
     return terms
 
 

@@ -123,9 +123,11 @@ def surface_points(sdf: Sdf | Grids, n: int, rng: torch.Generator, *, resolution
     ticks = (torch.arange(resolution, dtype=like.dtype, device=like.device) + 0.5) / resolution * 2 - 1
     x_obj = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     distance = torch.cat([sdf_field.distance(sdf, part) for part in x_obj.split(1 << 16)])
-    # Fraction of each cell inside the shape, as `visual_hull.surface` expects it.
-    inside = (0.5 - distance * resolution / 4).clamp(0, 1)
+    # Fraction of each cell, whose side is 2 / resolution, inside the shape, as `visual_hull.surface` expects it.
+    inside = (0.5 - distance * resolution / 2).clamp(0, 1)
     inside = torch.where(x_obj.norm(dim=-1) < 1, inside, 0.0)
+    if not bool((inside > 0.5).any()):
+        raise ValueError("the tracked shape has no surface in the unit sphere, tracking has failed: try --route graph")
     return visual_hull.sample_surface(inside.reshape(resolution, resolution, resolution), n, rng).positions
 
 
