@@ -88,6 +88,8 @@ def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
         (50, 0.4, 3, 0.5, 80, False),
         (110, 0.4, 3, 0.5, 80, True),
         (50, 0.2, 1, 0.1, 80, True),  # contours confirm it
+        (50, 0.2, 0, 0.1, 80, False),  # but chance may have one keypoint in each of many frames
+        (50, 0.2, 1, 0.15, 80, False),
         (50, 0.2, 1, 0.1, 70, False),  # too few to confirm it
         (30, 0.6, 3, 0.1, 80, False),
     ],
