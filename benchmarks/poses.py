@@ -126,7 +126,9 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
     if route == "graph":
         tracked, unclosed = drive(sfm, DRAFT.track, inputs, seed=0), None
     else:
-        tracked, unclosed = progressive_results(progressive.gather(capture, matches, partial(sfm.assess, inputs)))
+        tracked, unclosed = progressive_results(
+            progressive.gather(capture, inputs.matches, partial(sfm.assess, inputs))
+        )
     seconds = time.perf_counter() - started
     quality = tracked.quality
     scores = {}

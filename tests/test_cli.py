@@ -50,6 +50,17 @@ def test_the_help_names_frames_and_size_of_every_quality(
         assert f"draft {usual['draft']}, standard {usual['standard']}, full and paper {usual['paper']}." in said
 
 
+def test_the_help_says_that_poses_are_estimated_on_the_cpu(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where it speaks of a GPU: at the device, at the route and at the quality of the paper."""
+    assert run(monkeypatch, "run", "--help") == 0
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Poses are estimated on the CPU, with any device" in said
+    assert "Both run on the CPU, whatever --device is." in said
+    assert "takes days on the CPU unless poses are given" in said
+
+
 def test_a_film_is_converted_as_the_quality_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

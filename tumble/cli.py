@@ -35,7 +35,10 @@ Overwrite = Annotated[
 ]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
-    arg(help="Where to compute. cuda: on an NVIDIA GPU (benchmarks/gpu.md). auto: on one if there is one."),
+    arg(
+        help="Where to compute. cuda: on an NVIDIA GPU (benchmarks/gpu.md). auto: on one if there is one. "
+        "Poses are estimated on the CPU, with any device; only networks that match frames use it."
+    ),
 ]
 OCCUPIES_GPU = {"auto": None, "cpu": False, "cuda": True}
 """Whether a task on a cluster occupies a GPU, by device; None: if the cluster has any."""
@@ -84,9 +87,9 @@ class Tracking:
     """given: use the capture's poses if it has any, else estimate them. estimate: always estimate them."""
     route: Annotated[Literal["graph", "progressive"] | None, arg(help_behavior_hint="")] = None
     """graph: matches and silhouettes of all frames at once. progressive: the paper's, a neural field that grows frame
-    by frame, on the CPU whatever the device; with quality paper at the paper's size, which takes days, else with voxel
-    grids, which takes minutes: 1 to 3 degrees on four objects, lost on a duck with little texture
-    (benchmarks/poses.md). Default: graph; progressive with quality paper."""
+    by frame; with quality paper at the paper's size, which takes days, else with voxel grids, which takes minutes:
+    1 to 3 degrees on four objects, lost on a duck with little texture (benchmarks/poses.md). Both run on the CPU,
+    whatever --device is. Default: graph; progressive with quality paper."""
     matcher: str = "mixed"
     """Finds corresponding pixels in two frames.
     mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations.
@@ -197,8 +200,9 @@ def run(
             standard: 20,000 and 10,000 steps, for a GPU, 1 to 2 dB ahead of draft. On an H200, with half as many
             Gaussians as now, 75 seconds for 100 frames of 512 x 512 pixels with known poses (benchmarks/gpu.md).
             full: 150,000 steps each, for a GPU. Never run.
-            paper: the paper's stages and numbers instead of ours, for a GPU. Run only at a fraction of its size
-            (docs/method.md), where it is far behind draft.
+            paper: the paper's stages and numbers instead of ours, for a GPU, apart from its stage 1 (--route), which
+            takes days on the CPU unless poses are given. Run only at a fraction of its size (docs/method.md), where it
+            is far behind draft.
         tracking: How the poses are found.
         adjustment: Orientation and colour of the results.
         pick: Draw a box around the object in the browser, on the first sharp frame or on frame `--at`; then, if you

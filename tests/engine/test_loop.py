@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -171,6 +171,27 @@ def test_a_run_resumed_after_ctrl_c_equals_an_uninterrupted_one_bit_for_bit(tmp_
     resumed = drive(THIS, Config(), Inputs(at={stops[-1]: crash}), seed=3, checkpoint=path)
     assert bits(resumed) == uninterrupted()
     assert [p.name for p in path.parent.iterdir()] == ["state.safetensors"]
+
+
+def test_a_signal_between_two_steps_is_not_lost_and_has_a_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One right after the loop has asked for signals, and one while the last state is saved."""
+    path, answers, save = tmp_path / "state", iter([False, True, True]), loop._save
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "_interrupts", lambda: nullcontext(lambda: next(answers)))
+        with pytest.raises(KeyboardInterrupt, match="stopped at step 2 of 30; run the same command again to continue"):
+            drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    assert loop.peek(path)[0] == 2
+
+    def save_and_press(state: State, *others: Any) -> None:
+        save(state, *others)
+        press_ctrl_c(state)
+
+    monkeypatch.setattr(loop, "_save", save_and_press)
+    with pytest.raises(KeyboardInterrupt, match="stopped at step 30 of 30"):
+        drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)
+    assert bits(drive(THIS, Config(), Inputs(), seed=3, checkpoint=path)) == uninterrupted()
 
 
 @pytest.mark.parametrize("stop", [7, 8, 9, 22])

@@ -178,11 +178,13 @@ def drive(
                 scalars = _step(step, cfg, inputs, state, checkpoint)
                 state.step += 1
                 show(state.step, scalars)
-                stop = interrupted()  # once, lest a signal in between stops the stage without a save
-                if state.step % every == 0 or state.step == total or stop:
+                stops = interrupted()  # asked once, so that a signal after it has its state saved by the next step
+                if state.step % every == 0 or state.step == total or stops:
                     save()
-                if stop:
-                    raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
+                if stops:
+                    break
+            if interrupted():
+                raise KeyboardInterrupt(_stop_message(name, state.step, total, checkpoint))
         return stage.finish(cfg, inputs, state)
 
 

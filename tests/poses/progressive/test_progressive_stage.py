@@ -3,17 +3,24 @@
 import math
 import sys
 from functools import partial
+from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
 from torch.nn.functional import normalize
 
 from tests.lopsided import truth, tumbling
 from tests.poses.progressive.test_tracker import INPUTS, ON_A_SPHERE, SMOKE, TRUTH
-from tumble import recipes
+from tests.poses.sfm.test_segments import hidden, matched
+from tumble import matching, pipeline, recipes
+from tumble.engine import run
 from tumble.engine.loop import Stage, drive
 from tumble.maths.se3 import angle_between
 from tumble.poses.progressive import stage as progressive
+from tumble.poses.sfm import finalize
 from tumble.poses.sfm import stage as sfm
+from tumble.scene import Capture, Match
 
 
 def test_true_poses_are_rated_good() -> None:
@@ -54,6 +61,52 @@ def test_lifting_by_epnp_gives_the_poses_of_the_closed_form() -> None:
     assert angle_between(exact.rotation, lifted.rotation).max() < 1e-2
     assert (exact.xyz - lifted.xyz).abs().max() < 2e-2
     assert not torch.equal(exact.xyz, lifted.xyz)
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, list[str]]]:
+    """Inputs and their keys that the pipeline has given to stage 1, which is replaced by the truth."""
+    scene, calls = tumbling(12, points=300), []
+
+    def stage(opened: run.Run, folder: str, stage: Stage, cfg: Any, inputs: Any, keys: list[str]) -> Any:
+        calls.append((inputs, keys))
+        return sfm.assess(sfm.gather(scene.capture, ()), truth(scene)), "key"
+
+    monkeypatch.setattr(run, "stage", stage)
+    return calls
+
+
+def track(capture: Capture, matches: list[Match], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stage 1 of the pipeline by the progressive route."""
+    monkeypatch.setattr(matching, "match_pairs", lambda *_, **__: tuple(matches))
+    recipe = recipes.progressive_poses(recipes.DRAFT)
+    pipeline._track(run.Run(None, recipe), capture, Path("film"), "", 1, "cpu")
+
+
+def test_the_pixels_of_a_hand_are_not_tracked(given: list, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stage gets only the matches whose ends are not both on what hides the object."""
+    scene = tumbling(12, points=300)
+    capture = hidden(scene)
+    found = matched(scene, capture, [(t - 1, t) for t in range(1, 12)])
+    track(capture, found, monkeypatch)
+    of_object = sfm.gather(capture, found, hidden=True).matches
+    for match, expected, raw in zip(given[0][0].track.matches, of_object, found, strict=True):
+        assert len(expected) < len(raw)
+        assert torch.equal(match.uv_i, expected.uv_i)
+
+
+def test_another_assessment_makes_stage_1_run_again(given: list, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a constant of a module that `progressive` does not import, or by the version of the other route."""
+    capture = tumbling(12).capture
+    track(capture, [], monkeypatch)
+    track(capture, [], monkeypatch)
+    monkeypatch.setattr(finalize, "MAX_RESIDUAL", 2 * finalize.MAX_RESIDUAL)
+    track(capture, [], monkeypatch)
+    monkeypatch.setattr(sfm, "VERSION", sfm.VERSION + 1)
+    track(capture, [], monkeypatch)
+    first, again, constant, version = (tuple(keys) for _, keys in given)
+    assert first == again
+    assert len({first, constant, version}) == 3
 
 
 def test_recipes_select_the_progressive_route() -> None:

@@ -42,7 +42,7 @@ from tumble.poses.progressive.sdf_field import Fields, Sdf, Sizes
 from tumble.poses.progressive.virtual_camera import Aim
 from tumble.scene import OBJECT, Capture, Match
 
-VERSION = 4
+VERSION = 5
 OBJECT_PIXELS = 160
 """Diameter of the object in the frame whose pixels are the unit of match residuals [pixels].
 
