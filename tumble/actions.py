@@ -401,7 +401,8 @@ def relight_run(
     missing = _missing_images(images, about)
     if missing:
         files.write_json(images / LIGHT_FILE, about)
-        poses = Trajectory(asset.trajectory.T_cam_obj, "object").select(missing)
+        poses = Trajectory(asset.trajectory.T_cam_obj, "object")
+        poses = poses if len(missing) == n else poses.select(missing)
         views = progress.track(
             relight(asset, light, poses, cfg=_relighting(out), fast=fast), f"relighting under {env.stem}", len(missing)
         )
