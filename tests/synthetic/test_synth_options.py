@@ -90,6 +90,20 @@ def test_a_black_light_is_refused(box: Path, tmp_path: Path) -> None:
         assert not (tmp_path / "out").exists()
 
 
+def test_files_that_a_killed_call_left_are_removed(box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But not those of a process that is still running, such as the first one of all."""
+    options = SynthOptions(env="white", **TINY)
+    files.write_json(tmp_path / synthesize.SETTINGS_FILE, synthesize._manifest(box, options))
+    dead, alive = tmp_path / "truth" / f".partial-{2**22 + 1}-x.hdr", tmp_path / ".partial-1-x.json"
+    for path in (dead, alive):
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"half")
+    monkeypatch.setattr(synthesize, "_expose_lights", lambda *_: {})
+    monkeypatch.setattr(synthesize, "_render_frame", lambda *_: None)
+    synthesize.render_capture(box, tmp_path, options)
+    assert (dead.exists(), alive.exists()) == (False, True)
+
+
 @pytest.mark.parametrize(("kind", "wider"), [("wall", film.WIDER), ("torso", film.WIDER), ("desk", (1, 1))])
 def test_a_background_fills_the_largest_field_of_view_that_is_allowed(kind: str, wider: tuple[float, float]) -> None:
     for fov in (30.0, MAX_FOV[kind]):

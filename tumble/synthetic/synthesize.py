@@ -127,6 +127,7 @@ def render_capture(model: Path, out: Path, options: SynthOptions) -> Path:
     pathtracer.mitsuba()
     context = _context(parts, out, options)
     resuming = _prepare_folder(out, manifest)
+    files.remove_partial_files(out)
     frames = list(_frames(options, context.poses))
     lights = _expose_lights(context, unexposed, frames, resuming)
     for number, frame in enumerate(progress.track(frames, f"rendering {out.name}", len(frames))):
