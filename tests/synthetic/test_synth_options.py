@@ -82,6 +82,13 @@ def test_a_roughness_sweep_is_checked_before_anything_is_rendered(
     assert not (tmp_path / "out").exists()
 
 
+def test_the_folders_of_a_roughness_sweep_are_checked_before_anything_is_rendered(box: Path, tmp_path: Path) -> None:
+    files.write_json(tmp_path / "r0.40" / "diary.json", {})
+    with pytest.raises(BadFile, match=r"r0\.40: holds other files"):
+        synthesize.render_captures(box, tmp_path, SynthOptions(env="white", **TINY), (0.3, 0.4))
+    assert [path.name for path in tmp_path.iterdir()] == ["r0.40"]
+
+
 def test_a_black_light_is_refused(box: Path, tmp_path: Path) -> None:
     files.write_hdr(tmp_path / "night.hdr", np.zeros((8, 16, 3), np.float32))
     for lights in ({"env": str(tmp_path / "night.hdr")}, {"env": "white", "relight": (str(tmp_path / "night.hdr"),)}):

@@ -431,11 +431,14 @@ def render_captures(
         The capture folders.
 
     Raises:
+        BadFile: A folder of the sweep holds something else; nothing is rendered then.
         ValueError: A roughness is out of range, or two would have the same folder; nothing is rendered then.
     """
     if not roughness_sweep:
         return [render_capture(model, out, options)]
-    captures = {f"r{value:.2f}": dataclasses.replace(options, roughness=value) for value in roughness_sweep}
+    captures = {out / f"r{value:.2f}": dataclasses.replace(options, roughness=value) for value in roughness_sweep}
     if len(captures) < len(roughness_sweep):
         raise ValueError(f"the roughnesses {roughness_sweep} must differ in their first two decimals")
-    return [render_capture(model, out / name, each) for name, each in captures.items()]
+    for folder in captures:
+        outputs.claim_folder(folder, SETTINGS_FILE, fix="choose another folder with -o")
+    return [render_capture(model, folder, each) for folder, each in captures.items()]
