@@ -144,7 +144,7 @@ def test_the_hand_turns_with_the_object_and_changes_its_place(box: Path) -> None
         assert (end_cam[:, 0].abs() / end_cam[:, 2]).min() * poses[t].xyz[2] > 1.9
 
 
-@pytest.mark.parametrize("length", [0.03, 0.2, 0.26, 0.4])
+@pytest.mark.parametrize("length", [0.2, 0.26, 0.4])
 def test_an_arm_of_any_length_has_the_same_topology(length: float) -> None:
     hand = rig.read_rig()
     wrist, along = hand.bind[0, :3, 3], torch.tensor([0.36, 0.48, 0.8], dtype=torch.float64)
@@ -153,6 +153,24 @@ def test_an_arm_of_any_length_has_the_same_topology(length: float) -> None:
     assert all(np.isfinite(part.vertices).all() for part in parts.values())
     end = parts["sleeve"].vertices[-29:].mean(0) - wrist.numpy()
     assert end @ along.numpy() > length, "the sleeve reaches beyond the elbow"
+
+
+@pytest.mark.parametrize("length", [0.01, 0.03, 0.06, 0.09])
+@pytest.mark.parametrize("along", [(0.36, 0.48, 0.8), (0.6, 0.8, 0.0), (0.36, 0.48, -0.8)])
+def test_only_an_arm_that_is_too_short_for_its_sleeve_is_lengthened(length: float, along: tuple[float, ...]) -> None:
+    """The curve may be long enough although its elbow is near; it then stays as it is."""
+    hand = rig.read_rig()
+    identity, wrist = torch.eye(4, dtype=torch.float64), hand.bind[0, :3, 3]
+    elbow = wrist + length * torch.tensor(along, dtype=torch.float64)
+    parts = arm.forearm_parts(hand, identity, elbow, 1.0, 0.5, 0)
+    assert {name: len(part.vertices) for name, part in parts.items()} == {"forearm": 15 * 29, "sleeve": 48 * 29}
+    rings = parts["sleeve"].vertices.reshape(48, 29, 3).mean(1)
+    assert np.linalg.norm(np.diff(rings, axis=0), axis=1).min() > 0, "every ring is farther along the arm"
+    # The last ring is around the end of the curve, 15 percent beyond the elbow (`forearm_curve`), unless it was moved.
+    end = parts["sleeve"].vertices.reshape(48, 29, 3)[-1, :28].mean(0)
+    curve = arm.forearm_curve(wrist - arm.INSIDE * hand.bind[0, :3, 2], hand.bind[0, :3, 2], elbow, 1.0)
+    if curve.diff(dim=0).norm(dim=-1).sum() > 0.1:
+        assert np.linalg.norm(end - curve[-1].numpy()) < 0.02
 
 
 def test_a_dark_skin_is_darker_and_its_palm_lighter_than_its_back() -> None:

@@ -30,8 +30,9 @@ CUFF = 0.055
 """Length of the forearm that the sleeve leaves bare [metres]."""
 ELBOW_RADIUS = 0.047
 """Radius of the forearm at the elbow [metres]."""
-SHORTEST = 0.1
-"""Minimum distance of the elbow from the wrist [metres]: a shorter forearm has no room for cuff and sleeve."""
+MIN_FOREARM = 0.09
+"""Distance from the wrist at which the elbow is put if the forearm is shorter than what the sleeve leaves bare, because
+beside a large object the hand is small, and the border of the image as near [metres]."""
 BEND_LENGTH = 0.07
 """Distance behind the wrist over which the forearm turns to the elbow [metres]."""
 
@@ -126,19 +127,6 @@ def hand_part(rig: Rig, vertices: Float[Tensor, "v 3"], tone: float) -> Part:
     return Part(points, normals, faces, rig.uv.numpy(), skin_texture(tone), rough)
 
 
-def distant_elbow(wrist: Float[Tensor, "*b 3"], elbow: Float[Tensor, "*b 3"], metre: float) -> Float[Tensor, "*b 3"]:
-    """The position of the elbow, moved away from the wrist if it is nearer than `SHORTEST`.
-
-    Args:
-        wrist: Position of the wrist.
-        elbow: Position of the elbow.
-        metre: Length of a metre in the unit of the positions.
-    """
-    offset = elbow - wrist
-    distance = offset.norm(dim=-1, keepdim=True)
-    return torch.where(distance < SHORTEST * metre, wrist + offset / distance * SHORTEST * metre, elbow)
-
-
 def forearm_curve(
     wrist: Float[Tensor, "*b 3"], back: Float[Tensor, "*b 3"], elbow: Float[Tensor, "*b 3"], metre: float
 ) -> Float[Tensor, "*b n 3"]:
@@ -174,11 +162,13 @@ def forearm_parts(
     half = (end.amax(0) - end.amin(0))[:2].numpy() / 2
     middle = torch.cat([(end.amax(0) + end.amin(0))[:2] / 2, end.new_tensor([-INSIDE * metre])])
     start = axes[:, 3] + axes[:, :3] @ middle
-    elbow = distant_elbow(axes[:, 3], elbow, metre)
-    curve = forearm_curve(start, axes[:, 2], elbow, metre).numpy()
-    length = np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
-    # The same number of rings at every length: the path tracer moves vertices, it does not add any.
     cuff, overlap = CUFF * metre, (CUFF + 0.03) * metre
+    curve = forearm_curve(start, axes[:, 2], elbow, metre).numpy()
+    if _lengths(curve)[-1] <= overlap:
+        away = torch.nn.functional.normalize(elbow - start, dim=0)
+        curve = forearm_curve(start, axes[:, 2], start + MIN_FOREARM * metre * away, metre).numpy()
+    length = _lengths(curve)
+    # The same number of rings at every length: the path tracer moves vertices, it does not add any.
     fine = np.concatenate(
         [np.linspace(0, cuff, 13)[:-1], np.linspace(cuff, overlap, 3)[:-1], np.linspace(overlap, length[-1], 46)]
     )
@@ -196,6 +186,11 @@ def forearm_parts(
     sleeve = curve[covered, None] + wrinkles * (rings[covered] - curve[covered, None])
     sleeve[0] = curve[covered][0] + 0.9 * (sleeve[0] - curve[covered][0])
     return {"forearm": tube(rings[bare], skin, SKIN_ROUGHNESS), "sleeve": tube(sleeve, cloth, 0.9, repeats=2)}
+
+
+def _lengths(curve: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Length of a curve from its beginning to each of its points."""
+    return np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
 
 
 def _rings(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.maths import SE3, angle_between
-from tumble.synthetic.hand.arm import distant_elbow, forearm_curve, forearm_parts, hand_part
+from tumble.synthetic.hand.arm import forearm_curve, forearm_parts, hand_part
 from tumble.synthetic.hand.grasp import (
     SURFACE_SAMPLES,
     Grasps,
@@ -135,7 +135,7 @@ def plan(model: ObjectModel, T_cam_obj: SE3, *, facing: bool, seed: int) -> Hand
         hand = compared.grasps.vertices(rig, compared.grasps.flexion)[:, ::3]
         shown = torch.zeros(len(score), PLAN_SAMPLES, dtype=torch.bool)
         for pose in moments:
-            elbow_obj = distant_elbow(compared.wrist, pose.inverse() @ compared.elbows, metre)
+            elbow_obj = pose.inverse() @ compared.elbows
             arm = forearm_curve(compared.wrist, compared.back, elbow_obj, metre)[:, 4:]
             visible, cosine = _visible(surface, pose.inverse().xyz, hand, arm, metre)
             hidden = 1 - (cosine * visible).sum(-1) / cosine.sum()
