@@ -77,6 +77,9 @@ class SimulatedGpu(TorchDispatchMode):
         kwargs = dict(kwargs or {})
         name = function.__name__.partition(".")[0]
         tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
+        if any(x.device.type == DEVICE.type and not isinstance(x, OnDevice) for x in tensors):
+            # PyTorch fills it from Python values without telling anybody: its values would be arbitrary.
+            raise RuntimeError(f"{name}: a tensor was made on the device from Python values; make it first, then move")
         there = [x for x in tensors if isinstance(x, OnDevice)]
         target = kwargs.get("device")
         target = torch.device(target).type if target is not None else None

@@ -4,7 +4,6 @@ Functions that take an `Asset` are for notebooks. Functions that take a run dire
 line: they read the asset from the run and write their output into it.
 """
 
-import hashlib
 import itertools
 import math
 import tempfile
@@ -385,13 +384,13 @@ def relight_run(
     """
     gain = _gain(exposure)
     asset, light = finished(out, device), Environment.read(env)
-    sha256, n = _sha256(env), len(asset.trajectory)
+    sha256, n = files.sha256(env), len(asset.trajectory)
     images = images or _relit_folder(out, env.stem, sha256)
     outputs.claim_folder(images, LIGHT_FILE, overwrite=overwrite)
     about = {
         "light": str(env.resolve()),
         "sha256": sha256,
-        "asset": _sha256(out / run.ASSET),
+        "asset": files.sha256(out / run.ASSET),
         "fast": fast,
         "exposure": exposure,
         "images": n,
@@ -401,19 +400,13 @@ def relight_run(
     missing = _missing_images(images, about)
     if missing:
         files.write_json(images / LIGHT_FILE, about)
-        poses = Trajectory(asset.trajectory.T_cam_obj, "object")
-        poses = poses if len(missing) == n else poses.select(missing)
+        poses = Trajectory(asset.trajectory.T_cam_obj, "object").select(missing)
         views = progress.track(
             relight(asset, light, poses, cfg=_relighting(out), fast=fast), f"relighting under {env.stem}", len(missing)
         )
         for number, linear in zip(missing, views, strict=True):
             files.write_png(images / f"{number:04}.png", to_srgb8(gain * linear).cpu().numpy())
     return images
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _missing_images(images: Path, about: dict[str, Any]) -> list[int]:

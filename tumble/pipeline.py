@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
-from tumble.engine import Progress, Stage, loop, run
+from tumble.engine import Progress, Stage, run
 from tumble.inverse_rendering import absolute_colour, albedo_solve, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
 from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours
@@ -308,7 +308,7 @@ def _track(
     keys = [content, matching.settings(recipe.matcher)]
     if route is progressive:
         # Stage `sfm` assesses the poses of both routes.
-        keys.append(loop.fingerprint(sfm.VERSION, run.constants(sfm)))
+        keys.append(run.key("assess", sfm, sfm.Config(), []))
     return run.stage(opened, mask_refinement.folder(number), route, recipe.track, inputs, keys)
 
 

@@ -376,8 +376,8 @@ def scaled(recipe: Recipe, factor: float) -> Recipe:
     fewer, smaller = partial(_times, factor), partial(_times, math.sqrt(factor))
     track, second, third, relight = recipe.track, recipe.refine, recipe.decompose, recipe.relight
     if isinstance(track, progressive.Config):
-        steps = {name: fewer(getattr(track, name), 1) for name in ("warmup", "pose_steps", "joint_steps")}
-        steps["closing_steps"] = fewer(track.closing_steps, 1)
+        phases = ("warmup", "pose_steps", "joint_steps", "closing_steps")
+        steps = {name: fewer(getattr(track, name), 1) for name in phases}
         rays = {name: smaller(getattr(track, name), 16) for name in ("rays", "old_rays", "match_rays")}
         # The skip connection of the distance network needs a width above that of the encoded point, 39.
         widths = {name: smaller(getattr(track.sizes, name), 64) for name in ("width", "features", "colour_width")}

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -140,9 +139,7 @@ def _render(rendering: _Rendering) -> None:
 def _key(task: CaptureTask, options: SynthOptions) -> str:
     """Hash of everything that determines a rendered capture."""
     names = (task.case.model, options.env, *options.relight)
-    contents = [
-        hashlib.sha256(path.read_bytes()).hexdigest() if (path := _file(task.data, name)) else "" for name in names
-    ]
+    contents = [files.sha256(path) if (path := _file(task.data, name)) else "" for name in names]
     return loop.fingerprint(names, contents, options, source_fingerprint(("synthetic",)))
 
 

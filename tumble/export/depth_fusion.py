@@ -90,7 +90,7 @@ def signed_distances(
     values[:cells, :cells, :cells] = blocks.repeat_interleave(4, 0).repeat_interleave(4, 1).repeat_interleave(4, 2)
     values[corners] = fused(torch.stack(corners, -1))
     # The grid's own faces are outside, so that the surface is closed.
-    values[[0, -1]], values[:, [0, -1]], values[:, :, [0, -1]] = TRUNCATION, TRUNCATION, TRUNCATION
+    values[::cells], values[:, ::cells], values[:, :, ::cells] = TRUNCATION, TRUNCATION, TRUNCATION
     return values.cpu().numpy()
 
 

@@ -8,6 +8,7 @@ against `limits` before decoding it. Documents are parsed and validated at once,
 
 import contextlib
 import errno
+import hashlib
 import json
 import math
 import os
@@ -112,6 +113,12 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of the content of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextlib.contextmanager

@@ -96,13 +96,10 @@ def check_footage(
     """
     outputs.require_outside(out, path)
     outputs.claim_folder(out, video_to_capture.PREVIEW, overwrite=overwrite)
-    source, known = {"footage": str(path.resolve())}, out / SOURCE_FILE
-    if (
-        known.is_file()
-        and not overwrite
-        and (other := files.read_json(known, dict[str, str], outputs.OTHER_PLACE)) != source
-    ):
-        raise BadFile(out, f"holds the preview of {other.get('footage')}", outputs.OTHER_PLACE)
+    known, source = out / SOURCE_FILE, {"footage": str(path.resolve())}
+    shown = files.read_json(known, dict[str, str], outputs.OTHER_PLACE) if known.is_file() and not overwrite else source
+    if shown != source:
+        raise BadFile(out, f"holds the preview of {shown.get('footage')}", outputs.OTHER_PLACE)
     options = options or FootageOptions()
     options = pick_box(path, options, out / "capture") if pick else options
     findings = _findings(path, out, options)

@@ -95,8 +95,8 @@ def collect_silhouettes(path: Path, options: FootageOptions) -> PosedImages:
         raise BadFile(
             path, f"has a COLMAP model, which contains the lens: --{lens[0]} contradicts it", "leave that option out"
         )
-    if marks := [n for n in ("box", "click", "object", "not_object") if getattr(options, n)]:
-        rule = f"has a COLMAP model, whose images have masks: --{marks[0].replace('_', '-')} does not change them"
+    if options.marks:
+        rule = f"has a COLMAP model, whose images have masks: {options.marks[0]} does not change them"
         raise BadFile(path, rule, "leave that option out")
     if options.part:
         raise BadFile(path, "has a COLMAP model, whose images are all used", "leave out --part")

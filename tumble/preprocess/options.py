@@ -16,6 +16,8 @@ MIN_SIDE = 64
 """Minimum of width and height of footage, and minimum of `--size` [pixels]."""
 MIN_FRAMES = 3
 """Minimum number of frames of a capture."""
+MARKS = ("box", "click", "object", "not_object")
+"""Options that mark the object, where its masks are found."""
 
 Quality = Literal["draft", "standard", "full", "paper"]
 """Values of `--quality`, which `recipes.QUALITIES` maps to recipes."""
@@ -83,10 +85,15 @@ class FootageOptions:
         """Number of the first frame that is used."""
         return self.part[0] if self.part else 0
 
+    @property
+    def marks(self) -> list[str]:
+        """The given options that mark the object: a box or a click, and clicks that correct the masks."""
+        return [f"--{name.replace('_', '-')}" for name in MARKS if getattr(self, name)]
+
     def __post_init__(self) -> None:
         if self.box is not None and self.click is not None:
             raise ValueError("--box and --click both mark the object: give only one of them")
-        if (self.box or self.click or self.object or self.not_object) and self.masks is not None:
+        if self.marks and self.masks is not None:
             marks = "--box, --click, --object and --not-object"
             raise ValueError(f"{marks} are for masks that are found: leave them out, or --masks")
         if self.box is not None and min(self.box[2:]) < 2:

@@ -125,7 +125,7 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
     footage = open_footage(path, options.masks)
     scan = _read_scan(footage, options)
     if scan.masks is not None:
-        if options.box or options.click or options.object or options.not_object:
+        if options.marks:
             fix = "leave out --box, --click, --object and --not-object"
             raise BadFile(path, "has masks, which neither a box nor clicks change", fix)
         covered = scan.masks != BACKGROUND

@@ -88,6 +88,6 @@ class Trajectory:
 
     def select(self, frames: Sequence[int] | Tensor) -> "Trajectory":
         """The trajectory reduced to the given frames, in the given order."""
-        index = torch.as_tensor(frames, dtype=torch.long, device=self.T_cam_obj.xyz.device)
+        index = torch.as_tensor(frames, dtype=torch.long).to(self.T_cam_obj.xyz.device)
         turns = None if self.light_turns is None else self.light_turns[index]
         return replace(self, T_cam_obj=self.T_cam_obj[index], light_turns=turns)

@@ -6,7 +6,6 @@ includes it.
 """
 
 import dataclasses
-import hashlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -151,7 +150,7 @@ def _manifest(model: Path, options: SynthOptions) -> dict[str, Any]:
             return name
         if not Path(name).is_file():
             raise BadFile(Path(name), "is missing")
-        return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16]
+        return files.sha256(Path(name))[:16]
 
     option_values = dataclasses.asdict(options) | {"relight": [Path(name).name for name in options.relight]}
     sources: dict[str, str] = {}

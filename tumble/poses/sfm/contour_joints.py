@@ -1,9 +1,9 @@
 """Joining two parts of a capture that share no texture: by their contours, where one follows the other in time.
 
 The contours of all pairs of frames of two parts together leave few ways to put one into the other (epipolar tangency),
-and what one frame shows must be possible behind what hides the object in the other.
-They cannot tell a bottle from the same bottle after half a revolution, nor a box from one after a quarter; but the
-motion goes on where the first part ends, so that smaller rotations are likely there.
+and what one frame shows must be possible behind what hides the object in the other. They cannot tell a bottle from the
+same bottle after half a revolution, nor a box from one after a quarter; but the motion goes on where the first part
+ends, so that smaller rotations are likely there.
 
 Joints that keypoints suggest are fitted to the contours as well (`fitted_to_both`).
 """

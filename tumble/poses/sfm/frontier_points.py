@@ -112,12 +112,13 @@ def convex_contours(capture: Capture) -> Contours:
             reliable.append(torch.zeros(VERTICES, dtype=torch.bool))
             continue
         hull = _hull(inside)
+        possible = _possible(mask, reach)
         kernel = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
         unknown: np.ndarray = np.asarray(cv2.dilate((mask == UNKNOWN).astype(np.uint8), kernel))
         occluded = unknown[hull[:, 1], hull[:, 0]] > 0
         cut_off = ((hull < MARGIN) | (hull >= np.array([width, height]) - MARGIN)).any(1)
         vertices.append(torch.from_numpy(hull + 0.5).float())
-        outer.append(torch.from_numpy(_hull(_possible(mask, reach)) + 0.5).float())
+        outer.append(vertices[-1] if possible is None else torch.from_numpy(_hull(possible) + 0.5).float())
         reliable.append(torch.from_numpy(~occluded & ~cut_off))
     same = torch.equal(torch.stack(vertices), torch.stack(outer))
     return Contours(
@@ -134,8 +135,10 @@ def _reach(masks: UInt8[np.ndarray, "t h w"]) -> float:
     return 4 * math.sqrt(float(np.median(areas)) / math.pi) if areas else 0.0
 
 
-def _possible(mask: UInt8[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the object, and unknown ones behind which it may go on: connected to it and near."""
+def _possible(mask: UInt8[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"] | None:
+    """Pixels of the object, and unknown ones behind which it may go on: connected to it and near; None without any."""
+    if not (mask == UNKNOWN).any():
+        return None
     inside = mask == OBJECT
     distance = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5))
     either = inside | ((mask == UNKNOWN) & (distance <= reach))
@@ -187,9 +190,10 @@ def epipolar_tangencies(
         angles = _plane_angles((contours.vertices - principal) / focal, axes)
         vertices.append(torch.stack([angles.argmax(1), angles.argmin(1)], 1))
         inner.append(angles.gather(1, vertices[-1]))
+        outer.append(inner[-1])
         if contours.outer is not None:
             angles = _plane_angles((contours.outer - principal) / focal, axes)
-        outer.append(torch.stack([angles.amax(1), angles.amin(1)], 1))
+            outer[-1] = torch.stack([angles.amax(1), angles.amin(1)], 1)
         reliable = reliable & contours.reliable.gather(1, vertices[-1])
         reliable = reliable & ((outer[-1] - inner[-1]).abs() * pixels <= MARGIN)
         suitable = suitable & contours.reliable.any(1)[:, None]
