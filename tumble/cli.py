@@ -33,12 +33,12 @@ OptionalFolder = Annotated[Path | None, arg(aliases=["-o"], metavar="DIR", help_
 Overwrite = Annotated[
     bool, arg(help="Write even if the folder holds other files; those with the same names are replaced.")
 ]
-Device = Annotated[
-    Literal["auto", "cpu", "cuda"],
-    arg(
-        help="Where to compute. cuda: on an NVIDIA GPU (benchmarks/gpu.md). auto: on one if there is one. "
-        "Poses are estimated on the CPU, with any device; only networks that match frames use it."
-    ),
+DeviceName = Literal["auto", "cpu", "cuda"]
+WHERE = "Where to compute. cuda: on an NVIDIA GPU (benchmarks/gpu.md). auto: on one if there is one."
+Device = Annotated[DeviceName, arg(help=WHERE)]
+PosesDevice = Annotated[
+    DeviceName,
+    arg(help=f"{WHERE} Poses are estimated on the CPU, with any device; only networks that match frames use it."),
 ]
 OCCUPIES_GPU = {"auto": None, "cpu": False, "cuda": True}
 """Whether a task on a cluster occupies a GPU, by device; None: if the cluster has any."""
@@ -86,10 +86,11 @@ class Tracking:
     poses: Literal["given", "estimate"] = "given"
     """given: use the capture's poses if it has any, else estimate them. estimate: always estimate them."""
     route: Annotated[Literal["graph", "progressive"] | None, arg(help_behavior_hint="")] = None
-    """graph: matches and silhouettes of all frames at once. progressive: the paper's, a neural field that grows frame
-    by frame; with quality paper at the paper's size, which takes days, else with voxel grids, which takes minutes:
-    1 to 3 degrees on four objects, lost on a duck with little texture (benchmarks/poses.md). Both run on the CPU,
-    whatever --device is. Default: graph; progressive with quality paper."""
+    """graph: matches and silhouettes of all frames at once.
+    progressive: the paper's, a neural field that grows frame by frame, with quality paper at the paper's size,
+    which takes days, else with voxel grids, which takes minutes: 1 to 3 degrees on four objects, lost on a
+    duck with little texture (benchmarks/poses.md). Both run on the CPU, whatever --device is.
+    Default: graph; progressive with quality paper."""
     matcher: str = "mixed"
     """Finds corresponding pixels in two frames.
     mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations.
@@ -183,7 +184,7 @@ def run(
     frames: Frames = None,
     size: Size = None,
     pick: bool = False,
-    device: Device = "cpu",
+    device: PosesDevice = "cpu",
     seed: int = 0,
 ) -> None:
     """Reconstruct an object from a video: its motion, geometry, albedo and roughness, and the light of the room.
@@ -232,7 +233,7 @@ def batch(
     poses: Literal["given", "estimate"] = "given",
     jobs: Jobs = 0,
     address: Address = "",
-    device: Device = "cpu",
+    device: PosesDevice = "cpu",
     seed: int = 0,
 ) -> None:
     """Reconstruct many videos or captures, as `run` does each; exit code 1 if one of them fails.
@@ -387,7 +388,7 @@ def bench(
     again: bool = False,
     jobs: Jobs = 0,
     address: Address = "",
-    device: Device = "cpu",
+    device: PosesDevice = "cpu",
 ) -> None:
     """Measure a benchmark suite: captures with ground truth, one row of scores for each, tables and a page.
 
@@ -445,7 +446,7 @@ def weights(action: Positional[Literal["get", "list"]], name: Positional[str] = 
         print(line)
 
 
-def demo(out: Folder = Path("runs/demo"), device: Device = "cpu") -> None:
+def demo(out: Folder = Path("runs/demo"), device: PosesDevice = "cpu") -> None:
     """Reconstruct the bundled clip from its frames and masks, and score the result against ground truth; takes minutes.
 
     Args:
