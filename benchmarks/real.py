@@ -63,6 +63,7 @@ INPUTS = {
     "MDF14": Input("HO-3D, power drill, 146 frames", "--box 330 135 195 220 --focal 617", 617),
     "AP13": Input("HO-3D at half size, pitcher, 147 frames", "--box 143 60 86 165 --focal 308.5", 308.5),
     "BB12": Input("HO-3D, banana, 91 frames", "--box 204 355 272 80 --focal 617", 617),
+    "GSF12": Input("HO-3D, scissors, 108 frames", "--box 240 214 122 262 --focal 617", 617),
     "cube": Input("ViSP, cube_video.mp4, 989 frames", "--part 0 599 --box 390 155 222 222 --at 300 --focal 605", 605),
     "box": Input("OpenCV, box.mp4, 455 frames", "--box 292 16 308 225"),
     "dtu": Input("DTU scan 65 in the layout of NeuS: a skull, 49 photographs from a dome, their masks and poses", ""),

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -330,6 +331,16 @@ def test_background_in_the_masks_of_a_held_object_is_removed_after_stage_1(monke
     _, same, key = pipeline._poses_of(opened, without, Path("film"), "content", "cpu")
     assert content_key(same) == content_key(without)
     assert key == "key"
+
+
+def test_a_gpu_that_the_progressive_route_does_not_use_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tumbling(N, size=64, points=10)
+    monkeypatch.setattr(pipeline, "_track", lambda *_: (result(scene.capture.camera, scene.T_cam_obj), "key"))
+    for recipe, device, said in ((recipes.PAPER, "cuda", 1), (recipes.PAPER, "cpu", 0), (RECIPE, "cuda", 0)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            pipeline._poses_of(runs.Run(None, recipe, None), scene.capture, Path("film"), "content", device)
+        assert sum("runs on the CPU" in str(each.message) for each in caught) == said
 
 
 def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -270,6 +270,8 @@ def _poses_of(
     if len(capture) < MIN_FRAMES:
         rule = f"has {len(capture)} frames, too few to estimate the motion"
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
+    if stage_of(opened.recipe.track) is progressive and torch.device(device).type != "cpu":
+        warnings.warn("the progressive route of stage 1 runs on the CPU: only later stages use the GPU", stacklevel=2)
     tracked, key = _track(opened, capture, where, content, 1, device)
     for number in range(2, mask_refinement.ROUNDS + 1):
         trimmed = mask_refinement.trimmed_further(capture, tracked)

@@ -99,7 +99,8 @@ def test_a_hand_splits_no_gaussians() -> None:
         inputs = refine.Inputs(replace(with_a_hand(capture), masks=masks), Trajectory(true, "camera"))
         params = optim.leaves(Params(points, GAMMA, SHLight.constant(0.4, true.xyz), torch.zeros(4, 6)))
         optimizer, rng = optim.adam(params, refine._rates(cfg)), torch.Generator().manual_seed(0)
-        state = State(0, params, optimizer, rng, {"max_weight": torch.zeros(600)})
+        memory = {"max_weight": torch.zeros(600), "watched_since": torch.tensor(0)}
+        state = State(0, params, optimizer, rng, memory)
         refine._densify(cfg, inputs, state)
         counts.append(len(state.params.points.albedo_logits))
     assert counts == [600, 600 + 72]
@@ -120,10 +121,36 @@ def test_gaussians_that_no_frame_has_shown_since_the_last_densification_are_prun
     assert 0.2 < visible[0].float().mean() < 0.8 * visible[3].float().mean()
     state.memory["max_weight"][::3] = 0.9 * growth.prune_weight
     # Only one view is scored, but Gaussians that it hides are kept.
+    state.step = 2 * len(capture) - 1
     refine._densify(replace(cfg, densification=replace(growth, score_views=1)), inputs, state)
     n_left = len(state.params.points.albedo_logits)
     assert n_left == (visible[3] & (torch.arange(600) % 3 > 0)).sum()
     assert torch.equal(state.memory["max_weight"], torch.zeros(n_left))
+
+
+def test_no_gaussian_is_pruned_before_every_frame_could_have_shown_it() -> None:
+    """Four frames in random order: seven steps contain every frame. New Gaussians are judged when all are."""
+    _, true, capture = textured_sphere()
+    growth = densify.Config(max_gaussians=700, bad_min_error=0.0, grow_score=0.0, grow_fraction=0.1)
+    cfg = replace(SMOKE.refine, points=600, densification=growth)
+    inputs = refine.Inputs(capture, Trajectory(true, "camera"))
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+    refine.step(cfg, inputs, state)
+    shown = int((state.memory["max_weight"] > 0).sum())
+    state.step = 6
+    refine._densify(cfg, inputs, state)
+    largest = state.memory["max_weight"]
+    assert len(largest) > 600
+    assert int(largest.isinf().sum()) == 2 * (len(largest) - 600)
+    # Splits are of Gaussians that the views show, and each takes one of them away.
+    assert int((largest > 0).sum() - largest.isinf().sum()) == shown - (len(largest) - 600)
+    gaussians = state.params.points.gaussians.means
+    assert len(gaussians) == len(largest)
+    state.step = 7
+    refine._densify(cfg, inputs, state)
+    assert len(state.memory["max_weight"]) < 600
+    assert not state.memory["max_weight"].any()
+    assert int(state.memory["watched_since"]) == 7
 
 
 def test_gaussians_stay_in_morton_order_and_keep_their_moments() -> None:

@@ -38,7 +38,7 @@ class Config:
     prune_opacity: float = 0.05
     """Opacity below which a Gaussian is removed."""
     prune_weight: float = 0.05
-    """Blending weight [pixels] that a Gaussian must reach in some view since the last densification; otherwise it is
+    """Blending weight [pixels] that a Gaussian must reach in some view, once all were rendered; otherwise it is
     removed, since it lies inside the object."""
 
 

@@ -36,7 +36,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 17
+VERSION = 18
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3
@@ -225,7 +225,11 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
         pose_network=pose_network.initial(len(inputs.trajectory), like, rng) if learned else {},
     )
     params = optim.leaves(params)
-    memory = {"order": torch.zeros(0, dtype=torch.long), "max_weight": torch.zeros_like(scale)}
+    memory = {
+        "order": torch.zeros(0, dtype=torch.long),
+        "max_weight": torch.zeros_like(scale),
+        "watched_since": torch.tensor(0),
+    }
     return State(0, params, optim.adam(params, _rates(cfg)), rng, memory)
 
 
@@ -466,14 +470,22 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
         bad = densify.bad_pixels(growth, error, truth.mask)
         score += render(*arguments, mask=bad, visibility=cached_visibility(state)).touched / len(frames)
     prune = opacity(params.points.gaussians.sdf, params.gamma) < growth.prune_opacity
-    prune |= state.memory["max_weight"] < growth.prune_weight
+    # Epochs are in random order: two of them, less one step, contain every frame.
+    judged = state.step - int(state.memory["watched_since"]) >= 2 * len(inputs.capture) - 1
+    if judged:
+        prune |= state.memory["max_weight"] < growth.prune_weight
     plan = densify.plan(growth, score, prune)
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
     densify.place_children(points.gaussians, plan)
     order = morton_order(points.gaussians.means)
     points = optim.regrow(points, state.optimizer, order, torch.zeros_like(plan.fresh))
     state.params = replace(params, points=points)
-    state.memory["max_weight"] = torch.zeros_like(points.albedo_logits[:, 0])
+    if judged:
+        state.memory["max_weight"] = torch.zeros_like(points.albedo_logits[:, 0])
+        state.memory["watched_since"] = torch.tensor(state.step)
+    else:  # new Gaussians have been watched for less long than the others: they are judged next time
+        largest = state.memory["max_weight"][plan.index].masked_fill(plan.fresh, math.inf)
+        state.memory["max_weight"] = largest[order]
 
 
 def _alignment_steps(cfg: Config) -> list[int]:

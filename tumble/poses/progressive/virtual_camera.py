@@ -166,7 +166,8 @@ def by_pnp(points: Float[Tensor, "n 3"], aim: Aim, T_aim_obj: SE3, camera: Camer
             flags=cv2.SOLVEPNP_EPNP,
         )
         if not success:
-            raise ValueError(f"frame {frame}: RANSAC found no pose for the projected surface points")
+            rule = f"frame {frame}: RANSAC found no pose for the projected surface points"
+            raise ValueError(f"{rule}: estimate the poses by the other route (--route graph)")
         T_cam_obj = np.eye(4)
         T_cam_obj[:3, :3], T_cam_obj[:3, 3] = cv2.Rodrigues(rvec)[0], tvec[:, 0]
         poses.append(torch.from_numpy(T_cam_obj).to(points))
