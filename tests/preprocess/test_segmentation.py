@@ -167,6 +167,19 @@ def test_a_small_hole_is_unknown_and_a_large_one_is_background() -> None:
     assert labels[0, 0] == labels[99, 50] == BACKGROUND
 
 
+def test_what_is_unknown_within_the_object_may_be_its_print() -> None:
+    """The print reaches the silhouette; a hand beside the object, and background in a corner, are no part of it."""
+    labels = np.full((40, 40), BACKGROUND, np.uint8)
+    labels[10:30, 10:30] = OBJECT
+    labels[10:20, 15:25] = UNKNOWN
+    labels[20:26, 30:40] = UNKNOWN
+    labels[10:14, 10:12] = BACKGROUND
+    possible = segmentation.possible_object(np.stack([labels, np.full_like(labels, UNKNOWN)]))
+    assert possible[0, 10:20, 15:25].all()
+    assert possible[0].sum() == 400 - 8
+    assert not possible[1].any()
+
+
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_static_part_of_a_colour_of_its_own_is_not_background_though_it_reaches_the_wall(elsewhere: bool) -> None:
     """A plain ball rotates in place before a dark wall: its right half never changes, its left edge does. A patch of

@@ -133,7 +133,7 @@ def segment(
         sampled = samples.log_likelihood(images[i], i) if samples else None
         foreground, known = differs, background.known
         if sampled is not None:
-            foreground = differs | (~known & (sampled < NO_SAMPLE_LOG_LIKELIHOOD))
+            foreground = differs | (~known & ~(sampled >= NO_SAMPLE_LOG_LIKELIHOOD))
             known = known | ~np.isnan(sampled)
         return _Frame(
             images[i],

@@ -215,6 +215,18 @@ def make_trimap(
     return labels
 
 
+def possible_object(labels: UInt8[np.ndarray, "t h w"]) -> Bool[np.ndarray, "t h w"]:
+    """Pixels of the object, and unknown ones within its convex hull: these may be a print in a hand's colours."""
+    possible = []
+    for mask in labels:
+        hull = np.zeros(mask.shape, np.uint8)
+        pixels = np.argwhere(mask == OBJECT)[:, ::-1].astype(np.int32)
+        if len(pixels):
+            cv2.fillConvexPoly(hull, np.asarray(cv2.convexHull(np.ascontiguousarray(pixels))), 1)
+        possible.append((hull > 0) & (mask != BACKGROUND))
+    return np.stack(possible)
+
+
 def refine_mask(
     image: UInt8[np.ndarray, "h w 3"], coarse: UInt8[np.ndarray, "h w"], radius: int
 ) -> UInt8[np.ndarray, "h w"]:

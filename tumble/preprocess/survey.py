@@ -221,7 +221,7 @@ def _segment(
     if options.segmenter == "grabcut":
         samples = None
         if any(hands):
-            samples = sample_background(images, _at_hands(images, hands) | (masks.labels == OBJECT))
+            samples = sample_background(images, _at_hands(images, hands) | segmentation.possible_object(masks.labels))
         else:
             background = crossed_background(images, masks.labels == OBJECT, background)
         masks = _masks(path, images, background, seed, hands, options, samples)

@@ -9,10 +9,17 @@ import torch
 from tests.lopsided import DISTANCE, tumbling
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import stage
-from tumble.poses.sfm.contour_joints import ContourJoint, Correspondences, contour_joint, fitted_to_both, moved_part
+from tumble.poses.sfm.contour_joints import (
+    ContourJoint,
+    Correspondences,
+    _trusted,
+    contour_joint,
+    fitted_to_both,
+    moved_part,
+)
 from tumble.poses.sfm.partial import Observed, Partial
 from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
-from tumble.scene import BACKGROUND
+from tumble.scene import BACKGROUND, OBJECT
 
 SCENE = tumbling(28)
 R = SCENE.T_cam_obj.rotation.matrix().double()
@@ -60,6 +67,34 @@ def test_contours_of_another_object_are_not_joined(observed: Observed) -> None:
         mask[:] = torch.where((row - y).square() + (column - x).square() < radius**2, 255, 0).to(mask.dtype)
     inputs = stage.gather(replace(SCENE.capture, masks=masks), ())
     joint = contour_joint(replace(observed, inputs=inputs), in_other_frame(half(range(12, 24))), half(range(12)))
+    assert joint is None or not joint.accepted
+
+
+def test_frames_whose_masks_contradict_their_own_part_are_not_compared(observed: Observed) -> None:
+    """In two frames a patch beside the object counts as object; compared as well, they turn the joint by 25 degrees."""
+    masks = SCENE.capture.masks.clone()
+    masks[[20, 21], 108:124, 20:40] = OBJECT
+    inputs = stage.gather(replace(SCENE.capture, masks=masks), ())
+    spoilt = replace(observed, inputs=inputs)
+    assert bool(inputs.contours.reliable[[20, 21]].any(1).all())
+    assert _trusted(spoilt, half(range(12, 24))).frames == (*range(12, 20), 22, 23)
+    joint = contour_joint(spoilt, in_other_frame(half(range(12, 24))), half(range(12)))
+    assert joint is not None
+    assert joint.accepted
+    error = angle_between(SO3.from_matrix(joint.part.R), SO3.from_matrix(R[12:24]))
+    assert math.degrees(float(error.max())) < 3
+
+
+def test_the_distance_from_the_camera_does_not_jump(observed: Observed) -> None:
+    """The second half shows the object twice as near; contours alone would tell that it has grown."""
+    near = Partial(tuple(range(12, 24)), R[12:24], T[12:24] / 2)
+    assert contour_joint(observed, near, half(range(12))) is not None
+    contours = observed.inputs.contours
+    centre = contours.vertices[12:24].mean(1, keepdim=True)
+    vertices = contours.vertices.clone()
+    vertices[12:24] = centre + 2 * (vertices[12:24] - centre)
+    inputs = replace(observed.inputs, contours=replace(contours, vertices=vertices))
+    joint = contour_joint(replace(observed, inputs=inputs), half(range(12, 24)), half(range(12)))
     assert joint is None or not joint.accepted
 
 

@@ -103,6 +103,30 @@ def test_tangents_beyond_which_a_hand_may_hide_the_object_do_not_count(scene: Tu
     assert conflict.nan_to_num().abs().max() / DISTANCE > 3
 
 
+def test_the_border_of_the_image_may_hide_the_object(scene: Tumble) -> None:
+    """In every other frame a window cuts off all that is left of the object's middle."""
+    R, t = poses(scene)
+    masks = scene.capture.masks.clone()
+    for mask in masks[1::2]:
+        middle = int(torch.nonzero(mask)[:, 1].float().mean())
+        mask[:, : mask.shape[1] - middle] = mask[:, middle:].clone()
+        mask[:, mask.shape[1] - middle :] = BACKGROUND
+    shifted = [int(torch.nonzero(mask)[:, 1].float().mean()) for mask in scene.capture.masks]
+    contours = frontier_points.convex_contours(replace(scene.capture, masks=masks))
+    assert contours.outer is not None
+    for k in range(1, 24, 2):  # back to where the object is: contours are those of the whole image again
+        contours.vertices[k, :, 0] += shifted[k]
+        contours.outer[k, :, 0] += shifted[k]
+    i, j = all_pairs(24).T
+    camera = scene.capture.camera
+    found = frontier_points.epipolar_tangencies(
+        (R[i], t[i]), (R[j], t[j]), contours[i], contours[j], camera, radius=RADIUS
+    )
+    assert found.valid.sum() > 100
+    assert found.gap[found.valid].abs().max() / DISTANCE < 2
+    assert found.conflict.nan_to_num().abs().max() / DISTANCE < 2
+
+
 def test_frontier_points_lie_on_both_contours(scene: Tumble) -> None:
     """Each is a track of two observations, at object pixels next to the background."""
     R, t = poses(scene)

@@ -49,8 +49,8 @@ class Contours:
     reliable: Bool[Tensor, "c v"]
     """Whether the object ends at the vertex, rather than being occluded or cut off by the image border."""
     outer: Float[Tensor, "c v 2"] | None = None
-    """The same polygons of silhouettes together with unknown pixels that may hide more of the object [pixels]; None if
-    nothing does."""
+    """The same polygons of silhouettes together with pixels where more of the object may be, unknown ones and those
+    beyond the border of the image [pixels]; None if there are none."""
 
     def __getitem__(self, frames: Tensor) -> "Contours":
         """The contours of some frames."""
@@ -112,13 +112,13 @@ def convex_contours(capture: Capture) -> Contours:
             reliable.append(torch.zeros(VERTICES, dtype=torch.bool))
             continue
         hull = _hull(inside)
-        possible = _possible(mask, reach)
+        possible = _possible_hull(mask, reach)
         kernel = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
         unknown: np.ndarray = np.asarray(cv2.dilate((mask == UNKNOWN).astype(np.uint8), kernel))
         occluded = unknown[hull[:, 1], hull[:, 0]] > 0
         cut_off = ((hull < MARGIN) | (hull >= np.array([width, height]) - MARGIN)).any(1)
         vertices.append(torch.from_numpy(hull + 0.5).float())
-        outer.append(vertices[-1] if possible is None else torch.from_numpy(_hull(possible) + 0.5).float())
+        outer.append(vertices[-1] if possible is None else torch.from_numpy(possible + 0.5).float())
         reliable.append(torch.from_numpy(~occluded & ~cut_off))
     same = torch.equal(torch.stack(vertices), torch.stack(outer))
     return Contours(
@@ -135,15 +135,21 @@ def _reach(masks: UInt8[np.ndarray, "t h w"]) -> float:
     return 4 * math.sqrt(float(np.median(areas)) / math.pi) if areas else 0.0
 
 
-def _possible(mask: UInt8[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"] | None:
-    """Pixels of the object, and unknown ones behind which it may go on: connected to it and near; None without any."""
-    if not (mask == UNKNOWN).any():
+def _possible_hull(mask: UInt8[np.ndarray, "h w"], reach: float) -> Int32[np.ndarray, "v 2"] | None:
+    """Hull of the object's pixels, and of those where more of it may be: connected to them and near, and unknown or
+    beyond the border of the image. None if there are none of these."""
+    inner = np.zeros(mask.shape, bool)
+    inner[MARGIN:-MARGIN, MARGIN:-MARGIN] = True
+    cut_off = bool((mask[~inner] == OBJECT).any())
+    if not cut_off and not (mask == UNKNOWN).any():
         return None
+    border = math.ceil(reach) if cut_off else 0
+    mask = np.pad(mask, border, constant_values=UNKNOWN)
     inside = mask == OBJECT
     distance = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5))
     either = inside | ((mask == UNKNOWN) & (distance <= reach))
     component = np.asarray(cv2.connectedComponents(either.astype(np.uint8))[1])
-    return either & np.isin(component, np.unique(component[inside]))
+    return _hull(either & np.isin(component, np.unique(component[inside]))) - border
 
 
 def _hull(inside: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "v 2"]:
