@@ -32,7 +32,7 @@ from benchmarks.poses import line
 from tumble.bench import current_code
 from tumble.datasets import reader_for, save_capture
 from tumble.io import files, video
-from tumble.scene import BACKGROUND, OBJECT, Camera, Capture, Trajectory, Truth
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture, Trajectory, Truth
 from tumble.synthetic import SynthOptions, render_capture
 
 COMMAND = "python -m benchmarks.real NAME=PATH... -o FOLDER"
@@ -77,6 +77,7 @@ TITLES = {
     "rotation_median": "rotation, median [deg]",
     "rotation_p90": "90 % below [deg]",
     "with_truth": "frames with truth",
+    "reference_overlap": "overlap of the reference",
     "asset_to_scan": "asset to scan, median [% of diameter]",
     "scan_to_asset": "scan to asset, median",
     "seconds": "time of the stages [s]",
@@ -232,13 +233,40 @@ def compare(name: str, film: Path, run: Path, scan: Path) -> Row:
     R_scan_asset = relative[near].mean()
     errors = np.degrees((relative.inv() * R_scan_asset).magnitude())
     matrix = similarity(R[near], t[near], x_est[index][near], R_scan_asset.as_matrix())
-    asset = trimesh.load_mesh(glb, force="mesh")
+    asset, scanned = (trimesh.load_mesh(path, force="mesh") for path in (glb, rendered / "truth" / "mesh.glb"))
+    reference = {list(poses)[i]: (R, t) for i, R, t in pairs}
     return {
         "with_truth": len(pairs),
+        "reference_overlap": round(reference_overlap(run / "capture", reference, scanned), 3),
         "rotation_median": round(float(np.median(errors)), 2),
         "rotation_p90": round(float(np.quantile(errors, 0.9)), 2),
-        **surface_distances(asset, trimesh.load_mesh(rendered / "truth" / "mesh.glb", force="mesh"), matrix),
+        **surface_distances(asset, scanned, matrix),
     }
+
+
+def reference_overlap(
+    folder: Path, reference: dict[str, tuple[np.ndarray, np.ndarray]], scan: trimesh.Trimesh
+) -> float:
+    """Median overlap (IoU) of the masks with the silhouettes of the scan at the poses that serve as truth.
+
+    What is below 0.95 tells that the object of the film is not quite the scanned one: the bottle of `SM2` has another
+    label, at another place.
+
+    Args:
+        folder: Capture folder.
+        reference: Rotation and translation of the scan in the camera frame, by the names of frames.
+    """
+    capture, overlaps = reader_for(folder).load(folder), []
+    K = capture.camera.opencv_matrix
+    for name, (R, t) in reference.items():
+        mask = capture.masks[capture.names.index(name)].numpy()
+        projected = (scan.vertices @ R.T + t) @ K.T
+        inside = np.zeros_like(mask)
+        for triangle in (projected[:, :2] / projected[:, 2:]).round().astype(np.int32)[scan.faces]:
+            cv2.fillConvexPoly(inside, triangle, 1)
+        known, there = mask != UNKNOWN, mask == OBJECT
+        overlaps.append((known & there & (inside > 0)).sum() / (known & (there | (inside > 0))).sum())
+    return float(np.median(overlaps))
 
 
 def rendered_features(truth: Truth, camera: Camera) -> list[Features]:
