@@ -51,11 +51,16 @@ def test_an_arm_that_others_frames_do_not_show_becomes_background(scene: Tumble)
     assert not trimmed.images[trimmed.masks == BACKGROUND].any()
 
 
-def test_more_matches_outweigh_a_lost_frame_but_not_a_rating(scene: Tumble) -> None:
+def test_more_matches_outweigh_a_lost_frame_but_not_many_nor_a_rating(scene: Tumble) -> None:
     old, new = (result(scene, overlap=0.93, lost=lost) for lost in (1, 2))
     more = replace(new, quality=replace(new.quality, inliers=60 * torch.ones(N)))
     assert mask_refinement.explains_more(more, old)
     assert not mask_refinement.explains_more(new, old), "fewer frames with as many matches each"
+    fewer = result(scene, overlap=0.93, lost=1 + N // 10)
+    fewer = replace(fewer, quality=replace(fewer.quality, inliers=60 * torch.ones(N)))
+    assert fewer.quality.rating == old.quality.rating
+    assert not mask_refinement.explains_more(fewer, old), "a tenth of the frames fewer"
+    assert mask_refinement.explains_more(old, fewer)
     contradicting = replace(more, quality=replace(more.quality, overlap=0.8 * torch.ones(N)))
     assert contradicting.quality.rating == "bad"
     assert not mask_refinement.explains_more(contradicting, old)

@@ -34,6 +34,8 @@ MIN_TRIMMED = 0.01
 along the silhouettes, by which masks err anyway: 0.01 to 0.1 % where nothing touches the object, 2 to 45 % of hands."""
 ROUNDS = 3
 """Maximum number of times that stage 1 is run."""
+FEW_FRAMES = 0.05
+"""Fraction of all frames by which one result may have more frames with a pose than another that is better."""
 
 
 def folder(round: int) -> str:
@@ -92,13 +94,21 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
 
 
 def explains_more(new: PoseResult, old: PoseResult) -> bool:
-    """Whether poses from trimmed masks are better: by their rating, else by the number of matches that agree with them.
+    """Whether poses from trimmed masks are better: by their rating, else by the number of frames with a pose if that
+    differs clearly, else by the number of matches that agree with them.
 
-    A count of frames would refuse better poses of all of them for the sake of a single frame.
+    A few frames do not count: better poses of all would be refused for the sake of a single one. Many do: where frames
+    are lost, more frames are matched by a network, so that the others have more matches.
     """
     order = ("bad", "warn", "good")
-    ranks = [(order.index(q.rating), float(q.inliers[~q.lost].sum())) for q in (new.quality, old.quality)]
-    return ranks[0] > ranks[1]
+    ratings = [order.index(each.quality.rating) for each in (new, old)]
+    if ratings[0] != ratings[1]:
+        return ratings[0] > ratings[1]
+    frames = [int((~each.quality.lost).sum()) for each in (new, old)]
+    if abs(frames[0] - frames[1]) > FEW_FRAMES * len(new.quality.lost):
+        return frames[0] > frames[1]
+    matches = [float(each.quality.inliers[~each.quality.lost].sum()) for each in (new, old)]
+    return matches[0] > matches[1]
 
 
 def hull_by_vote(capture: Capture, T_cam_obj: SE3, frames: list[int]) -> Float[Tensor, "n 3"]:
