@@ -88,7 +88,7 @@ class _Frame:
     sampled: Float32[np.ndarray, "h w"] | None
     """Log likelihood of the background from other frames; not a number where there are too few."""
     foreground: Bool[np.ndarray, "h w"]
-    """Pixels that differ from the known background or, where it is unknown, from its samples."""
+    """Pixels that differ from the known background or, where it is unknown, from its samples, if there are any."""
     known: Bool[np.ndarray, "h w"]
     """Pixels whose background is known, or sampled."""
     strokes: Bool[np.ndarray, "h w"]
@@ -133,6 +133,7 @@ def segment(
         sampled = samples.log_likelihood(images[i], i) if samples else None
         foreground, known = differs, background.known
         if sampled is not None:
+            # Without samples, as where something covers the background in nearly all frames, this is true as well.
             foreground = differs | (~known & ~(sampled >= NO_SAMPLE_LOG_LIKELIHOOD))
             known = known | ~np.isnan(sampled)
         return _Frame(
