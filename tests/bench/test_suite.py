@@ -67,6 +67,19 @@ def test_only_seeds_and_methods_select_cases() -> None:
     assert chosen[0].options.seed == 7
 
 
+def test_rows_may_have_fewer_seeds_than_their_suite(tmp_path: Path) -> None:
+    text = HEAD.replace("[0]", "[0, 1]") + OBJECT
+    text += '[[rows]]\nmethod = ["tumble"]\n[[rows]]\nmethod = ["average"]\nseed = [1]\n'
+    suite = suites.read_suite(write(tmp_path, text))
+    assert [(case.method, case.seed) for case in suites.cases_of(suite)] == [
+        ("tumble", 0), ("tumble", 1), ("average", 1)
+    ]  # fmt: skip
+    asked = suites.cases_of(suite, seeds=[7])
+    assert {(case.method, case.seed, case.options.seed) for case in asked} == {("tumble", 7, 7), ("average", 7, 7)}
+    with pytest.raises(BadFile, match="not one of the suite's"):
+        suites.read_suite(write(tmp_path, text.replace("[1]", "[2]")))
+
+
 def test_no_object_or_light_of_one_half_is_in_the_other() -> None:
     halves: dict[str, set[str]] = {"tune": set(), "report": set(), "none": set()}
     for name in suites.suite_names():

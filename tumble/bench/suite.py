@@ -8,7 +8,7 @@
     [[compare]]                         two sets of rows whose scores are compared object by object
 
 The values of `[[rows]]` are options of `tumble synth`, `poses` ("given" or "estimate") and `method`; for captures of
-the user only the last two.
+the user only the last two. `seed` lists seeds of these rows alone, some or all of the suite's.
 """
 
 import dataclasses
@@ -145,12 +145,16 @@ def cases_of(
     """
     grids = [grid | ({"method": list(methods)} if methods else {}) for grid in suite.rows]
     varied = {name for grid in grids for name, values in grid.items() if name not in RUN_LABELS and len(values) > 1}
-    rest = tuple(sorted(varied - {"env", "setting", "material"}))
+    rest = tuple(sorted(varied - {"env", "setting", "material", "seed"}))
     cases: dict[str, Case] = {}
     for seed, about, grid in itertools.product(seeds or suite.seeds, suite.object, grids):
+        own = grid.get("seed", suite.seeds)
+        if unknown := set(own) - set(suite.seeds):
+            raise ValueError(f"has rows with the seed {min(unknown)}, which is not one of the suite's")
+        grid = grid | {"seed": [seed] if seeds or seed in own else []}
         for values in itertools.product(*grid.values()):
             chosen = dict(zip(grid, values, strict=True))
-            of_case = _given(about | chosen) if "folder" in about else _rendered(suite.capture | about | chosen, seed)
+            of_case = _given(about | chosen) if "folder" in about else _rendered(suite.capture | about | chosen)
             more = {"recipe": suite.recipe, "seed": seed, "varied": rest}
             case = msgspec.convert(of_case | more, Case)
             if all(word in case.name for word in only):
@@ -160,15 +164,15 @@ def cases_of(
 
 def _given(about: dict[str, Any]) -> dict[str, Any]:
     """What a case says of a given capture."""
-    labels = {name: value for name, value in about.items() if name != "folder"}
+    labels = {name: value for name, value in about.items() if name not in ("folder", "seed")}
     if unknown := labels.keys() - set(RUN_LABELS):
         raise ValueError(f"{min(unknown)!r} is not possible for a folder, which is not rendered")
     return labels | {"model": about["folder"], "options": None}
 
 
-def _rendered(about: dict[str, Any], seed: int) -> dict[str, Any]:
+def _rendered(about: dict[str, Any]) -> dict[str, Any]:
     """What a case says of a capture that is rendered."""
-    options = about | {"seed": seed}
+    options = dict(about)
     labels = {name: options.pop(name) for name in (*RUN_LABELS, "model") if name in options}
     # The directionality of a light is there for the reader of the file.
     options.pop("directionality", None)
