@@ -127,7 +127,7 @@ def textureless_glb(name: str) -> bytes:
         mesh.unmerge_vertices()
     grey = PBRMaterial(baseColorFactor=[128, 128, 128, 255], roughnessFactor=0.6, metallicFactor=0.0)
     mesh.visual = TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=grey)
-    exported = mesh.export(file_type="glb")
+    exported = mesh.export(file_type="glb", include_normals=True)
     assert isinstance(exported, bytes), "a GLB"
     return exported
 

@@ -23,7 +23,7 @@ VERTEX_BYTES = 160
 NODE_BYTES = 1 << 15
 """Memory of a node, which limits their number to 16000 [bytes]."""
 INDEX_BYTES = 24
-"""Memory of an index of one instance of a mesh [bytes]."""
+"""Memory of an index of one instance of a mesh with normals [bytes]; without them it becomes a vertex of its own."""
 EXTENSIONS = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_xmp_json_ld")
 """Extensions that a file may require: they are read, or change nothing that is read."""
 MATERIAL_EXTENSIONS = "KHR_materials_"
@@ -124,7 +124,8 @@ def _geometry_bytes(document: _Gltf) -> int:
     for node in document.nodes:
         for primitive in document.meshes[node.mesh].primitives if node.mesh is not None else []:
             total += VERTEX_BYTES * max((document.accessors[i].count for i in primitive.attributes.values()), default=0)
-            total += 0 if primitive.indices is None else INDEX_BYTES * document.accessors[primitive.indices].count
+            size = INDEX_BYTES if "NORMAL" in primitive.attributes else VERTEX_BYTES
+            total += 0 if primitive.indices is None else size * document.accessors[primitive.indices].count
     return total
 
 

@@ -193,16 +193,29 @@ def _transformed(part: Part, R_obj_file: np.ndarray, T_obj_file: np.ndarray) -> 
 
 
 def _part(mesh: Any, T: Float[np.ndarray, "4 4"]) -> Part:
-    """A mesh of trimesh with its node's transform `T` applied, in the file's coordinates."""
+    """A mesh of trimesh with its node's transform `T` applied, in the file's coordinates; flat where the file has no
+    normals."""
     vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
-    normals = mesh.vertex_normals @ np.linalg.inv(T[:3, :3])
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
     uv = getattr(mesh.visual, "uv", None)
     uv = np.zeros((len(vertices), 2)) if uv is None else np.stack([uv[:, 0], 1 - uv[:, 1]], 1)
     faces = np.asarray(mesh.faces)
     if np.linalg.det(T[:3, :3]) < 0:  # a mirrored node: without this, the outward side of its faces would be inside
         faces = faces[:, ::-1]
+    if "vertex_normals" not in mesh._cache:  # there trimesh keeps those of the file; else it would smooth
+        return _flat(vertices, faces, uv, _textures(mesh.visual))
+    normals = mesh.vertex_normals @ np.linalg.inv(T[:3, :3])
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
     return Part(vertices, normals, faces, uv, *_textures(mesh.visual))
+
+
+def _flat(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, textures: tuple[np.ndarray, ...]) -> Part:
+    """A part with flat shading: each triangle has three vertices of its own, with the triangle's normal. So glTF 2.0,
+    section 3.7.2.1, wants meshes without normals to be drawn."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(np.finfo(np.float64).tiny)
+    own = np.arange(faces.size).reshape(-1, 3)
+    return Part(corners.reshape(-1, 3), normals.repeat(3, 0), own, uv[faces.ravel()], *textures)
 
 
 def _textures(visual: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
