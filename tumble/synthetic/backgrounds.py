@@ -15,7 +15,10 @@ DESK_PITCH = math.radians(50)
 DESK_DROP = 2.7
 """Distance of the desk below the object's centre [object radius]."""
 HALF = 9.0
-"""Half the side of wall and desk [object radius]; they reach beyond the image."""
+"""Half the side of a wall [object radius]; it reaches beyond the image, and beyond the film."""
+DESK_HALF = 18.0
+"""Half the side of a desk [object radius]. It is larger than a wall, because the camera looks down on it at an angle:
+the upper corners of the film of the largest field of view show what is 17.5 behind the object."""
 THINGS = 9
 """Number of boxes on a cluttered desk."""
 
@@ -68,16 +71,16 @@ def _desk_axes(distance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _desk(distance: float, rng: np.random.Generator) -> Part:
     """A wooden desk on which the camera looks down."""
-    x, y = np.meshgrid(*[np.linspace(-1, 1, 512)] * 2)
-    at = np.stack([1.5 * x, 14 * y, np.zeros_like(x)], -1)
-    grain = np.sin(9 * y + 5 * noise(at / 3, int(rng.integers(1 << 16))) + 2 * noise(4 * at, 1))
+    x, y = np.meshgrid(*[np.linspace(-DESK_HALF, DESK_HALF, 1024)] * 2)
+    at = np.stack([x / 6, 14 / 9 * y, np.zeros_like(x)], -1)
+    grain = np.sin(y + 5 * noise(at / 3, int(rng.integers(1 << 16))) + 2 * noise(4 * at, 1))
     wander = (0.5 + 0.3 * grain + 0.5 * noise(at * [4, 12, 1], 2))[..., None].clip(0, 1)
     wood = np.array([[0.16, 0.085, 0.04], [0.36, 0.22, 0.12]]) * rng.uniform(0.7, 1.5)
     point, away, _ = _desk_axes(distance)
     right = np.array([1.0, 0.0, 0.0])
-    corner = point - HALF * right + HALF * away
+    corner = point - DESK_HALF * right + DESK_HALF * away
     texture = (1 - wander) * wood[0] + wander * wood[1]
-    return quads(corner[None], 2 * HALF * right[None], -2 * HALF * away[None], texture, 0.45)
+    return quads(corner[None], 2 * DESK_HALF * right[None], -2 * DESK_HALF * away[None], texture, 0.45)
 
 
 def _things(distance: float, rng: np.random.Generator) -> dict[str, Part]:

@@ -11,8 +11,7 @@ Setting = Literal["dome", "turntable", "handheld", "turned"]
 Skin = Literal["light", "medium", "dark"]
 Background = Literal["none", "wall", "desk", "clutter", "torso"]
 MAX_FOV = {"none": 120.0, "wall": 70.0, "desk": 52.0, "clutter": 52.0, "torso": 55.0}
-"""Maximum field of view with each background [degrees]: a wall or a desk would end inside a wider image, and a wall
-inside the film of a wider image."""
+"""Maximum field of view with each background [degrees]: a wall or a desk would end inside the film of a wider image."""
 
 
 @dataclass(frozen=True)
