@@ -140,6 +140,19 @@ def test_other_settings_of_stage_1_measure_only_rows_with_estimated_poses_again(
     assert [task.case.poses for task in missing] == ["estimate"]
 
 
+def test_method_files_of_the_same_name_are_different_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where one path names both, after a change of the folder; and one file has one module under all its paths."""
+    text = "from dataclasses import replace\ndef method(recipe):\n    return replace(recipe, matcher={!r})\n"
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "same.py").write_text(text.format(name))
+    for name in ("first", "second"):
+        monkeypatch.chdir(tmp_path / name)
+        method = batch.method_of("same.py")
+        assert method(SMOKE).matcher == name
+        assert batch.method_of(str(tmp_path / name / "same.py")) is method
+
+
 def test_an_unknown_method_is_refused_with_the_known_ones(suite: str, tmp_path: Path) -> None:
     (tmp_path / "empty.py").touch()
     for name, message in (("magic", "choose among tumble, average"), (str(tmp_path / "empty.py"), "has no function")):

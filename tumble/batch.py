@@ -160,12 +160,16 @@ def recipe_of(case: Case) -> Recipe:
 def method_of(name: str) -> Callable[[Recipe], Recipe]:
     """A method by its name in `METHODS`, or the function `method` of a Python file, which may be a stage itself.
 
+    A file is executed once per process. Its module is named after its whole path, so that files of the same name in
+    different folders are different methods.
+
     Raises:
         ValueError: There is neither.
     """
     if name in METHODS:
         return METHODS[name]
-    path, module = Path(name), f"method_{Path(name).stem}"
+    path = Path(name)
+    module = f"method_{path.stem}_{loop.fingerprint(path.resolve())[:16]}"
     if path.suffix != ".py" or not path.is_file():
         raise ValueError(f"there is no method {name!r}; choose among {', '.join(METHODS)}, or give a Python file")
     if module not in sys.modules:
