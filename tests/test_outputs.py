@@ -187,9 +187,12 @@ def test_a_run_whose_capture_was_moved_says_how_to_go_on(
     shutil.copytree(capture, moved)
     recipe = out / "recipe.json"
     recipe.write_text(recipe.read_text().replace(str(capture.resolve()), str(gone)))
-    advice = rf"{gone}: is the run's capture but does not exist \(.*repeat `tumble run NEW_CAPTURE -o {out}`"
-    with pytest.raises(BadFile, match=advice):
-        actions.evaluate_run(out)
+    advice = rf"{gone}: is the run's capture but does not exist \(.*repeat `tumble run NEW_CAPTURE -o {out}`.*--capture"
+    for command in (actions.evaluate_run, write_report):
+        with pytest.raises(BadFile, match=advice):
+            command(out)
+    with pytest.raises(BadFile, match=rf"{gone}: is missing"):
+        write_report(out, capture=gone)
     with pytest.warns(UserWarning, match=rf"{advice}.*baked from the Gaussians"):
         assert actions._frames_of_run(out, actions.finished(out)) is None
     pipeline.reconstruct(moved, out, RECIPE)

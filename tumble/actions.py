@@ -282,7 +282,7 @@ def evaluate_run(out: Path, capture: Path | None = None, where: Path | None = No
     """
     asset = finished(out, device)
     outputs.require_writable(where or out)
-    known = read_with_truth(capture or _capture_path(out))
+    known = read_with_truth(capture or run.existing_capture(out))
     names = source_names(out, known.capture)
     return _scored(asset, known, _aligned(out, asset, known), names, where or out, _relighting(out))
 
@@ -303,25 +303,10 @@ def evaluate_glb(
             holds something else.
         ModuleNotFoundError: Mitsuba is not installed.
     """
-    asset, known = finished(out), read_with_truth(capture or _capture_path(out))
+    asset, known = finished(out), read_with_truth(capture or run.existing_capture(out))
     where = where or out / GLB_SCORES
     outputs.claim_folder(where, SHEET, overwrite=overwrite)
     return score_glb(glb, asset, known, _aligned(out, asset, known), where)
-
-
-def _capture_path(out: Path) -> Path:
-    """Path of the capture of a run.
-
-    Raises:
-        BadFile: It is not there any more.
-    """
-    path = run.capture_source(out)
-    if not path.exists():
-        fix = (
-            f"if it was moved, repeat `tumble run NEW_CAPTURE -o {out}` with its options: that only notes the new place"
-        )
-        raise BadFile(path, "is the run's capture but does not exist", fix)
-    return path
 
 
 def _aligned(out: Path, asset: Asset, known: CaptureWithTruth) -> tuple[Any, str]:
@@ -521,7 +506,7 @@ def _frames_of_run(out: Path, asset: Asset) -> Capture | None:
     from tumble.report import capture_of_run
 
     try:
-        return capture_of_run(out, asset, _capture_path(out)).frames
+        return capture_of_run(out, asset, run.existing_capture(out)).frames
     except BadFile as error:
         text = f"{error}; the base colour is baked from the Gaussians, not solved from the photographs"
         warnings.warn(text, stacklevel=3)

@@ -240,6 +240,22 @@ def capture_source(path: Path) -> Path:
     return own if stored.name == CAPTURE and own.is_dir() else stored
 
 
+def existing_capture(path: Path) -> Path:
+    """Path of the capture or video of a run, for those who are going to read it.
+
+    Raises:
+        BadFile: It is not there any more, or the folder holds no run, or a run of an older format.
+    """
+    source = capture_source(path)
+    if not source.exists():
+        fix = (
+            f"if it was moved, repeat `tumble run NEW_CAPTURE -o {path}` with its options: that only notes the new "
+            "place; `tumble report` also takes it with --capture"
+        )
+        raise BadFile(source, "is the run's capture but does not exist", fix)
+    return source
+
+
 def frames_key(path: Path) -> str:
     """Hash of the capture of a run without its poses; empty for runs of earlier versions.
 

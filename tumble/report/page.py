@@ -95,9 +95,7 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
         BadFile: The run is not finished, its capture is missing, or `capture` is not the capture of the run.
         OSError: The folder cannot be written.
     """
-    asset, path = run.asset(out, Asset), capture or run.capture_source(out)
-    if not path.exists():
-        raise BadFile(path, "is the run's capture but does not exist", "give its new path with --capture")
+    asset, path = run.asset(out, Asset), capture or run.existing_capture(out)
     outputs.require_writable(out)
     used = capture_of_run(out, asset, path)
     made = read_provenance(path) if path.is_dir() else None
