@@ -13,6 +13,7 @@ Surfaces are compared after ICP with a similarity: from the vertices of the asse
 import argparse
 import json
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -109,6 +110,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--scan", nargs="*", default=[], metavar="NAME=GLB")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     scans = dict(each.split("=", 1) for each in arguments.scan)
     target = Path(__file__).with_suffix(".json")
     rows: list[Row] = json.loads(target.read_text())["rows"] if target.exists() else []
@@ -138,7 +140,7 @@ def measure(name: str, path: Path, run: Path) -> Row:
     """Run the pipeline; the rating of its report, how many frames have a pose, how long the stages took."""
     source = static_capture(path, run.parent / f"{name}-capture") if (path / CAMERAS).exists() else path
     command = [sys.executable, "-m", "tumble", "run", str(source), *INPUTS[name].options.split(), "-o", str(run)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    done = completed(command)
     code = current_code()["commit"]
     if done.returncode:
         return {"name": name, "result": "NO-GO", "sentence": done.stderr.strip().splitlines()[-1], "code": code}
@@ -158,6 +160,23 @@ def measure(name: str, path: Path, run: Path) -> Row:
         "code": code,
         "seconds": round(sum(record.get("seconds", 0) for record in records if record.get("event") == "done")),
     }
+
+
+def completed(command: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end and return what it printed.
+
+    If this process is interrupted, the command is told so, once, and has the time that it takes to keep its work: it
+    has a session of its own, so that Ctrl-C in a terminal does not reach it as well.
+    """
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    try:
+        output, errors = process.communicate()
+    except KeyboardInterrupt:
+        process.terminate()
+        process.communicate()
+        raise
+    return subprocess.CompletedProcess(command, process.returncode, output, errors)
 
 
 def static_capture(path: Path, out: Path) -> Path:
@@ -355,7 +374,7 @@ def exported(run: Path) -> Path:
     out = run / "export"
     if not list(out.glob("*.glb")):
         command = [sys.executable, "-m", "tumble", "export", str(run), "--preset", "web", "-o", str(out)]
-        subprocess.run(command, check=True, capture_output=True)
+        completed(command).check_returncode()
     return next(out.glob("*.glb"))
 
 
