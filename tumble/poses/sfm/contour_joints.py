@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
 from tumble.poses.sfm.bundle_adjustment import MIN_DEPTH
-from tumble.poses.sfm.frontier_points import EpipolarTangencies, epipolar_tangencies
+from tumble.poses.sfm.frontier_points import EpipolarTangencies, cauchy_loss, epipolar_tangencies
 from tumble.poses.sfm.partial import GAP_SCALE, Observed, Partial
 from tumble.poses.sfm.relocalization import JACOBIAN_STEP, candidate_rotations, damped_step, robust_cost
 
@@ -172,7 +172,7 @@ def _trusted(observed: Observed, part: Partial) -> Partial:
     """
     still = torch.eye(3, dtype=part.R.dtype)[None], part.t.new_zeros(1, 4)
     residuals = _Pairs(observed, part, part).residuals(still).reshape(len(part), len(part), 2)
-    cost = torch.log1p((residuals / GAP_SCALE).square()).nanmean(2)
+    cost = cauchy_loss(residuals, GAP_SCALE).nanmean(2)
     kept = list(range(len(part)))
     while len(kept) > len(part) / 2:
         of_frame = cost[kept][:, kept].nanmean(1).nan_to_num()

@@ -80,6 +80,16 @@ class EpipolarTangencies:
         return torch.where(self.valid, self.gap, self.conflict)
 
 
+def cauchy_loss(gaps: Float[Tensor, "*b"], scale: float) -> Float[Tensor, "*b"]:
+    """Robust loss of each tangency gap or conflict; NaN where there is none.
+
+    Args:
+        gaps: Gaps or conflicts [pixels].
+        scale: Scale of the Cauchy loss [pixels].
+    """
+    return torch.log1p((gaps / scale).square())
+
+
 def fill_boundary_bands(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]:
     """Masks whose narrow bands of unknown pixels between object and background are assigned to the nearer of the two.
 

@@ -175,4 +175,4 @@ def contour_cost(observed: Observed, part: Partial, other: Partial) -> tuple[flo
         radius=inputs.radius,
     )
     gap = found.gap[found.valid & (frames_a != frames_b)[:, None]]
-    return float(torch.log1p((gap / GAP_SCALE).square()).mean()) if len(gap) else 0.0, len(gap)
+    return float(frontier_points.cauchy_loss(gap, GAP_SCALE).mean()) if len(gap) else 0.0, len(gap)

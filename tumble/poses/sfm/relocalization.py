@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
-from tumble.poses.sfm.frontier_points import Contours, epipolar_tangencies
+from tumble.poses.sfm.frontier_points import Contours, cauchy_loss, epipolar_tangencies
 from tumble.scene import Camera
 
 CANDIDATE_ANGLES = (-0.35, -0.17, 0.17, 0.35)
@@ -86,7 +86,7 @@ def robust_cost(gaps: Float[Tensor, "h n"], scale: float) -> Float[Tensor, " h"]
         scale: Scale of the Cauchy loss [pixels].
     """
     valid = ~gaps.isnan()
-    loss = torch.log1p((torch.where(valid, gaps, 0.0) / scale).square()).sum(1)
+    loss = cauchy_loss(torch.where(valid, gaps, 0.0), scale).sum(1)
     return torch.where(valid.sum(1) < MIN_GAPS, torch.inf, loss / valid.sum(1).clamp_min(1))
 
 
