@@ -8,7 +8,7 @@ import torch
 
 from tests.lopsided import DISTANCE, tumbling
 from tumble.maths import SO3, angle_between
-from tumble.poses.sfm import stage
+from tumble.poses.sfm import contour_joints, stage
 from tumble.poses.sfm.contour_joints import (
     ContourJoint,
     Correspondences,
@@ -83,6 +83,24 @@ def test_frames_whose_masks_contradict_their_own_part_are_not_compared(observed:
     assert joint.accepted
     error = angle_between(SO3.from_matrix(joint.part.R), SO3.from_matrix(R[12:24]))
     assert math.degrees(float(error.max())) < 3
+
+
+def test_frames_to_compare_are_chosen_once_for_every_part(observed: Observed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the part is compared with; and anew for other masks."""
+
+    def counted(observed: Observed, part: Partial) -> Partial:
+        parts.append(part)
+        return _trusted(observed, part)
+
+    parts: list[Partial] = []
+    monkeypatch.setattr(contour_joints, "_trusted", counted)
+    first, second, third = half(range(10)), half(range(10, 20)), half(range(10))
+    fresh = replace(observed)
+    for each in (first, third, first):
+        contour_joint(fresh, second, each)
+    assert parts == [second, first, third]
+    contour_joint(replace(fresh), second, first)
+    assert parts == [second, first, third, second, first]
 
 
 def test_the_distance_from_the_camera_does_not_jump(observed: Observed) -> None:

@@ -160,9 +160,13 @@ def fitted_to_both(
     return _refined(residuals, start)[0]
 
 
-def _spread(part: Partial) -> Partial:
-    """Up to `USED_FRAMES` evenly spaced frames of a part."""
-    return part.select(sorted(set(torch.linspace(0, len(part) - 1, USED_FRAMES).round().long().tolist())))
+def _compared(observed: Observed, part: Partial) -> Partial:
+    """Up to `USED_FRAMES` frames of a part, evenly spaced over those that do not contradict it; chosen only once."""
+    if part not in observed.compared:
+        trusted = _trusted(observed, part)
+        places = torch.linspace(0, len(trusted) - 1, USED_FRAMES).round().long().unique().tolist()
+        observed.compared[part] = trusted.select(places)
+    return observed.compared[part]
 
 
 def _trusted(observed: Observed, part: Partial) -> Partial:
@@ -192,8 +196,8 @@ class _Pairs:
 
     @staticmethod
     def of(observed: Observed, part: Partial, other: Partial) -> "_Pairs":
-        """Those of some frames of each, spread evenly over the frames that do not contradict their own part."""
-        return _Pairs(observed, *(_spread(_trusted(observed, each)) for each in (part, other)))
+        """Those of the frames of each that are compared with other parts."""
+        return _Pairs(observed, _compared(observed, part), _compared(observed, other))
 
     def residuals(self, motion: Similarity) -> Float[Tensor, "h n"]:
         """Tangency gaps after each motion of the part, or conflicts where they are not valid [pixels].

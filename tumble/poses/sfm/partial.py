@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -39,6 +39,8 @@ class Observed:
     cfg: BaseConfig
     inputs: Inputs
     keypoints: Keypoints
+    compared: dict["Partial", "Partial"] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """Frames of parts whose contours are compared with other parts' (`contour_joints`), kept since they were chosen."""
 
 
 @dataclass(frozen=True, eq=False)
