@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 from skimage import color, metrics
 from torch import Tensor
 
 from tumble.maths.images import (
     crop,
     crop_box,
+    filled_hull,
     linear_from_srgb,
     resize,
     resize_area,
@@ -162,6 +164,19 @@ def test_crop_box_fits_the_mask_and_stays_in_the_image(dtype: torch.dtype) -> No
     assert crop_box(mask, 5) == (0, 7, 10, 13)
     assert (crop(mask, crop_box(mask, 0)) == 1).all()
     assert crop(mask[..., None].expand(10, 20, 3), (1, 10, 6, 9)).shape == (6, 9, 3)
+
+
+@pytest.mark.parametrize("border", [1, 9])
+def test_the_convex_hull_of_pixels_is_that_by_half_planes(border: int) -> None:
+    """Some pixels lie outside of the image. OpenCV's lines are up to 2 wider."""
+    pixels = np.random.default_rng(0).integers(-5, 50, (12, 2)).astype(np.int32)
+    column, row = np.meshgrid(np.arange(60), np.arange(40))
+    planes = ConvexHull(pixels).equations
+    outside = (planes[:, 0, None, None] * column + planes[:, 1, None, None] * row + planes[:, 2, None, None]).max(0)
+    found = filled_hull(pixels, (40, 60), border)
+    assert found[outside <= border // 2 - 1].all()
+    assert not found[outside > border // 2 + 2].any()
+    assert not filled_hull(pixels[:0], (40, 60), border).any()
 
 
 def test_crop_box_of_an_empty_mask_is_an_error() -> None:

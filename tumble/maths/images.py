@@ -1,4 +1,4 @@
-"""Images as tensors `[h w c]`: sRGB transfer curves, structural similarity, gradients, resampling, cropping.
+"""Images as tensors `[h w c]`: sRGB transfer curves, structural similarity, gradients, resampling, cropping, hulls.
 
 Rows run downwards. Pixel centres lie at +0.5, so that a resized image covers the same area. Values are linear RGB
 unless the name contains `srgb`.
@@ -7,8 +7,9 @@ unless the name contains `srgb`.
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Int32, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -156,6 +157,24 @@ def crop(x: Shaped[Tensor, "h w *c"], box: Box) -> Shaped[Tensor, "i j *c"]:
     """The part of the image in a box, as a view."""
     top, left, height, width = box
     return x[top : top + height, left : left + width]
+
+
+def filled_hull(pixels: Int32[np.ndarray, "n 2"], shape: tuple[int, int], border: int = 1) -> Bool[np.ndarray, "h w"]:
+    """Pixels in the convex hull of some, none if there are none.
+
+    Args:
+        pixels: Column and row of each.
+        shape: Height and width of the image [pixels].
+        border: Width of a line along the hull, of which one half is outside [pixels].
+    """
+    import cv2
+
+    mask = np.zeros(shape, np.uint8)
+    if len(pixels):
+        hull = np.asarray(cv2.convexHull(pixels))
+        cv2.fillConvexPoly(mask, hull, 1)
+        cv2.polylines(mask, [hull], True, 1, border)
+    return mask > 0
 
 
 def gaussian_blur(x: Float[Tensor, "*n"], window: int, sigma: float, axes: Sequence[int]) -> Float[Tensor, "*m"]:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, UInt8
 
-from tumble.maths import iou
+from tumble.maths import filled_hull, iou
 from tumble.preprocess.background import MIN_DIFFERENCE, Background, channel_max
 from tumble.preprocess.colour_model import (
     SEED_WEIGHT,
@@ -217,14 +217,8 @@ def make_trimap(
 
 def possible_object(labels: UInt8[np.ndarray, "t h w"]) -> Bool[np.ndarray, "t h w"]:
     """Pixels of the object, and unknown ones within its convex hull: these may be a print in a hand's colours."""
-    possible = []
-    for mask in labels:
-        hull = np.zeros(mask.shape, np.uint8)
-        pixels = np.argwhere(mask == OBJECT)[:, ::-1].astype(np.int32)
-        if len(pixels):
-            cv2.fillConvexPoly(hull, np.asarray(cv2.convexHull(np.ascontiguousarray(pixels))), 1)
-        possible.append((hull > 0) & (mask != BACKGROUND))
-    return np.stack(possible)
+    pixels = (np.argwhere(mask == OBJECT)[:, ::-1].astype(np.int32, order="C") for mask in labels)
+    return np.stack([filled_hull(each, labels.shape[1:]) for each in pixels]) & (labels != BACKGROUND)
 
 
 def refine_mask(

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from tumble.maths import filled_hull
 from tumble.preprocess.hands.detection import MIDDLE, RING, WRIST, Hand
 
 FINGERS = ((1, 2, 3, 4), (5, 6, 7, 8), (0, 9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
@@ -55,12 +56,11 @@ def hand_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarra
         hands: Hands of one image.
         shape: Height and width of the image [pixels].
     """
-    mask = np.zeros(shape, np.uint8)
+    mask = np.zeros(shape, bool)
     for hand in hands:
-        hull = cv2.convexHull(np.floor(hand.landmarks).astype(np.int32))
-        cv2.fillConvexPoly(mask, hull, 1)
-        cv2.polylines(mask, [hull], True, 1, _thickness(2 * REGION_MARGIN * palm_size(hand)))
-    return mask.astype(bool)
+        border = _thickness(2 * REGION_MARGIN * palm_size(hand))
+        mask |= filled_hull(np.floor(hand.landmarks).astype(np.int32), shape, border)
+    return mask
 
 
 def hand_surroundings(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
