@@ -6,7 +6,6 @@ along the axis of a turntable, and +z points to that frame's camera.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -245,11 +244,8 @@ def _better_sphere(capture: Capture, solution: Solution, sphere: Sphere, lost: B
 
     if bool(lost.all()) or (confirmed := overlap(sphere)) > CONFIRMED_OVERLAP:
         return sphere
-    kept = torch.nonzero(~lost)[:, 0]
     large = torch.zeros_like(sphere[0]), HULL_MARGIN * sphere[1].new_tensor(solution.radius)
-    trajectory = _trajectory(_in_sphere(solution, large), capture).select(kept)
-    frames = _select_frames(capture, kept.tolist())
-    hull = visual_hull.carve(frames, trajectory, resolution=HULL_RESOLUTION, tolerance=HULL_TOLERANCES[-1])
+    hull = _hull(capture, _trajectory(_in_sphere(solution, large), capture), lost, HULL_TOLERANCES[-1])
     cells = ((torch.nonzero(hull > 0.5) + 0.5) / HULL_RESOLUTION * 2 - 1).double()
     if len(cells) < MIN_HULL_CELLS:
         return sphere
@@ -321,15 +317,9 @@ def _hull_overlap(
     capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"], tolerance: float
 ) -> Float[Tensor, " t"]:
     """Intersection over union of all silhouettes with that of the visual hull of the frames that are not lost."""
-    kept = torch.nonzero(~lost)[:, 0]
-    if not len(kept):
+    if bool(lost.all()):
         return torch.zeros(len(capture))
-    inside = visual_hull.carve(
-        _select_frames(capture, kept.tolist()),
-        trajectory.select(kept),
-        resolution=HULL_RESOLUTION,
-        tolerance=tolerance,
-    )
+    inside = _hull(capture, trajectory, lost, tolerance)
     camera = capture.camera.resized(HULL_RESOLUTION, HULL_RESOLUTION)
     ticks = torch.arange(HULL_RESOLUTION) + 0.5
     rows = (ticks * capture.camera.height / HULL_RESOLUTION).long()
@@ -341,6 +331,15 @@ def _hull_overlap(
         counted, silhouette = mask != UNKNOWN, mask != BACKGROUND
         overlaps.append(iou(hit, silhouette, counted))
     return torch.stack(overlaps)
+
+
+def _hull(
+    capture: Capture, trajectory: Trajectory, lost: Bool[Tensor, " t"], tolerance: float
+) -> Float[Tensor, "x y z"]:
+    """Visual hull of the frames that are not lost."""
+    kept = torch.nonzero(~lost)[:, 0]
+    frames = replace(capture, trajectory=None).select(kept.tolist())
+    return visual_hull.carve(frames, trajectory.select(kept), resolution=HULL_RESOLUTION, tolerance=tolerance)
 
 
 def _hull_silhouette(inside: Float[Tensor, "x y z"], T_cam_obj: SE3, camera: Camera) -> Bool[Tensor, "h w"]:
@@ -365,11 +364,6 @@ def _hull_silhouette(inside: Float[Tensor, "x y z"], T_cam_obj: SE3, camera: Cam
     sampled = torch.nn.functional.grid_sample(inside[None, None], grid, align_corners=False)[0, 0, 0]
     hit[close] = (sampled > 0.5).any(-1)
     return hit
-
-
-def _select_frames(capture: Capture, frames: Sequence[int]) -> Capture:
-    """Some frames of a capture, without poses."""
-    return replace(capture, trajectory=None).select(list(frames))
 
 
 def _observability(
