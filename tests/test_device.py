@@ -70,6 +70,12 @@ def on_device(inputs: Any, device: torch.device = DEVICE) -> Any:
     return type(inputs)(*(tree.to(x, device) for x in vars(inputs).values()))
 
 
+def in_one_part(stage: Any, **others: Any) -> Any:
+    """The stage without the parts of its step, which is therefore never recorded; with other functions, if given."""
+    names = ("VERSION", "Config", "length", "init", "step", "finish")
+    return SimpleNamespace(**{name: getattr(stage, name) for name in names} | others)
+
+
 def steps(stage: Any, cfg: Any, inputs: Any, n: int) -> tuple[Any, list[dict[str, float]]]:
     """The output of a stage after `n` steps, and the terms of each."""
     state, seen = stage.init(cfg, inputs, torch.Generator().manual_seed(0)), []
@@ -121,8 +127,7 @@ def test_a_stage_on_a_device_goes_on_from_its_checkpoint(
             raise InterruptedError
         return stage.step(cfg, inputs, state)
 
-    same = {name: getattr(stage, name) for name in ("VERSION", "Config", "length", "init", "finish")}
-    stopping: Any = SimpleNamespace(**same, step=stopped)
+    stopping = in_one_part(stage, step=stopped)
     checkpoint = tmp_path / "state.safetensors"
     whole = loop.drive(stage, cfg, inputs, seed=1)
     with pytest.raises(InterruptedError):
@@ -233,7 +238,7 @@ def test_replayed_steps_are_those_that_nobody_recorded(
     """Bit for bit: Gaussians are split, poses aligned, shadows traced and the light doubled between the recordings."""
     stage, cfg, inputs = changing(number, stages, monkeypatch)
     with simulated_graphs() as recorder:
-        usual = loop.drive(stage, cfg, inputs, seed=1, graph=False)
+        usual = loop.drive(in_one_part(stage), cfg, inputs, seed=1)
         replayed = loop.drive(stage, cfg, inputs, seed=1)
     test_pipeline.assert_same(usual, replayed)
     assert recorder.sent == 40
@@ -265,7 +270,7 @@ def test_replayed_steps_of_other_settings_are_those_that_nobody_recorded(
         turns = SO3.exp(0.1 * torch.arange(12.0).view(4, 3)).matrix()
         inputs = dataclasses.replace(inputs, trajectory=dataclasses.replace(inputs.trajectory, light_turns=turns))
     with simulated_graphs() as recorder:
-        usual = loop.drive(stage, cfg, inputs, seed=1, graph=False)
+        usual = loop.drive(in_one_part(stage), cfg, inputs, seed=1)
         test_pipeline.assert_same(usual, loop.drive(stage, cfg, inputs, seed=1))
     assert recorder.replays >= 3
 
@@ -315,16 +320,16 @@ def test_replayed_steps_on_a_gpu_are_those_that_nobody_recorded(
             torch.ones(3).to(gpu)  # from memory that is not pinned
         return terms
 
-    def last(recorded: bool) -> dict[str, float]:
+    def last(stage: Any) -> dict[str, float]:
         seen: list[loop.Progress] = []
-        loop.drive(stage, cfg, on_device(inputs, gpu), seed=1, graph=recorded, report=seen.append)
+        loop.drive(stage, cfg, on_device(inputs, gpu), seed=1, report=seen.append)
         return seen[-1].metrics
 
-    usual = last(False)
-    assert last(True) == pytest.approx(usual, rel=0.1, abs=1e-3)
+    usual = last(in_one_part(stage))
+    assert last(stage) == pytest.approx(usual, rel=0.1, abs=1e-3)
     assert not caplog.messages
     monkeypatch.setattr(stage, "advance", copying)
-    assert last(True) == pytest.approx(usual, rel=0.1, abs=1e-3)
+    assert last(stage) == pytest.approx(usual, rel=0.1, abs=1e-3)
     assert "steps are not replayed as a CUDA graph" in caplog.text
 
 

@@ -26,8 +26,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from tumble import __version__
-from tumble.engine import graph as graphs
-from tumble.engine import optim
+from tumble.engine import graph, optim
 from tumble.engine.optim import NotFinite
 from tumble.io import BadFile, files, progress, read_tensors, tree, write_tensors
 
@@ -127,9 +126,10 @@ def drive(
     report: Callable[[Progress], None] | None = None,
     name: str = "",
     key: str = "",
-    graph: bool = True,
 ) -> Any:
     """Train a stage from its start or its checkpoint to the end, and return its output.
+
+    Steps are recorded and replayed as a whole if stage and device can do so (`engine.graph`).
 
     On a terminal a progress bar shows the remaining time and the latest scalars (`io.progress`). Ctrl-C or SIGTERM
     stops after the current step and saves a checkpoint; a second one stops immediately.
@@ -145,8 +145,6 @@ def drive(
             `REPORT_SECONDS`.
         name: Name of the stage for messages.
         key: Hash of the inputs. A checkpoint with another key, version, configuration or seed is ignored.
-        graph: Whether the steps of a stage that offers it are recorded and replayed as a whole (`graph`) on a device
-            that can do so.
 
     Raises:
         NotFinite: A tensor became NaN or infinite; the last valid checkpoint is kept.
@@ -170,8 +168,7 @@ def drive(
                 _write_preview(stage, cfg, inputs, state, checkpoint.with_name(PREVIEW))
 
         show = _step_reports(name, total, state.step, started - seconds, update, report)
-        steps = graphs.steps(stage, cfg, inputs, state) if graph else contextlib.nullcontext(stage.step)
-        with _interrupts() as interrupted, steps as step:
+        with _interrupts() as interrupted, graph.steps(stage, cfg, inputs, state) as step:
             if state.step >= total:
                 _check(state, checkpoint)
             while state.step < total:
@@ -215,7 +212,7 @@ def fingerprint(*parts: Any) -> str:
 
 
 def _step(
-    step: graphs.Step, cfg: Any, inputs: Any, state: State, checkpoint: Path | None
+    step: graph.Step, cfg: Any, inputs: Any, state: State, checkpoint: Path | None
 ) -> Mapping[str, Tensor | float]:
     try:
         return step(cfg, inputs, state)
