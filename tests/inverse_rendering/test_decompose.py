@@ -20,7 +20,7 @@ from tumble.datasets import folder
 from tumble.engine import loop, optim
 from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose, refine, specular_fit
-from tumble.inverse_rendering.pixel_sampling import PixelNumbers
+from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_per_step
 from tumble.inverse_rendering.sh_lighting import SHLight
 from tumble.rendering.shading import Bounce, Surface
 from tumble.scene.capture import OBJECT, UNKNOWN, Capture
@@ -199,9 +199,8 @@ def test_checkpoints_have_no_blockers_which_are_computed_again_from_the_traced_g
 
 @pytest.mark.parametrize(("part", "factor"), [(0.0, 1.0), (0.5, 2.0), (2.0, 1.0)])
 def test_larger_images_have_more_pixels_in_a_step(part: float, factor: float) -> None:
-    capture = folder.load(CAPTURE)
-    cfg = decompose.Config(pixels=100, side=round(part * min(capture.camera.height, capture.camera.width)))
-    assert decompose.pixels_per_step(cfg, capture) == 100 * factor
+    camera = folder.load(CAPTURE).camera
+    assert pixels_per_step(100, round(part * min(camera.height, camera.width)), camera) == 100 * factor
 
 
 def true_figure() -> decompose.Inputs:

@@ -29,7 +29,7 @@ from tumble.inverse_rendering.material_params import (
     with_metal,
     without_corners,
 )
-from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_at, sample_pixels
+from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_at, pixels_per_step, sample_pixels
 from tumble.inverse_rendering.refine import Refined
 from tumble.io import tree
 from tumble.maths import SE3, Index, entry, fibonacci_sphere, linear_from_srgb, random_rotation
@@ -205,12 +205,6 @@ class Inputs:
     refined: Refined
 
 
-def pixels_per_step(cfg: Config, capture: Capture) -> int:
-    """Number of pixels shaded per step: more in larger images. Asks no device."""
-    side = min(capture.camera.height, capture.camera.width)
-    return round(cfg.pixels * max(1.0, side / cfg.side)) if cfg.side else cfg.pixels
-
-
 def length(cfg: Config, inputs: Inputs) -> int:
     """Number of steps."""
     return cfg.steps
@@ -311,13 +305,14 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
 def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
     """Pixels of the object in several frames with both lobes under the current light."""
     params, capture, parts = state.params, inputs.capture, []
+    n = pixels_per_step(cfg.pixels, cfg.side, capture.camera)
     bounce, light = _bounce(cfg, state, params, corner_features(params.material)[1]), prefilter(params.environment)
     for frame in range(0, len(capture), -(-len(capture) // FIT_FRAMES)):
         T_cam_obj = pose(params, inputs, frame)
         view = render_gbuffer(params, T_cam_obj, capture.camera)
         truth = target_view(capture, frame, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
-        pixels = sample_pixels(FIT_PIXELS * pixels_per_step(cfg, capture), view.alpha, inner > 0.5, state.rng)
+        pixels = sample_pixels(FIT_PIXELS * n, view.alpha, inner > 0.5, state.rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels[pixels >= 0])
         R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
         gaussian, rough = _dominant_gaussian(view, points), torch.full_like(points.normals[:, :1], cfg.roughness)
@@ -339,13 +334,6 @@ def _first_network(cfg: Config, refined: Refined, rng: torch.Generator) -> dict[
     if not _learns_network(cfg):
         return {}
     return refined.pose_network or pose_network.initial(len(refined.trajectory), refined.albedo, rng)
-
-
-def _correction(params: Params, inputs: Inputs, frame: Index | slice) -> SE3:
-    """Correction of the poses of stage 2. A network also predicts those of stage 2, which are taken out."""
-    now, before = params.pose_network, inputs.refined.pose_network
-    correction = pose_network.correction(params.poses, now, frame)
-    return correction @ pose_network.correction(params.poses, before, frame).inverse() if now and before else correction
 
 
 def learning_rates(cfg: Config, material: Material) -> dict[str, float]:
@@ -419,7 +407,7 @@ def pose(params: Params, inputs: Inputs, frame: Index) -> SE3:
     base = inputs.refined.trajectory.T_cam_obj.at(frame)
     if not params.poses.requires_grad and not params.pose_network:
         return base
-    return _correction(params, inputs, frame) @ base
+    return pose_network.correction(params.poses, params.pose_network, frame, before=inputs.refined.pose_network) @ base
 
 
 @threads_for_kernels()
@@ -458,7 +446,8 @@ def advance(cfg: Config, inputs: Inputs, state: State, numbers: PixelNumbers) ->
     corners, mean_albedo = corner_features(shifted_material(params if cfg.corners else without_corners(params)))
     view = rasterize_material(params, corners, T_cam_obj, capture.camera)
     photo, mask = (entry(x, frame).to(view.alpha.device) for x in (capture.images, capture.masks))
-    pixels = pixels_at(numbers.place, pixels_per_step(cfg, capture), view.alpha, mask == OBJECT)
+    n = pixels_per_step(cfg.pixels, cfg.side, capture.camera)
+    pixels = pixels_at(numbers.place, n, view.alpha, mask == OBJECT)
     R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
     shown = _Shown(view, pixels, photo, T_cam_obj, R_env_obj, numbers.current)
     of_view = losses.material_terms(view, photo, mask)
@@ -589,12 +578,13 @@ def _upsample_light(cfg: Config, state: State) -> None:
 def finish(cfg: Config, inputs: Inputs, state: State) -> Asset:
     """The relightable asset."""
     params = absorbed(state.params if cfg.corners else without_corners(state.params))
-    T_cam_obj = _correction(params, inputs, slice(None)) @ inputs.refined.trajectory.T_cam_obj
+    before, trajectory = inputs.refined.pose_network, inputs.refined.trajectory
+    corrections = pose_network.correction(params.poses, params.pose_network, slice(None), before=before)
     return Asset(
         gaussians=params.gaussians,
         gamma=params.gamma,
         material=params.material,
         environment=params.environment,
-        trajectory=replace(inputs.refined.trajectory, T_cam_obj=T_cam_obj),
+        trajectory=replace(trajectory, T_cam_obj=corrections @ trajectory.T_cam_obj),
         camera=inputs.capture.camera,
     )

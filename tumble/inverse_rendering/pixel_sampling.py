@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import Index
+from tumble.scene import Camera
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,17 @@ class PixelNumbers:
     """Set of directions."""
     is_fixed: bool
     """Whether geometry and poses are fixed, in the warm-up."""
+
+
+def pixels_per_step(pixels: int, side: int, camera: Camera) -> int:
+    """Number of pixels that a step shades: more in larger images. Asks no device.
+
+    Args:
+        pixels: Their number in images up to a size.
+        side: Smaller side of images of that size [pixels]; 0 if the number is the same for all images.
+        camera: Camera of the images.
+    """
+    return round(pixels * max(1.0, min(camera.height, camera.width) / side)) if side else pixels
 
 
 def sample_pixels(

@@ -38,15 +38,23 @@ def tangents(network: dict[str, Tensor], frame: Index | slice) -> Float[Tensor, 
     return linear(hidden, network["weight2"], network["bias2"])
 
 
-def correction(poses: Float[Tensor, "t 6"], network: dict[str, Tensor], frame: Index | slice) -> SE3:
+def correction(
+    poses: Float[Tensor, "t 6"],
+    network: dict[str, Tensor],
+    frame: Index | slice,
+    *,
+    before: dict[str, Tensor] | None = None,
+) -> SE3:
     """Motion in the camera frame that corrects the initial pose of one frame, or of several.
 
     Args:
         poses: Tangents of all frames, which count if there is no network.
         network: A network, or an empty dict.
         frame: Index of the frame, or slice of the frames.
+        before: A network whose corrections the initial pose has already, which are taken out of those of another one.
     """
-    return SE3.exp(tangents(network, frame) if network else _selected(poses, frame))
+    now = SE3.exp(tangents(network, frame) if network else _selected(poses, frame))
+    return now @ SE3.exp(tangents(before, frame)).inverse() if network and before else now
 
 
 def _selected(of_frames: Tensor, frame: Index | slice) -> Tensor:
