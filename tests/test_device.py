@@ -72,8 +72,8 @@ def on_device(inputs: Any, device: torch.device = DEVICE) -> Any:
 
 def in_one_part(stage: Any, **others: Any) -> Any:
     """The stage without the parts of its step, which is therefore never recorded; with other functions, if given."""
-    names = ("VERSION", "Config", "length", "init", "step", "finish")
-    return SimpleNamespace(**{name: getattr(stage, name) for name in names} | others)
+    names = ("VERSION", "Config", "length", "init", "blank", "step", "finish")
+    return SimpleNamespace(**{name: getattr(stage, name) for name in names if hasattr(stage, name)} | others)
 
 
 def steps(stage: Any, cfg: Any, inputs: Any, n: int) -> tuple[Any, list[dict[str, float]]]:

@@ -1,8 +1,10 @@
 """Stage 3: division of the product of albedo and light. Whole runs are tested in `test_pipeline`."""
 
 import math
+import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +24,7 @@ from tumble.engine.loop import State
 from tumble.inverse_rendering import decompose, refine, specular_fit
 from tumble.inverse_rendering.pixel_sampling import PixelNumbers, pixels_per_step
 from tumble.inverse_rendering.sh_lighting import SHLight
+from tumble.io import tree
 from tumble.rendering.shading import Bounce, Surface
 from tumble.scene.capture import OBJECT, UNKNOWN, Capture
 from tumble.scene.environment import Environment
@@ -235,6 +238,44 @@ def test_metal_must_explain_as_much_as_a_lobe_must_and_more_than_it_does(
     cfg = replace(recipes.DRAFT.decompose, sets=1, directions=32, pixels=64)
     decompose.init(cfg, inputs, torch.Generator().manual_seed(0))
     assert kinds == ["glossy", "matte", "metal", chosen]
+
+
+@pytest.mark.parametrize(("metal", "is_metal"), [(0.5, True), (1.5, False)])
+def test_a_resumed_run_repeats_no_trial_and_comes_to_the_same_bits(
+    metal: float, is_metal: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also after a trial that adds parameters, those of metal. It stops after geometry has begun to move."""
+    trial, step = decompose._trial, decompose.step
+
+    def tried(cfg: decompose.Config, inputs: decompose.Inputs, before: State, start: decompose.Params) -> Any:
+        """The true state of a trial; metal has this error, all other trials have an error of 1."""
+        return trial(cfg, inputs, before, start)[0], 1.0 if start.material.metal_logits is None else metal
+
+    def interrupted(cfg: decompose.Config, inputs: decompose.Inputs, state: State) -> Any:
+        if state.step == 9:
+            signal.raise_signal(signal.SIGINT)
+        return step(cfg, inputs, state)
+
+    def repeated(*_: Any) -> None:
+        raise AssertionError("a resumed run tries out starts, or traces visibility, again")
+
+    inputs, checkpoint = true_figure(), tmp_path / "state.safetensors"
+    regions = torch.arange(len(inputs.refined.albedo)) % 2 == 0
+    monkeypatch.setattr(specular_fit, "metal_regions", lambda fitted, means: regions)
+    cfg = replace(recipes.DRAFT.decompose, steps=12, warmup=6, sets=2, directions=32, pixels=64)
+    with monkeypatch.context() as patch:
+        patch.setattr(decompose, "_trial", tried)
+        whole = loop.drive(decompose, cfg, inputs, seed=1)
+        patch.setattr(decompose, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="stopped at step 10 of 12"):
+            loop.drive(decompose, cfg, inputs, seed=1, checkpoint=checkpoint)
+    for name in ("choose_start", "_trial", "surface_points"):
+        monkeypatch.setattr(decompose, name, repeated)
+    resumed = loop.drive(decompose, cfg, inputs, seed=1, checkpoint=checkpoint)
+    assert (resumed.material.metal_logits is not None) == is_metal
+    expected, found = tree.named_tensors(whole), tree.named_tensors(resumed)
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(x, expected[name]) for name, x in found.items())
 
 
 @pytest.mark.parametrize(("factor", "halvings"), [(0.0, 0), (0.5, 0), (0.25, 1), (0.125, 2)])

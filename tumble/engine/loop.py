@@ -83,8 +83,9 @@ class Progress:
 class Stage(Protocol):
     """Interface of a stage module.
 
-    It may also define `preview(cfg, inputs, state)`, an image `u8[h w 3]`, and the two parts of its step
-    (`graph.SplitStage`).
+    It may also define `preview(cfg, inputs, state)`, an image `u8[h w 3]`; the two parts of its step
+    (`graph.SplitStage`); and, if `init` takes long, `blank(cfg, inputs, rng, names)`: a state whose `params` have
+    tensors of these names, into which a checkpoint is restored instead of into that of `init`.
     """
 
     @property
@@ -102,8 +103,8 @@ class Stage(Protocol):
         ...
 
     def init(self, cfg: Any, inputs: Any, rng: torch.Generator) -> State:
-        """The first state, which may have made some steps. Also called before a checkpoint is restored, to provide its
-        structure."""
+        """The first state, which may have made some steps. Without a `blank`, also called before a checkpoint is
+        restored, to provide its structure."""
         ...
 
     def step(self, cfg: Any, inputs: Any, state: State) -> Mapping[str, Tensor | float]:
@@ -157,8 +158,7 @@ def drive(
     total = stage.length(cfg, inputs)
     # A task of its own, which shows that it goes on without a number of steps: stage 3 tries out several starts here.
     with progress.task(f"{name or 'training'}: start"):
-        state = stage.init(cfg, inputs, torch.Generator().manual_seed(seed))
-        seconds = _restore(state, checkpoint, key) if checkpoint else 0.0
+        state, seconds = _start(stage, cfg, inputs, torch.Generator().manual_seed(seed), checkpoint, key)
     with progress.task(name or "training", total) as update:
 
         def save() -> None:
@@ -278,20 +278,31 @@ def _save(state: State, path: Path, key: str, seconds: float) -> None:
     write_tensors(path, tensors, {"type": "State", "tumble": __version__, "state": json.dumps(about)})
 
 
-def _restore(state: State, path: Path, key: str) -> float:
-    """Restore a checkpoint with this key into an initial state; returns its training time [s], or 0 without one.
+def _start(
+    stage: Stage, cfg: Any, inputs: Any, rng: torch.Generator, path: Path | None, key: str
+) -> tuple[State, float]:
+    """The state of a checkpoint with this key and its training time [s], or the first state and 0 without one.
 
     A damaged checkpoint gives a warning, and the stage starts again: every later state would contain the damage.
     """
-    if not path.exists():
-        return 0.0
     try:
-        about, tensors = _read(path)
+        saved = _read(path) if path and path.exists() else None
     except BadFile as error:
         warnings.warn(str(error), stacklevel=4)
-        return 0.0
-    if about.key != key:
-        return 0.0
+        saved = None
+    if path is None or saved is None or saved[0].key != key:
+        return stage.init(cfg, inputs, rng), 0.0
+    about, tensors = saved
+    names = [name.removeprefix("params/") for name in tensors if name.startswith("params/")]
+    blank = getattr(stage, "blank", None)
+    state = blank(cfg, inputs, rng, names) if blank else stage.init(cfg, inputs, rng)
+    _restore(state, path, tensors)
+    state.step = about.step
+    return state, about.seconds
+
+
+def _restore(state: State, path: Path, tensors: dict[str, Tensor]) -> None:
+    """Restore the tensors of a checkpoint into a state with its structure."""
     parts: dict[str, dict[str, Tensor]] = {"params": {}, "optimizer": {}, "memory": {}}
     for name, value in tensors.items():
         part, _, rest = name.partition("/")
@@ -309,8 +320,6 @@ def _restore(state: State, path: Path, key: str) -> float:
     except (KeyError, ValueError, TypeError, RuntimeError) as error:
         raise BadFile(path, f"does not match this stage: {error}", "remove it to restart the stage") from None
     state.memory = {name: x.to(devices.get(name, default), copy=True) for name, x in parts["memory"].items()}
-    state.step = about.step
-    return about.seconds
 
 
 def _read(path: Path) -> tuple[_SavedState, dict[str, Tensor]]:

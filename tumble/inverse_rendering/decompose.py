@@ -8,6 +8,7 @@ several rotated sets of directions that all Gaussians share, or traced from the 
 
 import math
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -237,6 +238,15 @@ def init(cfg: Config, inputs: Inputs, rng: torch.Generator) -> State:
     state = State(0, params, optim.adam(params, rates), rng, {"directions": torch.stack(sets)})
     _trace_visibility(cfg, inputs, state)
     return choose_start(cfg, inputs, state) if cfg.try_matte else state
+
+
+def blank(cfg: Config, inputs: Inputs, rng: torch.Generator, names: Collection[str]) -> State:
+    """A state with leaves of these names for those of a checkpoint, which has all that `init` traces and tries out."""
+    state = init(replace(cfg, visibility=False, try_matte=False), inputs, rng)
+    if "material.metal_logits" in names:
+        state.params = optim.leaves(with_metal(state.params, state.params.gaussians.means[:, 0] > 0))
+        state.optimizer = optim.adam(state.params, learning_rates(cfg, state.params.material))
+    return state
 
 
 def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
