@@ -127,7 +127,7 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
         tracked, unclosed = drive(sfm, DRAFT.track, inputs, seed=0), None
     else:
         tracked, unclosed = progressive_results(
-            progressive.gather(capture, inputs.matches, partial(sfm.assess, inputs))
+            progressive.gather(capture, inputs.matches, partial(sfm.assess, inputs), inputs.failed)
         )
     seconds = time.perf_counter() - started
     quality = tracked.quality

@@ -304,7 +304,8 @@ def _track(
                 if capture.focal_assumed:
                     text = "the focal length is a guess, which the progressive route does not refine"
                     warnings.warn(f"{text}: give --focal or --fov", stacklevel=2)
-                inputs = progressive.gather(capture, inputs.matches, partial(sfm.assess, inputs))
+                assess = partial(sfm.assess, inputs)
+                inputs = progressive.gather(capture, inputs.matches, assess, inputs.failed)
     except ValueError as error:
         raise BadFile(where, str(error), "provide masks that show the object") from None
     keys = [content, matching.settings(recipe.matcher)]

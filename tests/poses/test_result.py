@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tumble.poses.result import Observability, PoseQuality
+from tumble.maths import SE3, SO3
+from tumble.poses.result import Observability, PoseQuality, interpolate_lost
 
 OBSERVABLE = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.005, 0.004, 0.003]))
 ONES = torch.ones(10)
@@ -65,3 +66,12 @@ def test_an_unobservable_axis_comes_with_advice_for_object_and_video() -> None:
     assert "axis (0.00, 1.00) of the first image" in hidden.sentence
     assert "more light" in hidden.sentence
     assert "stick something" in hidden.sentence
+
+
+def test_lost_poses_at_the_ends_repeat_the_closest() -> None:
+    T = SE3(
+        SO3.exp(torch.randn(4, 3, generator=torch.Generator().manual_seed(0)).double()).wxyz, torch.rand(4, 3).double()
+    )
+    interpolated = interpolate_lost(T, torch.tensor([True, False, True, False]))
+    torch.testing.assert_close(interpolated.wxyz[0], T.wxyz[1])
+    torch.testing.assert_close(interpolated.xyz[2], (T.xyz[1] + T.xyz[3]) / 2)

@@ -4,9 +4,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from tumble.maths import SE3, interpolate
 from tumble.scene import Camera, Trajectory
 
 PoseRating = Literal["good", "warn", "bad"]
@@ -163,6 +165,23 @@ class PoseResult:
     quality: PoseQuality
     camera: Camera
     """Camera of the capture, with the estimated focal length where the capture's was only assumed."""
+
+
+def interpolate_lost(T: SE3, lost: Bool[Tensor, " t"]) -> SE3:
+    """Poses with those of lost frames interpolated between the closest other frames, or copied at either end."""
+    kept = torch.nonzero(~lost)[:, 0].tolist()
+    if not kept:
+        return T
+    wxyz, xyz = T.wxyz.clone(), T.xyz.clone()
+    for k in torch.nonzero(lost)[:, 0].tolist():
+        before, after = (
+            max((i for i in kept if i < k), default=kept[0]),
+            min((i for i in kept if i > k), default=kept[-1]),
+        )
+        fraction = (k - before) / (after - before) if before < k < after else 0.0
+        pose = interpolate(T[before], T[after], fraction)
+        wxyz[k], xyz[k] = pose.wxyz, pose.xyz
+    return SE3(wxyz, xyz)
 
 
 def _degrees(angle: Tensor | float) -> str:

@@ -2,7 +2,9 @@
 
 import math
 import sys
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +13,23 @@ import torch
 from torch.nn.functional import normalize
 
 from tests.lopsided import truth, tumbling
-from tests.poses.progressive.test_tracker import INPUTS, ON_A_SPHERE, SMOKE, TRUTH
+from tests.poses.progressive.test_tracker import INPUTS, ON_A_SPHERE, SMOKE, TRUTH, rotating_sphere
 from tests.poses.sfm.test_segments import hidden, matched
 from tumble import matching, pipeline, recipes
 from tumble.engine import run
 from tumble.engine.loop import Stage, drive
-from tumble.maths.se3 import angle_between
+from tumble.maths.se3 import SE3, angle_between
 from tumble.poses.progressive import stage as progressive
+from tumble.poses.result import PoseResult
 from tumble.poses.sfm import finalize
 from tumble.poses.sfm import stage as sfm
-from tumble.scene import Capture, Match
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match, Trajectory
+
+
+def gathered(capture: Capture, matches: Sequence[Match]) -> progressive.Inputs:
+    """Inputs of the route, as the pipeline gathers them."""
+    seen = sfm.gather(capture, matches)
+    return progressive.gather(capture, matches, partial(sfm.assess, seen), seen.failed)
 
 
 def test_true_poses_are_rated_good() -> None:
@@ -37,8 +46,7 @@ def test_true_poses_are_rated_good() -> None:
 
 def test_the_stage_finds_the_motion_of_a_sphere() -> None:
     """Five frames, 24 degrees; as far as `test_tracker` says that these settings can."""
-    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches))
-    inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
+    inputs = gathered(INPUTS.capture, INPUTS.matches)
     assert isinstance(sys.modules["tumble.poses.progressive.stage"], Stage)
     found = drive(progressive, progressive.Config(**vars(ON_A_SPHERE)), inputs, seed=0)
     assert len(found.quality) == len(TRUTH.xyz)
@@ -53,14 +61,109 @@ def test_the_stage_finds_the_motion_of_a_sphere() -> None:
 
 def test_lifting_by_epnp_gives_the_poses_of_the_closed_form() -> None:
     """Projections of the shape's surface have no noise, so that RANSAC-EPnP errs by its rounding alone."""
-    assess = partial(sfm.assess, sfm.gather(INPUTS.capture, INPUTS.matches))
-    inputs = progressive.gather(INPUTS.capture, INPUTS.matches, assess)
+    inputs = gathered(INPUTS.capture, INPUTS.matches)
     few = vars(SMOKE) | {"warmup": 1, "pose_steps": 1, "joint_steps": 1}
     exact = drive(progressive, progressive.Config(**few), inputs, seed=1).trajectory.T_cam_obj
     lifted = drive(progressive, progressive.Config(**few, lift="pnp"), inputs, seed=1).trajectory.T_cam_obj
     assert angle_between(exact.rotation, lifted.rotation).max() < 1e-2
     assert (exact.xyz - lifted.xyz).abs().max() < 2e-2
     assert not torch.equal(exact.xyz, lifted.xyz)
+
+
+# Frames whose mask failed ---------------------------------------------------------------------------------------------
+
+
+def failing(kind: str, frame: int) -> tuple[Capture, list[Match]]:
+    """A sphere in seven frames, in one of which the mask fails, and matches between the others."""
+    sphere = rotating_sphere(7)[0]
+    masks = sphere.capture.masks.clone()
+    mask = masks[frame]
+    if kind == "unknown":
+        mask[mask == OBJECT] = UNKNOWN
+    else:
+        mask[:] = BACKGROUND
+    if kind == "speck":
+        mask[3:6, 30:33] = OBJECT
+    if kind == "speck in the unknown":
+        mask[8:32, 8:32], mask[12:14, 25:27] = UNKNOWN, OBJECT
+    if kind == "opposite corners":
+        mask[1:3, 1:3] = mask[37:39, 37:39] = OBJECT
+    if kind == "too large":
+        mask[1:39, 1:39] = OBJECT
+    matches = [match for match in sphere.matches if frame not in (match.i, match.j)]
+    return replace(sphere.capture, masks=masks), matches
+
+
+def tracked_poses(capture: Capture, matches: list[Match]) -> tuple[list[int], SE3]:
+    """Lost frames, and the poses that are assessed."""
+    inputs, assessed = gathered(capture, matches), []
+
+    def assess(trajectory: Trajectory) -> PoseResult:
+        assessed.append(trajectory.T_cam_obj)
+        return inputs.assess(trajectory)
+
+    cfg = progressive.Config(**vars(SMOKE) | {"warmup": 2, "pose_steps": 2, "joint_steps": 2})
+    quality = drive(progressive, cfg, replace(inputs, assess=assess), seed=0).quality
+    return torch.nonzero(quality.lost)[:, 0].tolist(), assessed[0]
+
+
+@cache
+def without_frame(frame: int) -> tuple[list[int], SE3]:
+    """All frames of the sphere but one, and their poses in a capture that lacks it."""
+    capture, matches = failing("empty", frame)
+    others = [k for k in range(7) if k != frame]
+    renumbered = [replace(m, i=others.index(m.i), j=others.index(m.j)) for m in matches]
+    lost, found = tracked_poses(capture.select(others), renumbered)
+    assert lost == []
+    return others, found
+
+
+@pytest.mark.parametrize(
+    ("kind", "frame"),
+    [
+        ("empty", 3),
+        ("unknown", 3),
+        ("speck", 3),
+        ("speck in the unknown", 3),
+        ("opposite corners", 3),
+        ("too large", 3),
+        ("empty", 0),
+    ],
+)
+def test_a_frame_whose_mask_failed_is_lost_and_the_others_are_tracked_as_without_it(kind: str, frame: int) -> None:
+    """A mask with pixels in opposite corners had nearly halved the initial distance of all frames, and one without
+    object pixels had trained the shape to be empty."""
+    capture, matches = failing(kind, frame)
+    lost, every = tracked_poses(capture, matches)
+    assert lost == [frame]
+    others, without = without_frame(frame)
+    assert torch.equal(every.wxyz[others], without.wxyz)
+    assert torch.equal(every.xyz[others], without.xyz)
+    expected = (every.xyz[frame - 1] + every.xyz[frame + 1]) / 2 if frame else every.xyz[1]
+    torch.testing.assert_close(every.xyz[frame], expected)
+
+
+def test_the_masks_that_the_other_route_calls_failed_are_not_tracked(
+    given: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mask of one frame in twelve is twice as wide."""
+    capture = tumbling(12).capture
+    capture.masks[5] = torch.roll(capture.masks[5], 40, 1) | capture.masks[5]
+    track(capture, [], monkeypatch)
+    inputs = given[0][0]
+    assert torch.nonzero(~inputs.tracked)[:, 0].tolist() == [5]
+    assert inputs.track.capture.names == tuple(name for name in capture.names if name != "5.png")
+
+
+def test_a_capture_without_enough_masks_cannot_be_tracked() -> None:
+    capture = INPUTS.capture
+    none = replace(capture, masks=torch.full_like(capture.masks, UNKNOWN))
+    for masks, failed in ((none, torch.zeros(5) > 0), (capture, torch.arange(5) > 0)):
+        with pytest.raises(ValueError, match=r"the masks of [01] of 5 frames show the object"):
+            progressive.gather(masks, (), lambda trajectory: None, failed)
+
+
+# In the pipeline ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -158,15 +158,6 @@ def test_the_sphere_around_a_cube_excludes_an_outlier() -> None:
     assert float(radius) == pytest.approx(math.sqrt(3), abs=0.02)
 
 
-def test_lost_poses_at_the_ends_repeat_the_closest() -> None:
-    T = SE3(
-        SO3.exp(torch.randn(4, 3, generator=torch.Generator().manual_seed(0)).double()).wxyz, torch.rand(4, 3).double()
-    )
-    interpolated = finalize._interpolate_lost(T, torch.tensor([True, False, True, False]))
-    torch.testing.assert_close(interpolated.wxyz[0], T.wxyz[1])
-    torch.testing.assert_close(interpolated.xyz[2], (T.xyz[1] + T.xyz[3]) / 2)
-
-
 def test_frames_beyond_a_pose_jump_are_lost() -> None:
     """The first two frames, rotated by 180 degrees, are matched only with each other: nothing contradicts them."""
     scene = tumbling(24)

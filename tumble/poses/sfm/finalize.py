@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from tumble.maths import SE3, SO3, angle_between, interpolate, iou, linear_from_srgb, smallest_enclosing_sphere
-from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult
+from tumble.maths import SE3, SO3, angle_between, iou, linear_from_srgb, smallest_enclosing_sphere
+from tumble.poses.result import UNOBSERVABLE_SIGMA, Observability, PoseQuality, PoseResult, interpolate_lost
 from tumble.poses.sfm import bundle_adjustment, relocalization
 from tumble.poses.sfm.frontier_points import Contours, EpipolarTangencies, epipolar_tangencies, tracks_at
 from tumble.poses.sfm.relocalization import ContourConstraints
@@ -134,7 +134,7 @@ def pose_result(
     rejected, overlap = _reject_by_overlap(capture, _trajectory(T, capture), lost)
     # Where something hides the object, its masks are more doubtful than poses that matches confirm.
     lost = rejected if solution.confirmed is None else lost
-    T = _interpolate_lost(T, lost)
+    T = interpolate_lost(T, lost)
     trajectory = _trajectory(T, capture)
     points = ((X[reliable] - centre) / scale) @ R_first.mT
     colours = _point_colours(capture, tracks, residual, reliable)
@@ -261,23 +261,6 @@ def _in_sphere(solution: Solution, sphere: Sphere) -> SE3:
 
 def _trajectory(T: SE3, capture: Capture) -> Trajectory:
     return Trajectory(SE3(T.wxyz.float(), T.xyz.float()), capture.light)
-
-
-def _interpolate_lost(T: SE3, lost: Bool[Tensor, " t"]) -> SE3:
-    """Poses with those of lost frames interpolated between the closest other frames, or copied at either end."""
-    kept = torch.nonzero(~lost)[:, 0].tolist()
-    if not kept:
-        return T
-    wxyz, xyz = T.wxyz.clone(), T.xyz.clone()
-    for k in torch.nonzero(lost)[:, 0].tolist():
-        before, after = (
-            max((i for i in kept if i < k), default=kept[0]),
-            min((i for i in kept if i > k), default=kept[-1]),
-        )
-        fraction = (k - before) / (after - before) if before < k < after else 0.0
-        pose = interpolate(T[before], T[after], fraction)
-        wxyz[k], xyz[k] = pose.wxyz, pose.xyz
-    return SE3(wxyz, xyz)
 
 
 def _point_colours(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from tumble.maths import SE3, SO3
@@ -50,6 +50,8 @@ class Inputs:
     """Feature tracks, chained from the matches."""
     radius: float
     """Approximate radius of the object [mean distance]."""
+    failed: Bool[Tensor, " t"]
+    """Frames whose silhouette differs from those of nearby frames, because the mask failed."""
     mirror_symmetry: MirrorSymmetry
     """Mirror symmetry of all silhouettes, by which a body of revolution is recognised."""
     all_matches: Sequence[Match] = field(default=(), repr=False)
@@ -83,7 +85,7 @@ def gather(capture: Capture, matches: Sequence[Match], *, hidden: bool = False) 
     silhouettes = relative_pose.replace_failed(silhouettes, failed)
     radius = RADIUS_MARGIN * float(silhouettes.radius[silhouettes.visible].median())
     mirror = mirror_symmetry(capture.masks)
-    return Inputs(capture, sure, silhouettes, contours, tracks, radius, mirror, matches if hidden else ())
+    return Inputs(capture, sure, silhouettes, contours, tracks, radius, failed, mirror, matches if hidden else ())
 
 
 def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Capture) -> Tracks:
