@@ -1,6 +1,8 @@
 """The viewer: the page shows the contents of the run directory, during a run and after it."""
 
 import dataclasses
+import os
+import shutil
 import socket
 import sys
 import time
@@ -284,6 +286,35 @@ def test_controls_change_the_scene(window: viewer.ViewerWindow, whole: Path) -> 
     window.light_visible.value = False
     window._show_frame()
     assert not node("/light").visible
+
+
+def test_a_file_that_the_run_removes_while_it_is_read_does_not_end_the_viewer(
+    whole: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A stage that ends removes its checkpoint, at any moment; a damaged file stays an error."""
+    pytest.importorskip("viser", reason="needs the extra `view`")
+    out = Path(shutil.copytree(whole, tmp_path / "run"))
+    window, original = viewer.ViewerWindow(out, "127.0.0.1", free_port()), run.asset
+
+    def removed(path: Path, cls: type[Asset]) -> Asset:
+        (path / run.ASSET).unlink()
+        return original(path, cls)
+
+    try:
+        os.utime(out / run.ASSET)
+        with monkeypatch.context() as patch:
+            patch.setattr(run, "asset", removed)
+            window.refresh()
+        assert window.snapshot.stage == "finished"
+        window.refresh()
+        assert window.snapshot.stage == "stage 2 finished"
+        (out / run.ASSET).write_bytes(b"damaged")
+        with pytest.raises(BadFile, match=run.ASSET):
+            window.refresh()
+    finally:
+        window.server.stop()
 
 
 def test_a_folder_that_is_not_a_run_raises(tmp_path: Path) -> None:

@@ -162,7 +162,8 @@ class ViewerWindow:
         viser = _viser()
         if not out.is_dir() or not ((out / run.RECIPE).is_file() or (out / run.LOCK).exists()):
             raise BadFile(out, "is not a run directory", "give the output folder of a finished or running `tumble run`")
-        self.out, self.timestamps, self.snapshot = out, (), Snapshot("no result yet")
+        self.out, self.snapshot = out, Snapshot("no result yet")
+        self.timestamps: tuple[dict[str, int], bool] | None = None
         self.capture: Capture | None = None
         self.host, self.token, listening = host, new_token(), bind(host, port)
         port = listening.getsockname()[1]
@@ -196,21 +197,34 @@ class ViewerWindow:
 
     def refresh(self) -> None:
         """Update the page if files of the run have changed."""
-        timestamps = tuple((self.out / name).stat().st_mtime_ns for name in SOURCES if (self.out / name).is_file())
         if self.capture is None and (self.out / run.RECIPE).is_file():
             self.capture = _load_capture(self.out)
-        if (timestamps, self.capture is None) != self.timestamps:
+        timestamps = _timestamps(self.out)
+        if (timestamps, self.capture is None) != self.timestamps and self._read(timestamps):
             self.timestamps = timestamps, self.capture is None
-            if self.capture is not None:
-                tracked, _ = mask_refinement.stored_result(self.out, self.capture)
-                self.capture = replace(self.capture, camera=tracked.camera) if tracked else self.capture
-            self.snapshot = read_snapshot(self.out, self.capture)
             self._show_cameras()
             self.map.options = tuple(self.snapshot.colours) or ("as captured",)
             self._show_object()
             self._show_light()
             self._show_frame()
         self.status.value = f"{self.snapshot.stage}\n{progress(self.out)}"
+
+    def _read(self, timestamps: dict[str, int]) -> bool:
+        """Read the run's result; false if the run replaced or removed files meanwhile, so that it must be read again.
+
+        Raises:
+            BadFile: A file of the run is damaged.
+        """
+        try:
+            if self.capture is not None:
+                tracked, _ = mask_refinement.stored_result(self.out, self.capture)
+                self.capture = replace(self.capture, camera=tracked.camera) if tracked else self.capture
+            self.snapshot = read_snapshot(self.out, self.capture)
+        except (BadFile, OSError):
+            if _timestamps(self.out) == timestamps:
+                raise
+            return False
+        return True
 
     def _show_object(self) -> None:
         """Draw the Gaussians or points in the colours of the selected map."""
@@ -276,6 +290,15 @@ class ViewerWindow:
             R_env_obj = self.snapshot.trajectory.R_env_obj[min(self.frame.value, len(self.snapshot.trajectory) - 1)]
             light.wxyz = SO3.from_matrix(R_env_obj.T).wxyz.numpy()
             light.visible = self.light_visible.value
+
+
+def _timestamps(out: Path) -> dict[str, int]:
+    """Times of the last change of those files of `SOURCES` that a run has [ns]."""
+    found = {}
+    for name in SOURCES:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            found[name] = (out / name).stat().st_mtime_ns
+    return found
 
 
 def serve(out: Path, host: str, port: int) -> None:
