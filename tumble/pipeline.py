@@ -16,6 +16,7 @@ from torch import Tensor
 from tumble import matching, recipes
 from tumble.datasets import check_plausible, reader_for
 from tumble.engine import Progress, Stage, run
+from tumble.evaluation import PREDICTION
 from tumble.inverse_rendering import absolute_colour, albedo_solve, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
 from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours
@@ -37,7 +38,7 @@ MIN_FRAMES = 8
 """Minimum number of frames with a pose; fewer show too little of the object."""
 IN_MEMORY = Path("capture")
 """Name, in error messages, of a capture that was not read from disk."""
-MADE_OF_ASSET = {run.EXPORT: "export", run.RELIT: "relight"}
+MADE_OF_ASSET = {run.EXPORT: "export", run.RELIT: "relight", PREDICTION: "evaluate"}
 """Folders of a run that another command makes of its asset, with that command."""
 ROTATIONS_TO_UP = {
     "x": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
