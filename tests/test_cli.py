@@ -161,6 +161,7 @@ def test_the_doctor_names_the_renderer_and_every_fix_is_an_instruction(
         (["evaluate", "nowhere", "nowhere-either"], "nowhere-either: is missing"),
         (["evaluate", "nowhere"], "nowhere is not a finished run: give the capture"),
         (["evaluate", "nowhere", "--glb", "nowhere.glb"], "nowhere.glb: is missing"),
+        (["evaluate", "nowhere", "--glb", __file__], "export.json: is missing (give asset.glb where"),
         (["report", "caf\udce9"], "'caf\\udce9' is not valid UTF-8: rename the file or folder"),
         (["run", "film.mp4", "-o", "OUT", "--matcher", "mixd"], "no 'mixd' in tumble/matching; available: aliked"),
     ],

@@ -435,6 +435,10 @@ def test_an_exported_glb_is_scored_like_its_run(
     files.write_json(stretched / folder.TRANSFORMS, document | {"fl_y": document["fl_x"] + 1})
     with pytest.raises(BadFile, match="stretched: has pixels that are not square"):
         actions.evaluate_glb(out, glb, stretched)
+    for broken, rule in (({}, "missing required field"), ({"metres_per_object_radius": 0.0}, "> 0")):
+        files.write_json(glb.parent / export.EXPORT_FILE, broken)
+        with pytest.raises(BadFile, match=f"export.json: .*{rule}.*where `tumble export` wrote it"):
+            actions.evaluate_glb(out, glb, capture)
 
 
 def test_a_card_beside_the_object_is_seen_in_the_whole_photos(

@@ -364,10 +364,10 @@ def evaluate(
     """
     with _imports():
         from tumble.actions import GLB_SCORES, evaluate_folder, evaluate_glb, score_folder
-        from tumble.io import BadFile
+        from tumble.glb_scores import export_scale
 
-    if glb is not None and not glb.is_file():
-        raise BadFile(glb, "is missing", "make it by `tumble export`")
+    if glb is not None:
+        export_scale(glb)  # fail before the run is scored
     folder, of_glb = out or score_folder(prediction), None
     report = evaluate_folder(prediction, capture, out, overwrite=overwrite, device=device)
     if glb is not None:

@@ -1,8 +1,9 @@
 """Scores of the exported GLB, rendered by the renderer and with the protocol of the ground truth (extra `synth`)."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
+import msgspec
 import torch
 
 from tumble.evaluation import CaptureWithTruth, Prediction, Report, metrics, score_prediction
@@ -16,6 +17,25 @@ SAMPLES = 64
 """Samples per pixel of relit images."""
 MAX_STRETCH = 1e-3
 """Maximum difference of the focal lengths in x and y [pixels]."""
+
+
+class _ExportFacts(TypedDict):
+    """What the scores need of `export.json`."""
+
+    metres_per_object_radius: Annotated[float, msgspec.Meta(gt=0)]
+
+
+def export_scale(glb: Path) -> float:
+    """Object radius in the unit of a GLB of `tumble export`.
+
+    Raises:
+        BadFile: The GLB or the `export.json` beside it is missing, or the latter is broken.
+    """
+    facts, fix = glb.parent / EXPORT_FILE, "give asset.glb where `tumble export` wrote it, beside its export.json"
+    for path in (glb, facts):
+        if not path.is_file():
+            raise BadFile(path, "is missing", fix)
+    return files.read_json(facts, _ExportFacts, fix)["metres_per_object_radius"]
 
 
 @torch.no_grad()
@@ -42,7 +62,7 @@ def score_glb(glb: Path, asset: Asset, known: CaptureWithTruth, aligned: tuple[A
         raise BadFile(
             known.path, "has pixels that are not square", "leave out --glb: Mitsuba's camera has square pixels"
         )
-    model = read_glb(glb, float(files.read_json(glb.parent / EXPORT_FILE, dict[str, Any])["metres_per_object_radius"]))
+    model = read_glb(glb, export_scale(glb))
     poses = alignment.to_prediction(truth.trajectory).T_cam_obj
     views = [poses[i] for i in range(len(truth))]
     with progress.task("maps of the GLB"):
