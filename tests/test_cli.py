@@ -193,6 +193,22 @@ def test_what_is_printed_of_names_is_one_line_without_markup(capsys: pytest.Capt
     assert "\x1b" not in printed
 
 
+def test_names_of_scores_are_whole_in_80_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where there is no terminal, with the GLB beside the run; sentences are not broken."""
+    monkeypatch.setenv("COLUMNS", "80")
+    keys = ("relit.wooden_studio_12_4k.lpips_full_srgb_alex", "relit.wooden_studio_12_4k.lpips_crop_srgb_alex")
+    note = "views: " + "rendered in the capture's object frame without alignment, " * 2
+    scores = {"regions": {region: dict.fromkeys(keys, 24.37) for region in ("shared", "sphere")}, "notes": [note]}
+    report = {"prediction": "p", "capture": {"name": "c"}, "light": {}, "poses": {}, "published": {}, **scores}
+    cli._print_scores(report, report)  # type: ignore[arg-type]
+    lines = capsys.readouterr().out.splitlines()
+    names = "".join(line.split("│")[1].strip() for line in lines if line.startswith("│"))
+    assert names == "".join(keys)
+    assert lines[-1].strip() == f"note: {note}".strip()
+
+
 def test_an_unknown_command_ends_with_code_2(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -578,7 +578,7 @@ def _print_scores(report: "Report", of_glb: "Report | None" = None) -> None:
     if of_glb is not None:
         regions |= {f"{region}, GLB": scores for region, scores in of_glb["regions"].items()}
     for heading in ("metric", *regions):
-        table.add_column(heading, justify="left" if heading == "metric" else "right")
+        table.add_column(heading, justify="left" if heading == "metric" else "right", overflow="fold")
     for key in dict.fromkeys(key for scores in regions.values() for key in scores):
         table.add_row(escape(_line(key)), *(formatted(scores.get(key)) for scores in regions.values()))
     for key, value in {**report["light"], **report["poses"], **report["published"]}.items():
@@ -587,4 +587,4 @@ def _print_scores(report: "Report", of_glb: "Report | None" = None) -> None:
     console = Console()
     console.print(table)
     for note in report["notes"]:
-        console.print(f"note: {_line(note)}", markup=False, highlight=False)
+        console.print(f"note: {_line(note)}", markup=False, highlight=False, soft_wrap=True)
