@@ -104,6 +104,19 @@ def test_a_check_selects_as_many_frames_as_the_run_that_it_is_for(
     assert "7 selected" in capsys.readouterr().out
 
 
+def test_checks_of_folders_whose_names_have_a_dot_do_not_share_a_preview(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr("tumble.preprocess.check_footage", lambda _, folder, *__, **___: seen.append(str(folder)) or [])
+    monkeypatch.chdir(tmp_path)
+    for name in ("can.1", "can.2"):
+        (tmp_path / name).mkdir()
+        run(monkeypatch, "check", name)
+    run(monkeypatch, "check", "clip.mp4")
+    assert seen == ["runs/check/can.1", "runs/check/can.2", "runs/check/clip"]
+
+
 def test_a_batch_converts_films_as_the_quality_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     monkeypatch.setattr(

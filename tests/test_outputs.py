@@ -163,10 +163,10 @@ def test_a_capture_that_has_changed_is_not_taken_for_that_of_the_run(
     capture: Path,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    run_folder, moved = tmp_path / "run", tmp_path / "moved"
+    run_folder, moved = tmp_path / "run", tmp_path / "moved.v2"
     shutil.copytree(whole, run_folder)
     shutil.copytree(capture, moved)
-    write_report(run_folder, capture=moved)
+    assert "<h1>moved.v2</h1>" in write_report(run_folder, capture=moved).read_text()
     photo = next(moved.glob("images/*.png"))
     files.write_png(photo, 255 - files.read_image(photo))
     with pytest.raises(BadFile, match="images, masks or camera have changed since"):

@@ -161,7 +161,7 @@ def check(
     """
     from tumble.preprocess import PREVIEW, check_footage, passes
 
-    folder = out or Path("runs/check") / footage.stem
+    folder = out or Path("runs/check") / (footage.resolve().name if footage.is_dir() else footage.stem)
     options = at_quality(options, quality, frames=frames, size=size)
     findings = check_footage(footage, folder, options, pick=pick, overwrite=overwrite)
     for finding in findings:

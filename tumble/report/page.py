@@ -100,7 +100,7 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
     used = capture_of_run(out, asset, path)
     made = read_provenance(path) if path.is_dir() else None
     hand_coloured = {frame.name: frame.hand_coloured for frame in made.frames} if made else {}
-    name = out.resolve().name if path.name == run.CAPTURE else path.stem
+    name = (out if path.name == run.CAPTURE else path).resolve().name
     assumed_focal = float(used.whole.camera.fx_fy_cx_cy[0]) if used.whole.focal_assumed else None
     corrected = made is not None and made.window_top_left_height_width is not None
     summary = RunSummary(name, run.log_records(out), run.recipe(out), assumed_focal, corrected)
