@@ -65,7 +65,9 @@ def test_errors_name_invalid_and_missing_files(tmp_path: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize("name", ["x.exr", "x.hdr", "x.png"])
-def test_truncated_files_are_rejected(tmp_path: Path, name: str) -> None:
+def test_truncated_files_are_rejected_and_libraries_print_nothing(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     values = RNG.random((64, 64, 3)).astype(np.float32)
     {".exr": files.write_exr, ".hdr": files.write_hdr}.get(
         Path(name).suffix, lambda path, v: files.write_png(path, (v * 255).astype(np.uint8))
@@ -75,6 +77,7 @@ def test_truncated_files_are_rejected(tmp_path: Path, name: str) -> None:
     read = files.read_image if name.endswith("png") else files.read_radiance
     with pytest.raises(BadFile, match=name):
         read(tmp_path / name)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_too_large_images_are_rejected_before_decoding(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ against `limits` before decoding it. Documents are parsed and validated at once,
 import contextlib
 import errno
 import hashlib
+import io
 import json
 import math
 import os
@@ -326,12 +327,13 @@ def _first_line(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _hidden_library_messages() -> Iterator[None]:
-    """Context in which nothing is printed on stderr, where OpenEXR and OpenCV report what becomes a `BadFile`."""
+    """Context in which nothing is printed, where OpenEXR and OpenCV report what becomes a `BadFile`."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
-        yield
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
     finally:
         os.dup2(kept, 2)
         os.close(kept)
