@@ -11,16 +11,16 @@ import pytest
 import safetensors.torch
 import torch
 
+from tests.matching.conftest import NOT_INSTALLED, xfeat_weights
 from tumble import matching
 from tumble.io import weights, write_tensors
 from tumble.io.files import BadFile
-from tumble.io.plugins import load_plugin, plugin_names
+from tumble.io.plugins import load_plugin
 from tumble.matching import _aliked, _gmflow, _lightglue, _window, aliked, match_pairs, xfeat
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.scene.match import Match, View
 
 SIZE = 128
-NOT_INSTALLED = {"roma": "needs an installation of romav2", "mast3r": "needs an installation of mast3r"}
 WARP = np.array([[0.97, -0.10, 9.0], [0.09, 1.02, -6.0], [2e-4, -1e-4, 1.0]])
 """Asymmetric homography of rotation, stretch and perspective, for positions with pixel centres at +0.5."""
 
@@ -55,15 +55,6 @@ def pair() -> tuple[View, View]:
     views = (image, mask), (warped(image, cv2.INTER_CUBIC), warped(mask, cv2.INTER_NEAREST))
     i, j = (View(n, torch.from_numpy(im), torch.from_numpy(m)) for n, (im, m) in zip((7, 3), views, strict=True))
     return i, j
-
-
-@pytest.fixture(params=plugin_names("matching"))
-def matcher(request: pytest.FixtureRequest) -> matching.Matcher:
-    if request.param in NOT_INSTALLED:
-        pytest.skip(f"{request.param} {NOT_INSTALLED[request.param]}")
-    if request.param in weights.SOURCES and not weights.is_downloaded(request.param):
-        pytest.skip(f"{request.param} needs its weights: tumble weights get {request.param}")
-    return load_plugin("matching", request.param).load("cpu")
 
 
 def on_interior_pixels(match: Match, view_i: View, view_j: View) -> bool:
@@ -435,23 +426,8 @@ def test_lightglue_gives_up_pairs_that_an_earlier_output_calls_hopeless(monkeypa
 
 def test_xfeat_uses_the_published_names_and_shapes_of_weights() -> None:
     """With random weights, outputs have the right size, and keypoint probabilities of a cell sum to less than 1."""
-    rng = torch.Generator().manual_seed(3)
-    widths = {"block1": [1, 4, 8, 8, 24], "block2": [24, 24, 24], "block3": [24, 64, 64, 64]}
-    widths |= {"block4": [64] * 4, "block5": [64, 128, 128, 128, 64], "block_fusion": [64] * 3}
-    widths |= {"heatmap_head": [64] * 3, "keypoint_head": [64] * 4}
-    pointwise = {"block3.2", "block5.3"} | {f"{h}.{k}" for h in ("heatmap_head", "keypoint_head") for k in range(3)}
-    p = {}
-    for name, w in widths.items():
-        for k, (into, out) in enumerate(itertools.pairwise(w)):
-            side = 1 if f"{name}.{k}" in pointwise else 3
-            p[f"{name}.{k}.layer.0.weight"] = torch.randn(out, into, side, side, generator=rng) / (into * side) ** 0.5
-            p[f"{name}.{k}.layer.1.running_mean"] = torch.zeros(out)
-            p[f"{name}.{k}.layer.1.running_var"] = torch.ones(out)
-    for name, out, into in (("skip1.1", 24, 1), ("block_fusion.2", 64, 64), ("heatmap_head.2", 1, 64)):
-        p[f"{name}.weight"], p[f"{name}.bias"] = torch.randn(out, into, 1, 1, generator=rng), torch.zeros(out)
-    p["keypoint_head.3.weight"], p["keypoint_head.3.bias"] = torch.randn(65, 64, 1, 1, generator=rng), torch.zeros(65)
-    image = torch.randint(0, 256, (1, 3, 64, 96), generator=rng)
-    descriptors, keypoint_score, reliability = xfeat.network(image, p)
+    image = torch.randint(0, 256, (1, 3, 64, 96), generator=torch.Generator().manual_seed(5))
+    descriptors, keypoint_score, reliability = xfeat.network(image, xfeat_weights())
     assert descriptors.shape == (1, 64, 8, 12)
     assert reliability.shape == (1, 1, 8, 12)
     per_cell = keypoint_score.unflatten(2, (8, 8)).unflatten(4, (12, 8)).sum((3, 5))
