@@ -116,6 +116,14 @@ def test_without_an_object_the_match_is_empty(matcher: matching.Matcher) -> None
     assert len(matcher(empty, View(4, view_i.image, view_i.mask))) == 0
 
 
+def test_an_object_of_one_colour_is_no_error(matcher: matching.Matcher) -> None:
+    """It has no keypoints; flow may call it still."""
+    mask = pair()[0].mask
+    image = torch.full((SIZE, SIZE, 3), 90, dtype=torch.uint8)
+    match = matcher(View(0, image, mask), View(1, image, mask))
+    assert torch.equal(match.uv_i, match.uv_j)
+
+
 def test_swapped_views_give_equivalent_matches(matcher: matching.Matcher) -> None:
     view_i, view_j = pair()
     forward, backward = matcher(view_i, view_j), matcher(view_j, view_i).reversed()

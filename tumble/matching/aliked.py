@@ -62,9 +62,10 @@ def load(device: torch.device | str):
 def _extract(view: View, parameters: dict[str, Tensor]) -> Features:
     """Keypoints of a view, with descriptors."""
     device = parameters["conv1.weight"].device
+    none = torch.zeros(0, 2), torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device)
     width = extent(view) * (1 + 2 * MARGIN)
     if width == 0:
-        return torch.zeros(0, 2), torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device)
+        return none
     window = crop_window(view, width, SIZE)
     image = torch.from_numpy(window.rgb).to(device).permute(2, 0, 1)[None] / 255
     levels, score = _aliked.dense(image, parameters)
@@ -72,5 +73,7 @@ def _extract(view: View, parameters: dict[str, Tensor]) -> Features:
     at = _aliked.keypoints(score, usable, max_count=MAX_KEYPOINTS, min_score=MIN_SCORE)
     # Sub-pixel refinement may move a keypoint off the usable pixels.
     at = at[torch.from_numpy(window.contains(at.cpu().numpy() + 0.5)).to(device)]
+    if not len(at):
+        return none
     unit = _aliked.descriptors(levels, at, parameters)
     return window.in_frame(at.cpu().numpy().astype(np.float64) + 0.5), 2 * at / SIZE - 1, unit
