@@ -22,6 +22,7 @@ SUITE = """
 title = "Two rows of a pot"
 recipe = "smoke"
 seeds = [0]
+glb = true
 [capture]
 views = 6
 resolution = 32
@@ -50,7 +51,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> str:
 def measured(suite: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a benchmark with both rows; each process waits for, or renders, the one capture."""
     out = tmp_path_factory.mktemp("bench") / "b"
-    tasks = batch.missing_rows(cases_of(read_suite(suite)), out, None)
+    tasks = batch.missing_rows(cases_of(read_suite(suite)), out, None, glb=True)
     list(batch.run_rows(tasks, out, batch.Workers(jobs=2)))
     return out
 
@@ -72,7 +73,23 @@ def test_a_row_has_all_scores_and_what_they_depend_on(measured: Path) -> None:
     assert row["regions"].keys() == {"shared", "sphere"}
     assert all(wanted | {"roughness.rmse_fg"} <= scores.keys() for scores in row["regions"].values())
     assert {"light.rmse_clip10", "light.log_correlation"} <= row["light"].keys()
+    assert {"albedo.psnr_fg_srgb", "relit.psnr_fg_srgb", "normal.mean_fg_degrees"} <= row["glb"].keys()
+    # Gaussians and GLB show the same object: their scores differ, but little.
+    difference = row["glb"]["albedo.psnr_fg_srgb"] - row["regions"]["shared"]["albedo.psnr_fg_srgb"]
+    assert 0 < abs(difference) < 3
     assert len(list((measured / captures.CAPTURES).glob("*/transforms.json"))) == 1
+
+
+def test_a_row_without_the_scores_of_the_glb_is_completed_only_for_suites_that_have_them(
+    measured: Path, suite: str, tmp_path: Path
+) -> None:
+    cases = cases_of(read_suite(suite))
+    for row in rows.read_rows(measured):
+        row.pop("glb", None)
+        files.write_json(rows.row_file(tmp_path, row), row)
+    assert batch.missing_rows(cases, tmp_path, None) == []
+    missing = batch.missing_rows(cases, tmp_path, None, glb=True)
+    assert [(task.case.poses, task.glb) for task in missing] == [("given", True)]
 
 
 def test_a_failed_row_says_why_and_is_measured_again_only_on_demand(measured: Path, suite: str) -> None:
@@ -169,6 +186,7 @@ def test_rows_of_other_code_are_stale_in_the_report(
     assert "<title>Two rows of a pot - tumble</title>" in page
     document, markdown = measured / "pot.json", measured / "pot.md"
     assert "1 failed, 0 stale" in markdown.read_text("utf-8")
+    assert "| GLB: albedo object [dB] |" in markdown.read_text("utf-8")
     before, now = markdown.read_text("utf-8"), code.current_code()
     other = {**now, "fingerprint": "0" * 16}
     monkeypatch.setattr(code, "current_code", lambda: other)

@@ -44,6 +44,8 @@ class RowTask:
     data: Path | None
     out: Path
     device: str
+    glb: bool = False
+    """Whether the exported GLB is scored as well."""
 
     @property
     def name(self) -> str:
@@ -83,7 +85,13 @@ def make_captures(cases: Sequence[Case], out: Path, data: Path | None, workers: 
 
 
 def missing_rows(
-    cases: Sequence[Case], out: Path, data: Path | None, *, device: str = "cpu", again: bool = False
+    cases: Sequence[Case],
+    out: Path,
+    data: Path | None,
+    *,
+    device: str = "cpu",
+    again: bool = False,
+    glb: bool = False,
 ) -> list[RowTask]:
     """The cases without a row of the current code.
 
@@ -91,6 +99,7 @@ def missing_rows(
         out: Folder of the benchmark.
         data: Folder with the objects and lights of the suite.
         again: Also those whose row says that they failed.
+        glb: Also those whose row lacks the scores of the exported GLB; their runs, if still there, are not repeated.
 
     Raises:
         BadFile: An object or light is missing, or a row is damaged.
@@ -103,9 +112,10 @@ def missing_rows(
         path = bench.row_file(out, wanted)
         found = bench.read_row(path) if path.is_file() else None
         # A method in a file of the user may have changed.
-        if found is None or found["recipe"] != wanted["recipe"] or (again and "error" in found):
+        lacks = found is not None and ((again and "error" in found) or (glb and not found.keys() & {"glb", "error"}))
+        if found is None or found["recipe"] != wanted["recipe"] or lacks:
             # Machines of a cluster need whole paths.
-            tasks.append(RowTask(case, data and data.absolute(), out.absolute(), device))
+            tasks.append(RowTask(case, data and data.absolute(), out.absolute(), device, glb))
     progress.LOG.info("%d of %d rows are there already", len(cases) - len(tasks), len(cases))
     return tasks
 
@@ -204,6 +214,9 @@ def measure(task: RowTask) -> tuple[SuiteRow, bytes]:
     row["albedo_scale"], row["notes"] = report["albedo_scale"], report["notes"]
     if known.truth.light is not None:
         row["directionality"] = round(known.truth.light.directionality(), 3)
+    if task.glb:
+        glb = actions.export_run(where, None, "web", None, device=task.device) / "asset.glb"
+        row["glb"] = bench.rounded(actions.evaluate_glb(where, glb, capture)["regions"]["shared"])
     return row, bench.picture_of(capture, where / PREDICTION, report)
 
 

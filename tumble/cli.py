@@ -414,7 +414,8 @@ def bench(
     if action == "report":
         print(batch.report_suite(suite, out, **selection))
         return
-    cases = bench.cases_of(bench.read_suite(suite), **selection)
+    chosen = bench.read_suite(suite)
+    cases = bench.cases_of(chosen, **selection)
     workers, data = bench.Workers(jobs, address, gpu=OCCUPIES_GPU[device]), bench.data_folder(data)
     failed = 0
     if action == "list":
@@ -424,7 +425,7 @@ def bench(
             failed += bool(outcome.error)
             print(outcome.result or f"{outcome.task.name}: {_line(outcome.error)}", flush=True)
     if action == "run":
-        tasks = batch.missing_rows(cases, out, data, device=device, again=again)
+        tasks = batch.missing_rows(cases, out, data, device=device, again=again, glb=chosen.glb)
         for row in batch.run_rows(tasks, out, workers):
             failed += "error" in row
             print(batch.summary_line(row), flush=True)

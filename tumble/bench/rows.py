@@ -53,6 +53,8 @@ class SuiteRow(TypedDict):
     """Maximum memory of the process of the run and its evaluation [MiB]."""
     regions: NotRequired[dict[str, dict[str, float | None]]]
     """Scores by region of evaluation views and key (docs/metrics.md)."""
+    glb: NotRequired[dict[str, float | None]]
+    """Scores of the exported GLB in the shared views, by key; only in suites that ask for it."""
     light: NotRequired[dict[str, float | None]]
     poses: NotRequired[dict[str, float | None]]
     published: NotRequired[dict[str, float | None]]

@@ -1,6 +1,7 @@
 """Suites as data: TOML files that list objects, lights, settings, materials, poses, methods and seeds.
 
     title = "..."                       half = "tune", "report" or "none"        recipe = "draft"        seeds = [0, 1]
+    glb = true                          the exported GLB is scored as well, path traced
     [capture]                           options of `tumble synth` for all captures, such as `resolution = 128`
     [[object]]                          `model` and more options for its captures, such as `env` and `up`; or `folder`,
                                         a capture of the user in the data folder, in any layout that `tumble run` reads
@@ -99,6 +100,8 @@ class Suite:
     """Commit at which all constants of the method were chosen, before the first row of a suite of the half "report"."""
     capture: dict[str, Any] = field(default_factory=dict)
     compare: tuple[Comparison, ...] = ()
+    glb: bool = False
+    """Whether the GLB of `tumble export --preset web` is scored beside the Gaussians (docs/metrics.md)."""
     plot: str = ""
     """Label with numeric values along which scores are drawn, such as "views"."""
 
