@@ -168,8 +168,10 @@ PLAIN = [Case(model, light, seed) for seed in SEEDS for light in LIGHTS for mode
 """All objects, lights and trajectories at the default resolution."""
 OTHER_OBJECTS = [Case(model, light) for light in LIGHTS for model in NEW]
 """The nine other objects under both lights, one trajectory."""
-COMPARED = [Case(model) for model in (*TEXTURED, *OTHERS)]
-"""Captures on which the two routes of stage 1 are compared."""
+COMPARED = [Case(model, light) for light in LIGHTS for model in (*TEXTURED, *OTHERS, *NEW)]
+"""Captures on which the routes of stage 1 are compared: all objects under both lights, one trajectory."""
+TABLE_4 = COMPARED[: len(TEXTURED + OTHERS)]
+"""Captures on which refinements of the progressive route's poses are compared."""
 LARGE = [Case(TEXTURED[0], resolution=256), Case(OTHERS[0], LIGHTS[1], resolution=256)]
 """Captures at twice the resolution."""
 DIFFICULT = [
