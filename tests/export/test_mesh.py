@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from tests.surfaces import GAMMA, MAJOR, MINOR, flat, sphere, torus
 from tumble import backends
@@ -110,6 +111,21 @@ def test_tunnels_of_noise_are_closed_and_real_holes_stay() -> None:
     kept = mesh.surface(plate, -depth_fusion.HALF_SIDE, CELL)
     assert mesh.n_tunnels(kept) == 9
     assert np.array_equal(kept.vertices, marched(plate).vertices)
+
+
+def test_thin_loops_stay() -> None:
+    """A ball with six loops of wire, as those of a shoe's laces: smoothing would cut them."""
+    x = grid()
+    solid = np.linalg.norm(x, axis=-1) - 0.5
+    for axis in range(3):
+        for side in (-1, 1):
+            at = np.roll(x, -axis, axis=-1) - np.array([0.5 * side, 0.0, 0.0])
+            ring = np.hypot(np.hypot(at[..., 0], at[..., 1]) - 0.3, at[..., 2])
+            solid = np.minimum(solid, ring - 1.1 * CELL)
+    assert mesh.n_tunnels(marched(solid)) == 6
+    assert mesh.n_tunnels(marched(ndimage.gaussian_filter(solid, mesh.SMOOTHED[0]))) < 6
+    kept = mesh.surface(solid, -depth_fusion.HALF_SIDE, CELL)
+    assert np.array_equal(kept.vertices, marched(solid).vertices)
 
 
 def fused(gaussians: Gaussians) -> Mesh:

@@ -8,9 +8,9 @@ import torch
 
 from tests.lopsided import tumbling
 from tumble.maths import SO3
-from tumble.poses.sfm import stage
+from tumble.poses.sfm import registration, stage
 from tumble.poses.sfm.partial import Observed, Partial, contour_cost
-from tumble.poses.sfm.registration import Joint, solutions
+from tumble.poses.sfm.registration import Joint, best_joint, contour_joint, join, solutions
 from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
 
 SCENE = tumbling(12, points=200)
@@ -119,3 +119,36 @@ def test_a_part_moved_to_another_object_frame_shows_the_same_points() -> None:
     x = torch.tensor([0.5, -0.2, 0.7], dtype=torch.float64)
     x_new = 1.3 * turn @ x + shift.double()
     assert torch.allclose(moved.R @ x_new + moved.t, 1.3 * (part.R @ x + part.t))
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_a_joint_of_a_minority_of_keypoints_waits(
+    observed: Observed, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cap of a bottle agrees with any turn about its axis; its label does not."""
+    pose = SCENE.T_cam_obj
+    every = Partial(tuple(range(12)), pose.rotation.matrix().double(), pose.xyz.double())
+    a, b = every.select(range(7)), every.select(range(7, 12))
+    joint = Joint(b, 110, share, 3, 0.5, 80, True)
+    assert joint.accepted
+    known = {(best_joint, a, b): joint, (contour_joint, a, b): None}
+    monkeypatch.setattr(registration, "adjusted", lambda _, part, __: part)
+    monkeypatch.setattr(registration, "pruned", lambda _, part, __: part)
+    first = join(observed, [b, a], dict(known), by_majority=True)
+    assert [part.frames for part in first] == ([tuple(range(12))] if share > 0.5 else [a.frames, b.frames])
+    assert [part.frames for part in join(observed, [a, b], dict(known), by_majority=False)] == [tuple(range(12))]
+
+
+def test_parts_are_joined_by_contours_only_after_all_keypoints(
+    observed: Observed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pose = SCENE.T_cam_obj
+    every = Partial(tuple(range(12)), pose.rotation.matrix().double(), pose.xyz.double())
+    a, b = every.select(range(7)), every.select(range(7, 12))
+    by_contours = registration.ContourJoint(b, 0.05, math.inf, 100, 0.05)
+    assert by_contours.accepted
+    known = {(best_joint, a, b): None, (contour_joint, a, b): by_contours}
+    monkeypatch.setattr(registration, "adjusted", lambda _, part, __: part)
+    monkeypatch.setattr(registration, "pruned", lambda _, part, __: part)
+    assert len(join(observed, [a, b], dict(known), by_majority=True)) == 2
+    assert len(join(observed, [a, b], dict(known), by_majority=False)) == 1

@@ -72,7 +72,8 @@ def posed(scene: Tumble, inputs: stage.Inputs) -> tuple[Partial, stage.Inputs]:
 
 def test_segments_before_and_after_a_change_of_grip_are_joined(scene: Tumble, posed: tuple) -> None:
     part, _ = posed
-    assert set(range(N)) - set(part.frames) == set(REGRASP)
+    # What is seen of the first or the last frame may be too little.
+    assert set(REGRASP) <= set(range(N)) - set(part.frames) <= {0, *REGRASP, N - 1}
     T = SE3.from_rotation_matrix(part.R.float())
     scores = metrics.rotation_scores(Trajectory(T, "camera"), truth(scene).select(list(part.frames)))
     assert scores["rotation_median_degrees"] < 1.0
@@ -91,7 +92,10 @@ def test_the_network_is_asked_only_where_sift_leaves_frames_out(
             assert all(max(pair) >= first for pair in pairs)  # one of both frames has no pose
         return matched(scene, inputs.capture, pairs[:40])
 
-    def understood(cfg: object, given: stage.Inputs, wide: list[Match], R: torch.Tensor, rng: object) -> tuple:
+    def understood(
+        cfg: object, given: stage.Inputs, wide: list[Match], R: torch.Tensor, rng: object, *, cautious: bool
+    ) -> tuple:
+        assert cautious == (len(asked) == 1)
         found = first if len(asked) == 1 else N
         if len(asked) == 2:  # The network's matches are added to those of neighbouring frames and to SIFT's.
             assert sum(map(len, given.all_matches)) > sum(map(len, inputs.all_matches))
@@ -113,9 +117,10 @@ def test_frames_without_a_pose_are_lost_and_stay_out_of_the_adjustment(posed: tu
     state.params, state.memory["posed"] = replace(state.params, R=R, t=t), torch.zeros(N, dtype=torch.bool)
     state.memory["posed"][list(part.frames)] = True
     moved, _ = stage.adjust_all(QUICK, inputs, state, 1.0)
-    assert torch.equal(moved.R[list(REGRASP)], R[list(REGRASP)])
+    lost = sorted(set(range(N)) - set(part.frames))
+    assert torch.equal(moved.R[lost], R[lost])
     assert not torch.equal(moved.R[list(part.frames)], R[list(part.frames)])
-    assert torch.nonzero(stage.finish(QUICK, inputs, state).quality.lost)[:, 0].tolist() == list(REGRASP)
+    assert torch.nonzero(stage.finish(QUICK, inputs, state).quality.lost)[:, 0].tolist() == lost
 
 
 def test_only_a_wide_unknown_region_hides_the_object(scene: Tumble) -> None:

@@ -6,7 +6,7 @@ hypotheses. They are rated by all correspondences, by the contours, and by the m
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -120,8 +120,13 @@ class Joint:
             return False
         if self.confirmed:
             return self.keypoints >= MIN_MAJORITY_KEYPOINTS and self.frames > 0
-        enough = MIN_MAJORITY_KEYPOINTS if self.share > 0.5 else MIN_JOINT_KEYPOINTS
+        enough = MIN_MAJORITY_KEYPOINTS if self.by_majority else MIN_JOINT_KEYPOINTS
         return self.keypoints >= enough and self.frames >= MIN_JOINT_FRAMES
+
+    @property
+    def by_majority(self) -> bool:
+        """Whether more than half of the keypoints that have a surface point in the other part agree."""
+        return self.share > 0.5
 
     @property
     def measurable(self) -> bool:
@@ -306,18 +311,21 @@ def _agreeing(
     return np.bincount(np.searchsorted(part.frames, observed.keypoints.frame[agreeing]), minlength=len(part))
 
 
-def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> list[Partial]:
+def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses, *, by_majority: bool) -> list[Partial]:
     """Join parts, the best confirmed pair first, until no two belong together.
 
     Args:
         parts: Parts of the capture.
         known: Hypotheses of earlier calls; new ones are added.
+        by_majority: Only make joints on which most keypoints agree. Others are the last resort: the cap of a bottle
+            looks the same from all sides, and its keypoints agree with any turn about the axis.
     """
     parts = sorted(parts, key=len, reverse=True)
     while True:
         pairs = [(a, b) for k, a in enumerate(parts) for b in parts[k + 1 :]]
-        # Contours join what shares no texture.
-        found = _best(observed, pairs, known, best_joint) or _best(observed, pairs, known, contour_joint)
+        found = _best(observed, pairs, known, best_joint, by_majority=by_majority)
+        if found is None and not by_majority:
+            found = _best(observed, pairs, known, contour_joint)  # contours join what shares no texture
         if found is None:
             return parts
         (a, b), joint = found
@@ -326,21 +334,32 @@ def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses) -> lis
 
 
 def _best(
-    observed: Observed, pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses, propose: Propose
+    observed: Observed,
+    pairs: Sequence[tuple[Partial, Partial]],
+    known: Hypotheses,
+    propose: Propose,
+    *,
+    by_majority: bool = False,
 ) -> tuple[tuple[Partial, Partial], Joint | ContourJoint] | None:
     """The pair with the strongest accepted joint, and the joint."""
     for a, b in pairs:
         if (propose, a, b) not in known:
             known[propose, a, b] = propose(observed, b, a)
     joints = [((a, b), joint) for a, b in pairs if (joint := known[propose, a, b]) is not None and joint.accepted]
+    joints = [each for each in joints if each[1].by_majority or not by_majority]
     return max(joints, key=lambda each: each[1].strength, default=None)
 
 
-def grow(observed: Observed, part: Partial) -> Partial:
-    """Add neighbouring frames, one after another, for as long as keypoints, contours and motion confirm them."""
+def grow(observed: Observed, part: Partial, *, without: Collection[int] = ()) -> Partial:
+    """Add neighbouring frames, one after another, for as long as keypoints, contours and motion confirm them.
+
+    Args:
+        without: Frames that are not added.
+    """
+    frames = [frame for frame in range(observed.keypoints.n_frames) if frame not in without]
     while True:
         X = surface_points(observed, part, TOLERANCE)
-        new = [_registered(observed, part, frame, X) for frame in range(observed.keypoints.n_frames)]
+        new = [_registered(observed, part, frame, X) for frame in frames]
         grown = part
         for each in new:
             grown = grown if each is None else grown.merged(each)

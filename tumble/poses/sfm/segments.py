@@ -8,8 +8,9 @@ once with all features of the object and the hand, which moves with it while its
 apart in time, of the object alone, then join segments that show the same side, and add the frames between them. Frames
 that nothing confirms get no pose.
 
-Where this leaves frames out, a network matches these with their neighbours and with frames far apart as well, and all
-is done again.
+At first two parts are only joined where most matches between them agree. Where this leaves frames out, a network
+matches these with their neighbours and with frames far apart as well, and all is done again; fewer matches, or contours
+alone, then join parts, too.
 """
 
 import math
@@ -102,7 +103,7 @@ def segmented_poses(
     apart = [(i, j) for i in range(n) for j in range(i + 1, n)]
     near_or_even = [(i, j) for i, j in apart if j - i <= NEAR or not (i % FAR_STRIDE or j % FAR_STRIDE)]
     wide = _matched(inputs, near_or_even, WIDE_MATCHER)
-    part, tracks = _understood(cfg, inputs, wide, R, rng)
+    part, tracks = _understood(cfg, inputs, wide, R, rng, cautious=True)
     if part is None or n - len(part) > MAX_MISSING * n:
         near = set(neighbours(n))
         far = {(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)}
@@ -110,27 +111,34 @@ def segmented_poses(
         learned = _matched(inputs, sorted(each for each in near | far if missing.intersection(each)), LEARNED_MATCHER)
         of_near = [match for match in learned if (match.i, match.j) in near]
         inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), hidden=True)
-        other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng)
+        other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng, cautious=False)
         if other is not None and (part is None or len(other) >= len(part)):
             part, tracks = other, other_tracks
     return part, tracks
 
 
 def _understood(
-    cfg: BaseConfig, inputs: Inputs, wide: Sequence[Match], R: Float[Tensor, "t 3 3"], rng: torch.Generator
+    cfg: BaseConfig,
+    inputs: Inputs,
+    wide: Sequence[Match],
+    R: Float[Tensor, "t 3 3"],
+    rng: torch.Generator,
+    *,
+    cautious: bool,
 ) -> tuple[Partial | None, Tracks]:
     """The largest part of the capture that matches explain, and its tracks; None if there is no segment.
 
     Args:
         wide: Matches of all that is not background, also between frames that are far apart in time.
+        cautious: Leave apart what only a minority of matches would join, or contours alone.
     """
     on_it = [match for each in wide if len(match := on_object(each, inputs.capture.masks)) >= MIN_WIDE_MATCHES]
     sure = _observed(cfg, inputs, inputs.tracks, on_it)
     tracks = tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)
     known: Hypotheses = {}
     found = [part for each in (sure, _observed(cfg, inputs, tracks, on_it)) for part in _segments(each, R, rng)]
-    parts = join(sure, _supported(sure, found), known)
-    parts = join(sure, _grown(sure, parts), known)
+    parts = join(sure, _supported(sure, found), known, by_majority=cautious)
+    parts = join(sure, _grown(sure, parts, cautious=cautious), known, by_majority=cautious)
     if not parts:
         return None, inputs.tracks
     tracks = thinned(joined_tracks(sure, parts[0], TOLERANCE)[0])
@@ -176,12 +184,17 @@ def _supported(sure: Observed, parts: Sequence[Partial]) -> list[Partial]:
     return kept
 
 
-def _grown(sure: Observed, parts: Sequence[Partial]) -> list[Partial]:
-    """Parts, the largest first, with single frames added; without those that then add too few frames to the others."""
+def _grown(sure: Observed, parts: Sequence[Partial], *, cautious: bool) -> list[Partial]:
+    """Parts, the largest first, with single frames added; without those that then add too few frames to the others.
+
+    Args:
+        cautious: Add no frames that other parts have: a part that grows over another one drifts away from it.
+    """
     grown, covered = [], set()
     for part in parts:
         if len(set(part.frames) - covered) >= MIN_NEW_FRAMES:
-            grown.append(grow(sure, part) if len(grown) < MAX_GROWN else part)
+            others = covered.union(*(each.frames for each in parts if each is not part)) if cautious else set()
+            grown.append(grow(sure, part, without=others) if len(grown) < MAX_GROWN else part)
             covered |= set(grown[-1].frames)
     return grown
 
