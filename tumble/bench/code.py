@@ -20,6 +20,7 @@ DECIDING = (
     "datasets",
     "engine",
     "evaluation",
+    "export",
     "inverse_rendering",
     "io",
     "maths",
@@ -29,6 +30,7 @@ DECIDING = (
     "scene",
     "synthetic",
     "actions.py",
+    "glb_scores.py",
     "pipeline.py",
     "recipes.py",
 )
