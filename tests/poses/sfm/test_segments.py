@@ -12,7 +12,7 @@ from tumble.poses.sfm import segments, stage
 from tumble.poses.sfm.adjustment import Windows
 from tumble.poses.sfm.observations import is_hidden, on_object, shown
 from tumble.poses.sfm.partial import Observed, Partial, cut
-from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
+from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, gather_keypoints
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture, Match, Trajectory
 
 QUICK = stage.Config(window_scales=(3.0, 1.0, 0.5), relocalized_scales=(1.0, 0.5))
@@ -94,13 +94,13 @@ def test_the_network_is_asked_only_where_sift_leaves_frames_out(
 
     def understood(
         cfg: object, given: stage.Inputs, wide: list[Match], R: torch.Tensor, rng: object, *, cautious: bool
-    ) -> tuple:
+    ) -> tuple[list[Partial], Tracks]:
         assert cautious == (len(asked) == 1)
         found = first if len(asked) == 1 else N
         if len(asked) == 2:  # The network's matches are added to those of neighbouring frames and to SIFT's.
             assert sum(map(len, given.all_matches)) > sum(map(len, inputs.all_matches))
             assert len(wide) == len({(match.i, match.j) for match in wide})
-        return Partial(tuple(range(found)), R[:found], R[:found, 0]), inputs.tracks
+        return [Partial(tuple(range(found)), R[:found], R[:found, 0])], inputs.tracks
 
     monkeypatch.setattr(segments, "_matched", matches)
     monkeypatch.setattr(segments, "_understood", understood)

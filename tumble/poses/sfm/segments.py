@@ -8,9 +8,9 @@ once with all features of the object and the hand, which moves with it while its
 apart in time, of the object alone, then join segments that show the same side, and add the frames between them. Frames
 that nothing confirms get no pose.
 
-At first two parts are only joined where most matches between them agree. Where this leaves frames out, a network
-matches these with their neighbours and with frames far apart as well, and all is done again; fewer matches, or contours
-alone, then join parts, too.
+At first two parts are only joined where most matches between them agree. Where this leaves frames out or apart, a
+network matches these with their neighbours and with frames far apart as well, and all is done again; fewer matches, or
+contours alone, then join parts, too.
 """
 
 import math
@@ -103,17 +103,19 @@ def segmented_poses(
     apart = [(i, j) for i in range(n) for j in range(i + 1, n)]
     near_or_even = [(i, j) for i, j in apart if j - i <= NEAR or not (i % FAR_STRIDE or j % FAR_STRIDE)]
     wide = _matched(inputs, near_or_even, WIDE_MATCHER)
-    part, tracks = _understood(cfg, inputs, wide, R, rng, cautious=True)
+    parts, tracks = _understood(cfg, inputs, wide, R, rng, cautious=True)
+    part = parts[0] if parts else None
     if part is None or n - len(part) > MAX_MISSING * n:
         near = set(neighbours(n))
         far = {(i, j) for i, j in apart if j - i > NEAR and not (i % LEARNED_STRIDE or j % LEARNED_STRIDE)}
-        missing = set(range(n)) - set(part.frames if part else ())
-        learned = _matched(inputs, sorted(each for each in near | far if missing.intersection(each)), LEARNED_MATCHER)
+        known = [set(each.frames) for each in parts]
+        unknown = (pair for pair in near | far if not any(frames.issuperset(pair) for frames in known))
+        learned = _matched(inputs, sorted(unknown), LEARNED_MATCHER)
         of_near = [match for match in learned if (match.i, match.j) in near]
         inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), hidden=True)
-        other, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng, cautious=False)
-        if other is not None and (part is None or len(other) >= len(part)):
-            part, tracks = other, other_tracks
+        others, other_tracks = _understood(cfg, inputs, _merged(wide, learned), R, rng, cautious=False)
+        if others and (part is None or len(others[0]) >= len(part)):
+            part, tracks = others[0], other_tracks
     return part, tracks
 
 
@@ -125,8 +127,8 @@ def _understood(
     rng: torch.Generator,
     *,
     cautious: bool,
-) -> tuple[Partial | None, Tracks]:
-    """The largest part of the capture that matches explain, and its tracks; None if there is no segment.
+) -> tuple[list[Partial], Tracks]:
+    """The parts of the capture that matches explain, the largest first, and the tracks of that one.
 
     Args:
         wide: Matches of all that is not background, also between frames that are far apart in time.
@@ -140,9 +142,9 @@ def _understood(
     parts = join(sure, _supported(sure, found), known, by_majority=cautious)
     parts = join(sure, _grown(sure, parts, cautious=cautious), known, by_majority=cautious)
     if not parts:
-        return None, inputs.tracks
+        return [], inputs.tracks
     tracks = thinned(joined_tracks(sure, parts[0], TOLERANCE)[0])
-    return parts[0], replace(tracks, frame=torch.tensor(parts[0].frames)[tracks.frame])
+    return parts, replace(tracks, frame=torch.tensor(parts[0].frames)[tracks.frame])
 
 
 def _matched(inputs: Inputs, pairs: Sequence[tuple[int, int]], matcher: str) -> list[Match]:
