@@ -109,6 +109,24 @@ def test_the_network_is_asked_only_where_sift_leaves_frames_out(
     assert (len(part), asked) == ((N - 1, ["sift"]) if first == N - 1 else (N, ["sift", "aliked"]))
 
 
+def test_the_network_matches_no_pair_of_frames_of_one_part(
+    scene: Tumble, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    R, asked = start(scene), {}
+    halves = [Partial(tuple(frames), R[frames], R[frames, 0]) for frames in (range(15, N), range(14))]
+
+    def matches(inputs: stage.Inputs, pairs: list[tuple[int, int]], matcher: str) -> list[Match]:
+        asked[matcher] = pairs
+        return matched(scene, inputs.capture, pairs[:40])
+
+    monkeypatch.setattr(segments, "_matched", matches)
+    monkeypatch.setattr(segments, "_understood", lambda *_, **__: (halves, inputs.tracks))
+    segments.segmented_poses(QUICK, inputs, R, torch.Generator().manual_seed(0))
+    assert all(i < 14 <= j or 14 in (i, j) for i, j in asked["aliked"])
+    assert (13, 15) in asked["aliked"]
+    assert any(i < 14 < j for i, j in asked["aliked"])
+
+
 def test_frames_without_a_pose_are_lost_and_stay_out_of_the_adjustment(posed: tuple) -> None:
     part, inputs = posed
     state = stage.init(QUICK, inputs, torch.Generator().manual_seed(0))
