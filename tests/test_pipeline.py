@@ -26,6 +26,7 @@ from tumble.io import files, tree, video
 from tumble.io.files import BadFile
 from tumble.maths.se3 import SE3
 from tumble.rendering import gbuffer
+from tumble.scene import visual_hull
 from tumble.scene.asset import Asset
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, Truth, content_key, truth_without_views
 from tumble.scene.environment import Environment
@@ -365,6 +366,20 @@ def test_what_cannot_be_done_is_said(capture: Path, tmp_path: Path, monkeypatch:
         pipeline.reconstruct(capture, tmp_path / "lost", quick, poses="estimate")
     with pytest.raises(BadFile, match="finish the run first"):
         actions.evaluate_run(tmp_path / "nowhere", capture)
+
+    def contradicts(*arguments: Any) -> Any:
+        if arguments[1] == runs.REFINE:
+            raise visual_hull.EmptyHull("is empty")
+        return stage(*arguments)
+
+    monkeypatch.setattr(runs, "stage", contradicts)
+    said = r"no shape has these silhouettes .* \(see whether the masks show the object\. "
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the poses of so few frames are rated bad
+        with pytest.raises(BadFile, match=said):
+            pipeline.reconstruct(capture, tmp_path / "empty", quick, poses="estimate")
+    with pytest.raises(visual_hull.EmptyHull):
+        pipeline.reconstruct(capture, tmp_path / "given", quick, poses="given")
 
 
 @pytest.mark.parametrize("fast", [True, False])

@@ -32,7 +32,7 @@ from tumble.preprocess import (
     to_capture,
 )
 from tumble.recipes import DRAFT, Recipe
-from tumble.scene import BACKGROUND, Asset, Capture, Trajectory, content_key, opengl_from_opencv
+from tumble.scene import BACKGROUND, Asset, Capture, Trajectory, content_key, opengl_from_opencv, visual_hull
 
 MIN_FRAMES = 8
 """Minimum number of frames with a pose; fewer show too little of the object."""
@@ -212,6 +212,7 @@ def _reconstruct(
 ) -> tuple[Asset, tuple[str, ...]]:
     """The asset on the CPU, and the names of its frames."""
     recipe, trajectory, key = opened.recipe, capture.trajectory, content_key(capture)
+    tracked = None
     if trajectory is None:
         tracked, capture, key = (found, capture, "") if found else _poses_of(opened, capture, where, key, device)
         kept = torch.where(~tracked.quality.lost)[0].tolist()
@@ -221,9 +222,15 @@ def _reconstruct(
     else:
         recipe = recipes.known_poses(recipe)
     capture, trajectory = tree.to(capture, device), tree.to(trajectory, device)
-    refined, key = run.stage(
-        opened, run.REFINE, stage_of(recipe.refine), recipe.refine, refine.Inputs(capture, trajectory), [key]
-    )
+    stage_2, inputs = stage_of(recipe.refine), refine.Inputs(capture, trajectory)
+    try:
+        refined, key = run.stage(opened, run.REFINE, stage_2, recipe.refine, inputs, [key])
+    except visual_hull.EmptyHull as error:
+        if tracked is None:
+            raise
+        rule = "could not be reconstructed: no shape has these silhouettes at the estimated poses"
+        fix = f"see whether the masks show the object. {tracked.quality.sentence}"
+        raise BadFile(where, rule, fix) from error
     inputs = decompose.Inputs(capture, refined)
     asset, _ = run.stage(opened, run.DECOMPOSE, stage_of(recipe.decompose), recipe.decompose, inputs, [key])
     asset = _in_absolute_colour(opened, asset, inputs.capture, white)

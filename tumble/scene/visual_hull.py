@@ -28,6 +28,10 @@ HULL_MARGIN = 2.0
 """Distance up to which doubtful cells may lie outside the convex hull of the others [cells]."""
 
 
+class EmptyHull(ValueError):
+    """No shape has the silhouettes at the poses."""
+
+
 @dataclass(frozen=True)
 class OrientedPoints:
     """Points with normals on a surface, object frame."""
@@ -149,12 +153,12 @@ def sample_surface(inside: Float[Tensor, "x y z"], n: int, rng: torch.Generator)
     """At most `n` random points, uniform over the surface on which the occupancy `inside` is one half.
 
     Raises:
-        ValueError: The hull is empty because poses and silhouettes contradict each other.
+        EmptyHull: Poses and silhouettes contradict each other.
     """
     resolution = inside.shape[0]
     positions, normals = _crossings(inside)
     if len(positions) < 16:
-        raise ValueError("the visual hull of the silhouettes is empty: check that poses and masks belong together")
+        raise EmptyHull("the visual hull of the silhouettes is empty: check that poses and masks belong together")
     # The number of grid edges that cross a surface, per area, is proportional to the L1 norm of its normal.
     probability = 1 / normals.abs().sum(-1)
     chosen = torch.multinomial(probability.cpu(), min(n, len(positions)), generator=rng).to(positions.device)
