@@ -69,8 +69,8 @@ class ContourJoint:
     """Number of tangency gaps that are valid, as the contours on both sides are seen there."""
     gap_cost: float
     """Mean robust cost of these alone."""
-    by_majority: bool = False
-    """Whether most keypoints agree: there are none (see `registration.Joint`)."""
+    certain: bool = False
+    """Whether keypoints make it certain: there are none (see `registration.Joint`)."""
 
     @property
     def strength(self) -> float:

@@ -58,6 +58,9 @@ a hand) hypotheses with 40 to 100 keypoints were wrong 12 times of 12 where thes
 times of 10 elsewhere."""
 MIN_JOINT_FRAMES = 2
 """Number of frames with `MIN_CORRESPONDENCES` agreeing keypoints below which keypoints alone do not join two parts."""
+MIN_CERTAIN_FRAMES = 8
+"""The same below which a joint of a minority of keypoints waits until the network has matched (`Joint.certain`). The
+wrong joint of the halves of `SM2` has 4, right ones of `MC1` have 9 and 14."""
 MIN_GAPS = 50
 """Number of tangency gaps below which contours do not contradict that two parts belong together."""
 MAX_CONTOUR_COST = 1.1
@@ -120,13 +123,13 @@ class Joint:
             return False
         if self.confirmed:
             return self.keypoints >= MIN_MAJORITY_KEYPOINTS and self.frames > 0
-        enough = MIN_MAJORITY_KEYPOINTS if self.by_majority else MIN_JOINT_KEYPOINTS
+        enough = MIN_MAJORITY_KEYPOINTS if self.share > 0.5 else MIN_JOINT_KEYPOINTS
         return self.keypoints >= enough and self.frames >= MIN_JOINT_FRAMES
 
     @property
-    def by_majority(self) -> bool:
-        """Whether more than half of the keypoints that have a surface point in the other part agree."""
-        return self.share > 0.5
+    def certain(self) -> bool:
+        """Whether it can do without other matches: more than half of the keypoints agree, or some in many frames."""
+        return self.share > 0.5 or self.frames >= MIN_CERTAIN_FRAMES
 
     @property
     def measurable(self) -> bool:
@@ -311,20 +314,20 @@ def _agreeing(
     return np.bincount(np.searchsorted(part.frames, observed.keypoints.frame[agreeing]), minlength=len(part))
 
 
-def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses, *, by_majority: bool) -> list[Partial]:
+def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses, *, certain: bool) -> list[Partial]:
     """Join parts, the best confirmed pair first, until no two belong together.
 
     Args:
         parts: Parts of the capture.
         known: Hypotheses of earlier calls; new ones are added.
-        by_majority: Only make joints on which most keypoints agree. Others are the last resort: the cap of a bottle
-            looks the same from all sides, and its keypoints agree with any turn about the axis.
+        certain: Only make joints that are `Joint.certain`. Others are the last resort: the cap of a bottle looks the
+            same from all sides, and its keypoints agree with any turn about the axis.
     """
     parts = sorted(parts, key=len, reverse=True)
     while True:
         pairs = [(a, b) for k, a in enumerate(parts) for b in parts[k + 1 :]]
-        found = _best(observed, pairs, known, best_joint, by_majority=by_majority)
-        if found is None and not by_majority:
+        found = _best(observed, pairs, known, best_joint, certain=certain)
+        if found is None and not certain:
             found = _best(observed, pairs, known, contour_joint)  # contours join what shares no texture
         if found is None:
             return parts
@@ -339,14 +342,14 @@ def _best(
     known: Hypotheses,
     propose: Propose,
     *,
-    by_majority: bool = False,
+    certain: bool = False,
 ) -> tuple[tuple[Partial, Partial], Joint | ContourJoint] | None:
     """The pair with the strongest accepted joint, and the joint."""
     for a, b in pairs:
         if (propose, a, b) not in known:
             known[propose, a, b] = propose(observed, b, a)
     joints = [((a, b), joint) for a, b in pairs if (joint := known[propose, a, b]) is not None and joint.accepted]
-    joints = [each for each in joints if each[1].by_majority or not by_majority]
+    joints = [each for each in joints if each[1].certain or not certain]
     return max(joints, key=lambda each: each[1].strength, default=None)
 
 

@@ -8,9 +8,9 @@ once with all features of the object and the hand, which moves with it while its
 apart in time, of the object alone, then join segments that show the same side, and add the frames between them. Frames
 that nothing confirms get no pose.
 
-At first two parts are only joined where most matches between them agree. Where this leaves frames out or apart, a
-network matches these with their neighbours and with frames far apart as well, and all is done again; fewer matches, or
-contours alone, then join parts, too.
+At first two parts are only joined where most matches between them agree, or some in many frames. Where this leaves
+frames out or apart, a network matches these with their neighbours and with frames far apart as well, and all is done
+again; fewer matches, or contours alone, then join parts, too.
 """
 
 import math
@@ -132,15 +132,15 @@ def _understood(
 
     Args:
         wide: Matches of all that is not background, also between frames that are far apart in time.
-        cautious: Leave apart what only a minority of matches would join, or contours alone.
+        cautious: Leave apart what only few matches would join, or contours alone.
     """
     on_it = [match for each in wide if len(match := on_object(each, inputs.capture.masks)) >= MIN_WIDE_MATCHES]
     sure = _observed(cfg, inputs, inputs.tracks, on_it)
     tracks = tracks_of(inputs.all_matches, inputs.silhouettes, inputs.capture)
     known: Hypotheses = {}
     found = [part for each in (sure, _observed(cfg, inputs, tracks, on_it)) for part in _segments(each, R, rng)]
-    parts = join(sure, _supported(sure, found), known, by_majority=cautious)
-    parts = join(sure, _grown(sure, parts, cautious=cautious), known, by_majority=cautious)
+    parts = join(sure, _supported(sure, found), known, certain=cautious)
+    parts = join(sure, _grown(sure, parts, cautious=cautious), known, certain=cautious)
     if not parts:
         return [], inputs.tracks
     tracks = thinned(joined_tracks(sure, parts[0], TOLERANCE)[0])
