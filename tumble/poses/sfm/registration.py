@@ -58,9 +58,9 @@ a hand) hypotheses with 40 to 100 keypoints were wrong 12 times of 12 where thes
 times of 10 elsewhere."""
 MIN_JOINT_FRAMES = 2
 """Number of frames with `MIN_CORRESPONDENCES` agreeing keypoints below which keypoints alone do not join two parts."""
-MIN_CERTAIN_FRAMES = 8
-"""The same below which a joint of a minority of keypoints waits until the network has matched (`Joint.certain`). The
-wrong joint of the halves of `SM2` has 4, right ones of `MC1` have 9 and 14."""
+MIN_CERTAIN_FRAMES = 0.25
+"""The same, as a fraction of the part's frames, below which a joint of a minority of keypoints waits until the network
+has matched (`Joint.certain`). The wrong joint of the halves of `SM2` has 0.08, right ones of `MC1` 0.35 to 0.45."""
 MIN_GAPS = 50
 """Number of tangency gaps below which contours do not contradict that two parts belong together."""
 MAX_CONTOUR_COST = 1.1
@@ -129,7 +129,7 @@ class Joint:
     @property
     def certain(self) -> bool:
         """Whether it can do without other matches: more than half of the keypoints agree, or some in many frames."""
-        return self.share > 0.5 or self.frames >= MIN_CERTAIN_FRAMES
+        return self.share > 0.5 or self.frames >= MIN_CERTAIN_FRAMES * len(self.part)
 
     @property
     def measurable(self) -> bool:
