@@ -121,34 +121,35 @@ def test_a_part_moved_to_another_object_frame_shows_the_same_points() -> None:
     assert torch.allclose(moved.R @ x_new + moved.t, 1.3 * (part.R @ x + part.t))
 
 
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> tuple[Partial, Partial, Partial]:
+    """A motion of 24 frames and two parts of it, which joining leaves as they are."""
+    monkeypatch.setattr(registration, "adjusted", lambda _, part, __: part)
+    monkeypatch.setattr(registration, "pruned", lambda _, part, __: part)
+    every = Partial(tuple(range(24)), torch.eye(3).double().expand(24, 3, 3), torch.zeros(24, 3).double())
+    return every, every.select(range(14)), every.select(range(14, 24))
+
+
 @pytest.mark.parametrize(("share", "frames", "waits"), [(0.4, 2, True), (0.6, 2, False), (0.3, 3, False)])
 def test_a_joint_of_a_minority_of_keypoints_in_few_frames_waits(
-    observed: Observed, share: float, frames: int, waits: bool, monkeypatch: pytest.MonkeyPatch
+    observed: Observed, parts: tuple[Partial, Partial, Partial], share: float, frames: int, waits: bool
 ) -> None:
     """The cap of a bottle agrees with any turn about its axis; its label does not."""
-    poses = torch.eye(3).double().expand(24, 3, 3), torch.zeros(24, 3).double()
-    every = Partial(tuple(range(24)), *poses)
-    a, b = every.select(range(14)), every.select(range(14, 24))
+    every, a, b = parts
     joint = Joint(b, 110, share, frames, 0.5, 80, True)
     assert joint.accepted
     known = {(best_joint, a, b): joint, (contour_joint, a, b): None}
-    monkeypatch.setattr(registration, "adjusted", lambda _, part, __: part)
-    monkeypatch.setattr(registration, "pruned", lambda _, part, __: part)
     first = join(observed, [b, a], dict(known), certain=True)
     assert [part.frames for part in first] == ([a.frames, b.frames] if waits else [every.frames])
     assert [part.frames for part in join(observed, [a, b], dict(known), certain=False)] == [every.frames]
 
 
 def test_parts_are_joined_by_contours_only_after_all_keypoints(
-    observed: Observed, monkeypatch: pytest.MonkeyPatch
+    observed: Observed, parts: tuple[Partial, Partial, Partial]
 ) -> None:
-    pose = SCENE.T_cam_obj
-    every = Partial(tuple(range(12)), pose.rotation.matrix().double(), pose.xyz.double())
-    a, b = every.select(range(7)), every.select(range(7, 12))
+    _, a, b = parts
     by_contours = registration.ContourJoint(b, 0.05, math.inf, 100, 0.05)
     assert by_contours.accepted
     known = {(best_joint, a, b): None, (contour_joint, a, b): by_contours}
-    monkeypatch.setattr(registration, "adjusted", lambda _, part, __: part)
-    monkeypatch.setattr(registration, "pruned", lambda _, part, __: part)
     assert len(join(observed, [a, b], dict(known), certain=True)) == 2
     assert len(join(observed, [a, b], dict(known), certain=False)) == 1

@@ -69,13 +69,16 @@ class ContourJoint:
     """Number of tangency gaps that are valid, as the contours on both sides are seen there."""
     gap_cost: float
     """Mean robust cost of these alone."""
-    certain: bool = False
-    """Whether keypoints make it certain: there are none (see `registration.Joint`)."""
 
     @property
     def strength(self) -> float:
         """What the strongest of several joints has most of."""
         return -self.cost
+
+    @property
+    def certain(self) -> bool:
+        """Whether it can do without more matches: it has none (see `registration.Joint`)."""
+        return False
 
     @property
     def accepted(self) -> bool:
