@@ -177,6 +177,8 @@ def test_a_run_is_scored_into_itself_or_elsewhere_and_an_input_is_never_written_
     for taken in ("method", "truth"):
         with pytest.raises(BadFile, match=f"{taken}: holds other files"):
             actions.evaluate_folder(Path("method"), Path("truth"), Path(taken))
+    with pytest.raises(BadFile, match="run: is a run, whose own scores these would replace"):
+        actions.evaluate_folder(Path("method"), Path("truth"), Path("run"))
 
 
 def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(

@@ -246,12 +246,14 @@ def evaluate_folder(
 
     Raises:
         ValueError: A prediction folder is given without its capture.
-        BadFile: `out` holds something else.
+        BadFile: `out` holds something else, or is another run.
     """
     is_run, out = _is_run(prediction), out or score_folder(prediction)
     if not is_run and capture is None:
         raise ValueError(f"{prediction} is not a finished run: give the capture of the prediction as second argument")
     if not (is_run and out.resolve() == prediction.resolve()):
+        if _is_run(out) and not overwrite:
+            raise BadFile(out, "is a run, whose own scores these would replace", outputs.OTHER_PLACE)
         outputs.claim_folder(out, SHEET, overwrite=overwrite)
     if is_run or capture is None:
         return evaluate_run(prediction, capture, out, device=device)

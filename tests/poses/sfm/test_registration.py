@@ -1,15 +1,16 @@
 """Poses from keypoints and surface points that were projected by a known pose."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from tests.lopsided import tumbling
+from tests.lopsided import AXES, Tumble, tumbling
 from tumble.maths import SO3
 from tumble.poses.sfm import registration, stage
-from tumble.poses.sfm.partial import Observed, Partial, contour_cost
+from tumble.poses.sfm.partial import Observed, Partial, colour_contradictions, contour_cost
 from tumble.poses.sfm.registration import Joint, best_joint, contour_joint, join, solutions
 from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
 
@@ -76,6 +77,58 @@ def test_contours_contradict_a_part_that_is_turned(observed: Observed) -> None:
     assert gaps > 50
     assert right < 0.1
     assert wrong > 5 * right
+
+
+def two_coloured(scene: Tumble, brightness: torch.Tensor) -> torch.Tensor:
+    """Images of the ellipsoid, yellow where x is positive in the object frame and blue elsewhere."""
+    images = torch.zeros(*scene.capture.masks.shape, 3)
+    for k, T_obj_cam in enumerate(scene.T_cam_obj[i].inverse() for i in range(len(images))):
+        o, d = T_obj_cam.xyz / AXES, (T_obj_cam.rotation @ scene.capture.camera.directions().double()) / AXES
+        a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum() - 1
+        hit = o + d * ((-b - (b * b - a * c).clamp_min(0).sqrt()) / a)[..., None]
+        colours = torch.where(hit[..., :1] > 0, torch.tensor([200.0, 170.0, 40.0]), torch.tensor([50.0, 80.0, 180.0]))
+        images[k] = colours * brightness[k]
+    return images.round().to(torch.uint8)
+
+
+def seen_in_colour(scene: Tumble, images: torch.Tensor) -> tuple[Observed, Partial]:
+    """What is known of the frames of a scene with other images, and its true motion."""
+    rng = torch.Generator().manual_seed(0)
+    matches = [scene.match(i, j, rng) for i in range(12) for j in range(i + 1, min(12, i + 5))]
+    inputs = stage.gather(replace(scene.capture, images=images), ())
+    pose = scene.T_cam_obj
+    every = Partial(tuple(range(12)), pose.rotation.matrix().double(), pose.xyz.double())
+    return Observed(stage.Config(), inputs, gather_keypoints(matches, NO_TRACKS, CAMERA, 12)), every
+
+
+def test_colours_contradict_a_part_that_shows_another_face() -> None:
+    """Half a revolution about a line of sight swaps yellow and blue; the light changes from frame to frame."""
+    scene = tumbling(12)
+    seen, every = seen_in_colour(scene, two_coloured(scene, torch.linspace(0.5, 1.1, 12)))
+    first, second = every.select(range(6)), every.select(range(6, 12))
+    sight = torch.nn.functional.normalize(first.R[3].mT @ first.t[3], dim=0)
+    ways = [second.moved(SO3.exp(turn * sight).matrix(), 1.0, torch.zeros(3).double()) for turn in (0, 0.05, math.pi)]
+    found = colour_contradictions(seen, second, first, ways)
+    assert max(found[:2]) < 1 < registration.MAX_COLOUR_CONTRADICTION < 4 < found[2]
+    joints = [Joint(way, 500, 0.9, 6, 0.1, 80, True, each) for way, each in zip(ways, found, strict=True)]
+    assert [joint.accepted for joint in joints] == [True, True, False]
+
+
+def test_parts_that_show_different_sides_do_not_contradict_each_other() -> None:
+    """All is red in the first frames and blue in the last, which is compared only if they show the same side."""
+    scene = tumbling(12)
+    images = torch.zeros_like(scene.capture.images)
+    images[:6, ..., 0], images[6:, ..., 2] = 200, 200
+    seen, every = seen_in_colour(scene, images)
+    first, second = every.select(range(3)), every.select(range(9, 12))
+    half = SO3.exp(torch.tensor([0, math.pi, 0], dtype=torch.float64)).matrix()
+    ways = [
+        second.moved(first.R[1].mT @ turn @ second.R[1], 1.0, torch.zeros(3).double())
+        for turn in (torch.eye(3).double(), half)
+    ]
+    same, opposite = colour_contradictions(seen, second, first, ways)
+    assert same > 4
+    assert opposite == 0
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 The contours of all pairs of frames of two parts together leave few ways to put one into the other (epipolar tangency),
 and what one frame shows must be possible behind what hides the object in the other. They cannot tell a bottle from the
 same bottle after half a revolution, nor a box from one after a quarter; but the motion goes on where the first part
-ends, so that smaller rotations are likely there.
+ends, so that smaller rotations are likely there. Colours then refuse those that put one side on another of other print.
 
 Joints that keypoints suggest are fitted to the contours as well (`fitted_to_both`).
 """
@@ -19,7 +19,7 @@ from torch import Tensor
 from tumble.maths import SO3, Damping, Linearised, angle_between, minimise, select_rows
 from tumble.poses.sfm.bundle_adjustment import MIN_DEPTH
 from tumble.poses.sfm.frontier_points import EpipolarTangencies, cauchy_loss, epipolar_tangencies
-from tumble.poses.sfm.partial import GAP_SCALE, Observed, Partial
+from tumble.poses.sfm.partial import GAP_SCALE, MAX_COLOUR_CONTRADICTION, Observed, Partial, colour_contradictions
 from tumble.poses.sfm.relocalization import JACOBIAN_STEP, candidate_rotations, damped_step, robust_cost
 
 MAX_GAP = 6
@@ -103,7 +103,9 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     step = angle_between(SO3.from_matrix(part.R[p] @ R_new_obj.mT), SO3.from_matrix(other.R[q]))
     depth_ratio = _moved(part.select([p]), (R_new_obj, rest))[1][:, 0, 2] / other.t[q, 2]
     possible = (step <= MAX_TURN) & (depth_ratio > 1 / MAX_DEPTH_RATIO) & (depth_ratio < MAX_DEPTH_RATIO)
-    cost = torch.where(possible, cost, torch.inf)
+    moved = [moved_part(part, (R_new_obj, rest), k) for k in range(len(cost))]
+    same_colours = torch.tensor(colour_contradictions(observed, part, other, moved)) <= MAX_COLOUR_CONTRADICTION
+    cost = torch.where(possible & same_colours, cost, torch.inf)
     k = int(cost.argmin())
     if not math.isfinite(float(cost[k])):
         return None
@@ -111,7 +113,7 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     second = float(torch.where(differs, cost, torch.inf).min())
     gaps = pairs.valid_gaps((R_new_obj[k : k + 1], rest[k : k + 1]))
     gap_cost = float(robust_cost(gaps[None], GAP_SCALE)[0])
-    return ContourJoint(moved_part(part, (R_new_obj, rest), k), float(cost[k]), second, len(gaps), gap_cost)
+    return ContourJoint(moved[k], float(cost[k]), second, len(gaps), gap_cost)
 
 
 def moved_part(part: Partial, motion: Similarity, k: int) -> Partial:

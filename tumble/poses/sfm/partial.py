@@ -1,12 +1,15 @@
 """Poses of some frames of a capture, in an object frame of their own: a part of the capture that is understood."""
 
+import functools
 import itertools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
 from tumble.poses.sfm import bundle_adjustment, frontier_points
@@ -15,7 +18,11 @@ from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.observations import Inputs
 from tumble.poses.sfm.schedule import BaseConfig
 from tumble.poses.sfm.tracks import Keypoints, Tracks
+from tumble.scene import OBJECT
 
+TOLERANCE = 3.0
+"""Distance from the epipolar line up to which a match joins tracks, and reprojection error up to which a frame's
+keypoint agrees with a surface point [pixels]."""
 TRACKS_PER_FRAME = 120
 """Number of tracks, the longest first, up to which bundle adjustment uses those of a frame."""
 ROUNDS_PER_JOIN = 3
@@ -30,6 +37,29 @@ MIN_MATCHES = 15
 """Number of matches that agree with the epipolar lines below which a frame is left out."""
 GAP_SCALE = 3.0
 """Scale of the robust cost of tangency gaps [pixels]."""
+MAX_COLOUR_CONTRADICTION = 2.0
+"""Difference of colours between two parts, over that within them, above which they contradict a joint. On the films
+`MC1` and `SM2` it is at most 1.84 for right joints, and above 2 for those that put the front on the back."""
+COLOURED_POINTS = 1500
+"""Number of surface points of a part whose colours are compared."""
+COLOURED_FRAMES = 20
+"""Number of frames, evenly spaced over a part, in which they are."""
+COLOUR_SIGMA = 2.0
+"""Standard deviation of the Gaussian with which frames are blurred before [pixels]."""
+COLOUR_SHIFT = 3
+"""Distance from its projection at which a point's colour is looked for as well [pixels]: poses have errors."""
+MIN_BRIGHTNESS = 30.0
+"""Sum of the channels below which the chromaticity of a pixel is uncertain [code values]."""
+COLOUR_QUANTILE = 0.7
+"""Quantile of the differences of colours: two faces of a box may have the same colour at half of the points."""
+SAME_SIDE = math.cos(math.radians(35))
+"""Cosine of the angle between two lines of sight to a surface point up to which both show it."""
+MIN_TIME_APART = 3
+"""Least distance in time of frames of one part whose colours are compared [frames]."""
+MIN_COLOUR_DIFFERENCE = 8.0
+"""Difference of colours that lights and shadows make at least [255 x chromaticity]."""
+MIN_SHOWN_SHARE = 0.05
+"""Share of all pairs of surface points and frames that have to be compared; fewer lie at edges only."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +71,24 @@ class Observed:
     keypoints: Keypoints
     compared: dict["Partial", "Partial"] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Frames of parts whose contours are compared with other parts' (`contour_joints`), kept since they were chosen."""
+    coloured: dict["Partial", "ColouredPoints"] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """Surface points of parts with their colours (`coloured_points`), kept since they were found."""
+
+    @property
+    def masks(self) -> UInt8[np.ndarray, "t h w"]:
+        """Labels of all pixels (`scene.OBJECT` and others)."""
+        return self.inputs.capture.masks.numpy()
+
+    @functools.cached_property
+    def chromaticity(self) -> UInt8[np.ndarray, "t h w 3"]:
+        """Blurred colours of the object in all frames, divided by their sum [255 x fraction]."""
+        found = []
+        for image, mask in zip(self.inputs.capture.images.numpy(), self.masks, strict=True):
+            shown = (mask == OBJECT).astype(np.float32)[..., None]
+            total, weight = (cv2.GaussianBlur(x, (0, 0), COLOUR_SIGMA) for x in (image * shown, shown))
+            blurred = total / weight[..., None].clip(1e-3)
+            found.append(np.rint(255 * blurred / blurred.sum(-1, keepdims=True).clip(MIN_BRIGHTNESS)).astype(np.uint8))
+        return np.stack(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,3 +226,91 @@ def contour_cost(observed: Observed, part: Partial, other: Partial) -> tuple[flo
     )
     gap = found.gap[found.valid & (frames_a != frames_b)[:, None]]
     return float(frontier_points.cauchy_loss(gap, GAP_SCALE).mean()) if len(gap) else 0.0, len(gap)
+
+
+@dataclass(frozen=True)
+class ColouredPoints:
+    """Surface points of a part, one for every keypoint, and the colours that its frames show there."""
+
+    frame: Int64[np.ndarray, " p"]
+    """Frame of the keypoint."""
+    X: Float[np.ndarray, "p 3"]
+    """Object frame of the part."""
+    towards: Float[np.ndarray, "p 3"]
+    """Direction of the camera, of unit length."""
+    colour: UInt8[np.ndarray, "p 3"]
+    """See `Observed.chromaticity`."""
+    usual: float = 0.0
+    """Difference between the colours that the part's own frames show at the points (`difference`)."""
+
+    def difference(self, observed: Observed, part: Partial, *, apart: int = 0) -> float:
+        """Difference from the colours that frames of a part show at the points; 0 if they show too few.
+
+        Args:
+            part: Poses in the same object frame.
+            apart: Least distance in time of the frames that are compared.
+        """
+        found, pairs, (_, height, width) = [np.zeros(0, np.float32)], 0, observed.masks.shape
+        for k in np.linspace(0, len(part) - 1, min(COLOURED_FRAMES, len(part))).astype(np.int64).tolist():
+            frame, pairs = part.frames[k], pairs + len(self.X)
+            facing = (_towards(part, self.X, np.full(len(self.X), k)) * self.towards).sum(1) > SAME_SIDE
+            index = np.flatnonzero(facing & (np.abs(self.frame - frame) >= apart))
+            x = torch.from_numpy(self.X[index]) @ part.R[k].mT + part.t[k]
+            uv = observed.keypoints.camera.project(x).floor().long().numpy()
+            inside = ((uv >= 0) & (uv < (width, height))).all(1)
+            found.append(_least_difference(observed, frame, uv[inside], self.colour[index[inside]]))
+        differences = np.concatenate(found)
+        if len(differences) <= MIN_SHOWN_SHARE * pairs:
+            return 0.0
+        return float(np.quantile(differences, COLOUR_QUANTILE))
+
+
+def coloured_points(observed: Observed, part: Partial) -> ColouredPoints:
+    """A sample of the surface points of a part that its frames show as object, and their colours."""
+    if part in observed.coloured:
+        return observed.coloured[part]
+    X, keypoints, masks = surface_points(observed, part, TOLERANCE), observed.keypoints, observed.masks
+    place = np.full(keypoints.n_frames, -1)
+    place[list(part.frames)] = range(len(part))
+    row_column = keypoints.uv[:, ::-1].astype(np.int64).clip(0, np.array(masks.shape[1:]) - 1)
+    shown = masks[keypoints.frame, *row_column.T] == OBJECT
+    index = np.flatnonzero(~np.isnan(X[:, 0]) & (place[keypoints.frame] >= 0) & shown)
+    index = index[np.linspace(0, len(index) - 1, min(COLOURED_POINTS, len(index))).astype(np.int64)]
+    frame, X = keypoints.frame[index], X[index]
+    colour = observed.chromaticity[frame, *row_column[index].T]
+    points = ColouredPoints(frame, X, _towards(part, X, place[frame]), colour)
+    usual = points.difference(observed, part, apart=MIN_TIME_APART)
+    observed.coloured[part] = replace(points, usual=usual)
+    return observed.coloured[part]
+
+
+def colour_contradictions(observed: Observed, part: Partial, other: Partial, moved: Sequence[Partial]) -> list[float]:
+    """Difference of colours of two parts where they show the same surface, over that within them; 0 if they hardly do.
+
+    Args:
+        moved: The part in the object frame of the other, in each of several ways.
+    """
+    points = coloured_points(observed, other)
+    usual = max(points.usual, coloured_points(observed, part).usual, MIN_COLOUR_DIFFERENCE)
+    return [points.difference(observed, each) / usual for each in moved]
+
+
+def _towards(part: Partial, X: Float[np.ndarray, "p 3"], place: Int64[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
+    """Directions from points to the cameras of the frames at some places of a part."""
+    centre = -torch.einsum("fij,fi->fj", part.R, part.t).numpy()[place] - X
+    return centre / np.linalg.norm(centre, axis=1, keepdims=True)
+
+
+def _least_difference(
+    observed: Observed, frame: int, uv: Int64[np.ndarray, "p 2"], colour: UInt8[np.ndarray, "p 3"]
+) -> Float32[np.ndarray, " q"]:
+    """Differences of colours from the most similar ones at and around pixels of a frame, where these are object."""
+    image, mask = observed.chromaticity[frame], observed.masks[frame]
+    (column, row), (height, width) = uv.T, mask.shape
+    shown = mask[row, column] == OBJECT
+    least = np.full(int(shown.sum()), np.inf, np.float32)
+    for shift in itertools.product((0, -COLOUR_SHIFT, COLOUR_SHIFT), repeat=2):
+        column, row = (uv[shown] + shift).clip(0, (width - 1, height - 1)).T
+        difference = np.abs(image[row, column].astype(np.float32) - colour[shown]).sum(1)
+        least = np.minimum(least, np.where(mask[row, column] == OBJECT, difference, np.inf))
+    return least

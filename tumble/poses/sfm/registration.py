@@ -26,11 +26,18 @@ from tumble.poses.sfm.contour_joints import (
     fitted_to_both,
     moved_part,
 )
-from tumble.poses.sfm.partial import Observed, Partial, adjusted, contour_cost, pruned, surface_points
+from tumble.poses.sfm.partial import (
+    MAX_COLOUR_CONTRADICTION,
+    TOLERANCE,
+    Observed,
+    Partial,
+    adjusted,
+    colour_contradictions,
+    contour_cost,
+    pruned,
+    surface_points,
+)
 
-TOLERANCE = 3.0
-"""Distance from the epipolar line up to which a match joins tracks, and reprojection error up to which a frame's
-keypoint agrees with a surface point [pixels]."""
 RANSAC_ERROR = 2.5
 """Reprojection error of inliers in the search for a pose [pixels]."""
 RANSAC_ITERATIONS = 400
@@ -110,6 +117,8 @@ class Joint:
     """Number of tangency gaps behind that cost."""
     continuous: bool
     """Whether the object turns little from the frames of one part to those of the other that are near in time."""
+    contradiction: float = 0.0
+    """See `colour_contradictions`."""
 
     @property
     def strength(self) -> float:
@@ -119,12 +128,19 @@ class Joint:
     @property
     def accepted(self) -> bool:
         """Whether the two parts belong together in this way."""
+        if not self.possible:
+            return False
         if self.measurable and self.cost > MAX_CONTOUR_COST and self.share < SURE_SHARE:
             return False
         if self.confirmed:
             return self.keypoints >= MIN_MAJORITY_KEYPOINTS and self.frames > 0
         enough = MIN_MAJORITY_KEYPOINTS if self.share > 0.5 else MIN_JOINT_KEYPOINTS
         return self.keypoints >= enough and self.frames >= MIN_JOINT_FRAMES
+
+    @property
+    def possible(self) -> bool:
+        """Whether the colours of both parts do not contradict it."""
+        return self.contradiction <= MAX_COLOUR_CONTRADICTION
 
     @property
     def certain(self) -> bool:
@@ -230,6 +246,7 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
     Every frame of the part suggests poses for all of its frames, as their relative poses are known. Those with many
     agreeing keypoints are fitted to these and to the contours; among them the contours decide, but a jump of the motion
     is the last resort: print that is on two faces of a box suggests half a revolution, of which contours see nothing.
+    Where all of them put one face on another of other colours, those with fewer keypoints follow.
     """
     X = surface_points(observed, other, TOLERANCE)
     seen = [observed.keypoints.correspondences(frame, other.frames, X) for frame in part.frames]
@@ -237,26 +254,48 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
     proposed = _proposed(observed, part, other, seen)
     if proposed is None:
         return None
-    agreeing = [
-        int(_agreeing(observed, moved_part(part, proposed, k), keypoint, points, JOINT_ERROR).sum())
-        for k in range(len(proposed[0]))
-    ]
-    chosen = _distinct(proposed[0], np.array(agreeing))
+    moved = [moved_part(part, proposed, k) for k in range(len(proposed[0]))]
+    agreeing = np.array([_agreeing(observed, each, keypoint, points, JOINT_ERROR).sum() for each in moved])
     place = np.searchsorted(part.frames, observed.keypoints.frame[keypoint])
     together = Correspondences(*map(torch.from_numpy, (place, observed.keypoints.uv[keypoint], points)))
-    fitted = fitted_to_both(observed, part, other, together, (proposed[0][chosen], proposed[1][chosen]), JOINT_ERROR)
-    distance, p, q = part.nearest(other)
+    left, found = _distinct(proposed[0], agreeing), []
+    while left and (not found or agreeing[left[0]] >= MIN_MAJORITY_KEYPOINTS):
+        chosen = [k for k in left[:FITTED_HYPOTHESES] if agreeing[k] >= MIN_SHARE * agreeing[left[0]]]
+        start = proposed[0][chosen], proposed[1][chosen]
+        fitted = fitted_to_both(observed, part, other, together, start, JOINT_ERROR)
+        moved = [moved_part(part, fitted, k) for k in range(len(chosen))]
+        found += _joints(observed, part, other, (keypoint, points), moved)
+        if any(joint.possible for joint in found):
+            break
+        left = left[len(chosen) :]
+    found = [joint for joint in found if joint.possible] or found
+    most = max(joint.keypoints for joint in found)
+    return min((joint for joint in found if joint.keypoints >= MIN_SHARE * most), key=lambda joint: joint.order)
+
+
+def _joints(
+    observed: Observed,
+    part: Partial,
+    other: Partial,
+    seen: tuple[Int64[np.ndarray, " c"], Float[np.ndarray, "c 3"]],
+    moved: Sequence[Partial],
+) -> list[Joint]:
+    """What speaks for each of several ways to put a part into the object frame of another.
+
+    Args:
+        seen: Keypoints of the part and their surface points in the other.
+    """
+    (keypoint, points), (distance, p, q) = seen, part.nearest(other)
     matched, joints = max(1, len(np.unique(keypoint))), []
-    for new in (moved_part(part, fitted, k) for k in range(len(chosen))):
+    contradictions = colour_contradictions(observed, part, other, moved)
+    for new, contradiction in zip(moved, contradictions, strict=True):
         counts = _agreeing(observed, new, keypoint, points, JOINT_ERROR)
         step = float(angle_between(SO3.from_matrix(new.R[p]), SO3.from_matrix(other.R[q])))
         continuous = distance == 0 or step <= MAX_STEP * distance
         number, frames = int(counts.sum()), int((counts >= MIN_CORRESPONDENCES).sum())
         cost, gaps = contour_cost(observed, other, new)
-        joints.append(Joint(new, number, number / matched, frames, cost, gaps, continuous))
-    most = max(joint.keypoints for joint in joints)
-    joints = [joint for joint in joints if joint.keypoints >= MIN_SHARE * most]
-    return min(joints, key=lambda joint: joint.order)
+        joints.append(Joint(new, number, number / matched, frames, cost, gaps, continuous, contradiction))
+    return joints
 
 
 def _proposed(
@@ -288,8 +327,7 @@ def _distinct(R_new_obj: Float[Tensor, "h 3 3"], keypoints: Int64[np.ndarray, " 
     chosen: list[int] = []
     rotation = SO3.from_matrix(R_new_obj)
     for k in np.argsort(-keypoints, kind="stable").tolist():
-        is_new = not chosen or bool((angle_between(rotation[chosen], rotation[k]) > SAME_ROTATION).all())
-        if is_new and len(chosen) < FITTED_HYPOTHESES and keypoints[k] >= MIN_SHARE * keypoints.max():
+        if not chosen or bool((angle_between(rotation[chosen], rotation[k]) > SAME_ROTATION).all()):
             chosen.append(k)
     return chosen
 

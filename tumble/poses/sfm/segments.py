@@ -27,6 +27,7 @@ from tumble.poses.frame_pairs import neighbours
 from tumble.poses.sfm.adjustment import Windows, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.observations import Inputs, gather, on_object, shown, silhouette_centres, tracks_of
 from tumble.poses.sfm.partial import (
+    TOLERANCE,
     Observed,
     Partial,
     adjusted,
@@ -36,7 +37,7 @@ from tumble.poses.sfm.partial import (
     pruned,
     thinned,
 )
-from tumble.poses.sfm.registration import TOLERANCE, Hypotheses, grow, join
+from tumble.poses.sfm.registration import Hypotheses, grow, join
 from tumble.poses.sfm.schedule import BaseConfig
 from tumble.poses.sfm.tracks import Tracks, gather_keypoints
 from tumble.scene import Match
