@@ -167,11 +167,11 @@ def test_times_and_settings_are_those_of_the_log(page: Path) -> None:
 
 
 def test_without_xatlas_there_is_a_page_without_a_mesh(
-    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    asset: Asset, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.warns(UserWarning, match="xatlas.*the report has no live view"):
-        assert report.write_model(asset, tmp_path) is None
+        assert report.write_model(asset, tmp_path, capture) is None
 
 
 def test_a_name_is_escaped(page: Path) -> None:

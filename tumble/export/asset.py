@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble import __version__
-from tumble.export import atlas, bake, confidence, gltf, mesh, photo_texture, ply
+from tumble.export import atlas, bake, confidence, gltf, mesh, photo_texture, ply, unseen
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
@@ -91,7 +91,7 @@ def write_asset(
         device = asset.gaussians.means.device
         frames = begin(beside, device, lambda: _lit_frames(asset, capture if settings else None))
         score = begin(beside, device, lambda: _confidence(asset)) if settings else None
-        shape = extract_mesh(asset, settings) if settings else extract_mesh(asset, SIZE_PRESET) if scale_mm else None
+        shape = extract_mesh(asset, settings or SIZE_PRESET, capture) if settings or scale_mm else None
         flat, textures = None, None
         if settings and shape:
             with progress.task("texture coordinates"):
@@ -137,8 +137,11 @@ def _replacing(out: Path) -> Iterator[Path]:
                 (out / path).unlink(missing_ok=True)
 
 
-def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
+def extract_mesh(asset: Asset, preset: Preset, capture: Capture | None = None) -> Mesh:
     """The surface of the Gaussians as a triangle mesh, object frame.
+
+    Args:
+        capture: Frames of the trajectory. What none of them shows is then spanned by a smooth surface.
 
     Raises:
         ValueError: The Gaussians have no surface.
@@ -150,8 +153,8 @@ def extract_mesh(asset: Asset, preset: Preset) -> Mesh:
     if values.min() >= 0:
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
     with progress.task("extracting the mesh"):
-        whole = mesh.surface(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells)
-        return mesh.simplify(mesh.smooth(whole), preset.triangles)
+        whole = mesh.smooth(mesh.surface(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells))
+        return mesh.simplify(unseen.spanned(whole, asset, capture) if capture else whole, preset.triangles)
 
 
 def _lit_frames(asset: Asset, capture: Capture | None) -> list[lit_frames.LitFrame]:

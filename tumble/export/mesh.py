@@ -6,12 +6,16 @@ the *values*: signed distances to the surface, positive outside, in any unit (`d
 
 from dataclasses import dataclass
 from itertools import permutations
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 
 from tumble.maths import fibonacci_sphere
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 MIN_COMPONENT_FRACTION = 0.02
 """Size below which a connected component is removed as a floater [fraction of the largest component's triangles]."""
@@ -159,16 +163,23 @@ def smooth(mesh: Mesh) -> Mesh:
 
     Each edge must belong to two triangles that are oriented alike, as in meshes of `marching_tetrahedra`.
     """
+    mean, x = neighbour_means(mesh), mesh.vertices
+    for fraction in (SHRINKING, GROWING) * SMOOTHING_STEPS:
+        x = x + fraction * (mean @ x - x)
+    return Mesh(x, mesh.faces)
+
+
+def neighbour_means(mesh: Mesh) -> "sparse.csr_matrix":
+    """Matrix that takes values of the vertices to the means over their neighbours.
+
+    Each edge must belong to two triangles that are oriented alike.
+    """
     from scipy import sparse
 
     start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     n = len(mesh.vertices)
     weight = 1 / np.bincount(start, minlength=n).clip(1)
-    mean = sparse.csr_matrix((weight[start], (start, end)), (n, n))
-    x = mesh.vertices
-    for fraction in (SHRINKING, GROWING) * SMOOTHING_STEPS:
-        x = x + fraction * (mean @ x - x)
-    return Mesh(x, mesh.faces)
+    return sparse.csr_matrix((weight[start], (start, end)), (n, n))
 
 
 def simplify(mesh: Mesh, triangles: int) -> Mesh:

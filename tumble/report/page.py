@@ -110,7 +110,7 @@ def write_report(out: Path, *, capture: Path | None = None, device: torch.device
         all_frames = AllFrames(used.whole, used.masked, hand_coloured)
         with ThreadPoolExecutor(1) as beside:
             # The mesh is made by one thread most of the time.
-            model = begin(beside, asset.gaussians.means.device, lambda: write_model(asset, Path(folder)))
+            model = begin(beside, asset.gaussians.means.device, lambda: write_model(asset, Path(folder), used.frames))
             build(asset, used.frames, model, summary, quality, out / run.REPORT, all_frames=all_frames)
     return out / run.REPORT
 
@@ -158,10 +158,14 @@ def frames_of_run(capture: Capture, asset: Asset, names: Sequence[str], path: Pa
     return Capture(capture.images[index], capture.masks[index], asset.camera, tuple(names), capture.light)
 
 
-def write_model(asset: Asset, folder: Path) -> Path | None:
-    """Write a small GLB of the asset to a folder; None if the Gaussians have no surface or xatlas is not installed."""
+def write_model(asset: Asset, folder: Path, capture: Capture) -> Path | None:
+    """Write a small GLB of the asset to a folder; None if the Gaussians have no surface or xatlas is not installed.
+
+    Args:
+        capture: The frames of the asset's trajectory.
+    """
     try:
-        shape = extract_mesh(asset, MESH)
+        shape = extract_mesh(asset, MESH, capture)
     except ValueError:
         return None
     try:

@@ -39,7 +39,7 @@ GAP_SCALE = 3.0
 """Scale of the robust cost of tangency gaps [pixels]."""
 MAX_COLOUR_CONTRADICTION = 2.0
 """Difference of colours between two parts, over that within them, above which they contradict a joint. On the films
-`MC1` and `SM2` it is at most 1.84 for right joints, and above 2 for those that put the front on the back."""
+`MC1` and `SM2` it is at most 1.83 for right joints, and above 2 for those that put the front on the back."""
 COLOURED_POINTS = 1500
 """Number of surface points of a part whose colours are compared."""
 COLOURED_FRAMES = 20

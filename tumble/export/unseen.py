@@ -1,0 +1,80 @@
+"""Parts of a mesh that no frame shows, such as those under a hand that never lets go: spanned like soap films.
+
+Nothing is known of such a part, and the surface of the Gaussians has lumps, holes and the outlines of fingers there.
+The smallest surface between what was seen takes its place; the confidence marks it as it marks all that was not seen.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tumble.export.mesh import Mesh, components, neighbour_means, vertex_normals
+from tumble.rendering import render_gbuffer
+from tumble.scene import OBJECT, UNKNOWN, Asset, Capture
+
+MAX_FRAMES = 72
+"""Maximum number of frames that are looked at, evenly spaced over the capture."""
+MIN_COSINE = 0.25
+"""Minimum cosine between normal and view direction at which a frame shows a vertex."""
+DEPTH_TOLERANCE = 0.03
+"""Maximum difference between the depths of a vertex and of the Gaussians at which it is in front, besides the slope of
+its surface [object radius]."""
+MIN_FRAMES = 2
+"""Number of frames that must show a vertex; a mask may be wrong in one."""
+MIN_SHOWN = 0.25
+"""Of the frames in which a vertex is in front, the fraction that must show object there, as in background removal."""
+AVERAGING_STEPS = 20
+"""Number of times that "seen" is averaged over neighbours, so that wrong pixels of masks leave no spikes."""
+
+
+def spanned(mesh: Mesh, asset: Asset, capture: Capture) -> Mesh:
+    """The mesh with every vertex that was not seen at the mean of its neighbours: a discrete minimal surface.
+
+    Components of which nothing was seen stay as they are.
+
+    Args:
+        capture: The frames of the asset's trajectory.
+    """
+    from scipy.sparse import identity
+    from scipy.sparse.linalg import splu
+
+    mean, seen = neighbour_means(mesh), seen_vertices(mesh, asset, capture).astype(np.float64)
+    for _ in range(AVERAGING_STEPS):
+        seen = mean @ seen
+    fixed = seen >= 0.5
+    component = components(len(fixed), mesh.faces)
+    free = ~fixed & (np.bincount(component, fixed) > 0)[component]
+    vertices, rows = mesh.vertices.copy(), mean[free]
+    if free.any():
+        inner = identity(int(free.sum()), format="csc") - rows[:, free].tocsc()
+        vertices[free] = splu(inner).solve(rows[:, ~free] @ vertices[~free])
+    return Mesh(vertices, mesh.faces)
+
+
+@torch.no_grad()
+def seen_vertices(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray, " v"]:
+    """Vertices that enough frames show as object: in front, and not too obliquely."""
+    x_obj, normals = (torch.from_numpy(x).to(asset.gaussians.means) for x in (mesh.vertices, vertex_normals(mesh)))
+    shown, hidden = torch.zeros(2, len(x_obj), dtype=torch.long, device=x_obj.device)
+    for i in torch.linspace(0, len(capture) - 1, min(MAX_FRAMES, len(capture))).round().long().tolist():
+        label = _labels(asset, i, capture.masks[i].to(x_obj.device), x_obj, normals)
+        shown += label == OBJECT
+        hidden += label == UNKNOWN
+    return ((shown >= MIN_FRAMES) & (shown >= MIN_SHOWN * (shown + hidden))).cpu().numpy()
+
+
+def _labels(
+    asset: Asset, frame: int, mask: Tensor, x_obj: Float[Tensor, "v 3"], normals: Float[Tensor, "v 3"]
+) -> Float[Tensor, " v"]:
+    """What the mask of a frame says of each vertex; not a number of those that the frame cannot show."""
+    camera, T_cam_obj = asset.camera, asset.trajectory.T_cam_obj[frame]
+    to_camera, x_cam = T_cam_obj.inverse().xyz - x_obj, T_cam_obj @ x_obj
+    cosine, z = (to_camera * normals).sum(-1) / to_camera.norm(dim=-1), x_cam[:, 2]
+    column_row, size = camera.project(x_cam).floor().long(), torch.tensor(mask.T.shape, device=mask.device)
+    inside = ((column_row >= 0) & (column_row < size)).all(-1)
+    column, row = torch.minimum(column_row.clamp_min(0), size - 1).T
+    slope = 2 / camera.fx_fy_cx_cy[0] * z * (cosine.clamp(MIN_COSINE, 1) ** -2 - 1).sqrt()
+    depth = render_gbuffer(asset, T_cam_obj, camera).depth[row, column]
+    visible = inside & (cosine > MIN_COSINE) & ((z - depth).abs() < DEPTH_TOLERANCE + slope)
+    return torch.where(visible, mask[row, column].to(z), torch.nan)
