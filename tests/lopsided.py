@@ -59,9 +59,9 @@ def moving(T_cam_obj: SE3, *, size: int = 128, points: int = 400, seed: int = 1)
     for i in range(n):
         T_obj_cam = T_cam_obj[i].inverse()
         o, d = T_obj_cam.xyz / AXES, (T_obj_cam.rotation @ directions) / AXES
-        inside = _hits(o, d, 1.0)
+        inside = first_hits(o, d, 1.0)[1]
         for knob in KNOBS:
-            inside |= _hits(T_obj_cam.xyz - knob[:3], T_obj_cam.rotation @ directions, float(knob[3]))
+            inside |= first_hits(T_obj_cam.xyz - knob[:3], T_obj_cam.rotation @ directions, float(knob[3]))[1]
         masks.append(torch.where(inside, OBJECT, BACKGROUND).to(torch.uint8))
     rng = torch.Generator().manual_seed(seed)
     surface = torch.nn.functional.normalize(torch.randn(points, 3, generator=rng, dtype=torch.float64), dim=-1) * AXES
@@ -70,10 +70,11 @@ def moving(T_cam_obj: SE3, *, size: int = 128, points: int = 400, seed: int = 1)
     return Tumble(Capture(images, torch.stack(masks), camera, names, "camera"), T_cam_obj, surface)
 
 
-def _hits(origin: Tensor, direction: Tensor, radius: float) -> Tensor:
-    """Whether rays meet a ball about 0, by the discriminant."""
+def first_hits(origin: Tensor, direction: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Where rays first meet a ball about 0, and whether they do, by the discriminant."""
     a, b = (direction * direction).sum(-1), (direction * origin).sum(-1)
-    return b * b > a * ((origin * origin).sum() - radius**2)
+    discriminant = b * b - a * ((origin * origin).sum() - radius**2)
+    return origin + direction * ((-b - discriminant.clamp_min(0).sqrt()) / a)[..., None], discriminant > 0
 
 
 def tumbling_rotations(n: int) -> Tensor:

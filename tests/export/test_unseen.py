@@ -9,6 +9,7 @@ import torch
 
 from tests.export.test_bake import painted
 from tests.export.test_mesh import CELL, assert_closed, grid, marched
+from tests.lopsided import first_hits
 from tests.surfaces import sphere
 from tumble.export import mesh, unseen
 from tumble.maths import SE3, SO3
@@ -32,11 +33,9 @@ def capture(asset: Asset) -> Capture:
     masks = []
     for i in range(N):
         T_obj_cam = asset.trajectory.T_cam_obj[i].inverse()
-        o, d = T_obj_cam.xyz, T_obj_cam.rotation @ asset.camera.directions()
-        a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum() - RADIUS**2
-        hit = o + d * ((-b - (b * b - a * c).clamp_min(0).sqrt()) / a)[..., None]
+        hit, inside = first_hits(T_obj_cam.xyz, T_obj_cam.rotation @ asset.camera.directions(), RADIUS)
         label = torch.where(hit[..., 0] > 0.35, UNKNOWN, OBJECT)
-        masks.append(torch.where(b * b > a * c, label, BACKGROUND).to(torch.uint8))
+        masks.append(torch.where(inside, label, BACKGROUND).to(torch.uint8))
     images = torch.zeros(N, SIZE, SIZE, 3, dtype=torch.uint8)
     return Capture(images, torch.stack(masks), asset.camera, tuple(map(str, range(N))), "camera")
 

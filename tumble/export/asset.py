@@ -162,7 +162,7 @@ def _lit_frames(asset: Asset, capture: Capture | None) -> list[lit_frames.LitFra
     if capture is None:
         return []
     found = lit_frames.lit_frames(asset, capture)
-    return list(progress.track(found, "light of the photographs", lit_frames.count(capture)))
+    return list(progress.track(found, "light of the photographs", len(lit_frames.frame_numbers(capture))))
 
 
 def _confidence(asset: Asset) -> Float[Tensor, " n"]:

@@ -10,11 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tumble.export.mesh import Mesh, components, neighbour_means, vertex_normals
-from tumble.rendering import render_gbuffer
+from tumble.rendering import lit_frames, render_gbuffer
 from tumble.scene import OBJECT, UNKNOWN, Asset, Capture
 
-MAX_FRAMES = 72
-"""Maximum number of frames that are looked at, evenly spaced over the capture."""
 MIN_COSINE = 0.25
 """Minimum cosine between normal and view direction at which a frame shows a vertex."""
 DEPTH_TOLERANCE = 0.03
@@ -57,7 +55,7 @@ def seen_vertices(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray
     """Vertices that enough frames show as object: in front, and not too obliquely."""
     x_obj, normals = (torch.from_numpy(x).to(asset.gaussians.means) for x in (mesh.vertices, vertex_normals(mesh)))
     shown, hidden = torch.zeros(2, len(x_obj), dtype=torch.long, device=x_obj.device)
-    for i in torch.linspace(0, len(capture) - 1, min(MAX_FRAMES, len(capture))).round().long().tolist():
+    for i in lit_frames.frame_numbers(capture):
         label = _labels(asset, i, capture.masks[i].to(x_obj.device), x_obj, normals)
         shown += label == OBJECT
         hidden += label == UNKNOWN

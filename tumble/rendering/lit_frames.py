@@ -66,15 +66,15 @@ def usable_pixels(
     return inner & (photo.max(-1) < SATURATED)
 
 
-def count(capture: Capture) -> int:
-    """Number of frames that `lit_frames` yields."""
-    return min(MAX_FRAMES, len(capture))
+def frame_numbers(capture: Capture) -> list[int]:
+    """Indices of the frames that are used."""
+    return torch.linspace(0, len(capture) - 1, min(MAX_FRAMES, len(capture))).round().long().tolist()
 
 
 @torch.no_grad()
 def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
     """Up to `MAX_FRAMES` photographs with their light; the capture's frames are those of the asset's trajectory."""
-    frames = torch.linspace(0, len(capture) - 1, count(capture)).round().long().tolist()
+    frames = frame_numbers(capture)
     gaussians, material, camera = asset.gaussians, asset.material, asset.camera
     poses = [asset.trajectory.T_cam_obj[i] for i in frames]
     light, directions = prefilter(asset.environment), fibonacci_sphere(DIRECTIONS).to(gaussians.means)

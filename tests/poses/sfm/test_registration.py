@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.lopsided import AXES, Tumble, tumbling
+from tests.lopsided import AXES, Tumble, first_hits, tumbling
 from tumble.maths import SO3
 from tumble.poses.sfm import registration, stage
 from tumble.poses.sfm.partial import Observed, Partial, colour_contradictions, contour_cost
@@ -84,8 +84,7 @@ def two_coloured(scene: Tumble, brightness: torch.Tensor) -> torch.Tensor:
     images = torch.zeros(*scene.capture.masks.shape, 3)
     for k, T_obj_cam in enumerate(scene.T_cam_obj[i].inverse() for i in range(len(images))):
         o, d = T_obj_cam.xyz / AXES, (T_obj_cam.rotation @ scene.capture.camera.directions().double()) / AXES
-        a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum() - 1
-        hit = o + d * ((-b - (b * b - a * c).clamp_min(0).sqrt()) / a)[..., None]
+        hit, _ = first_hits(o, d, 1.0)
         colours = torch.where(hit[..., :1] > 0, torch.tensor([200.0, 170.0, 40.0]), torch.tensor([50.0, 80.0, 180.0]))
         images[k] = colours * brightness[k]
     return images.round().to(torch.uint8)

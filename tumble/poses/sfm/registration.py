@@ -254,8 +254,8 @@ def best_joint(observed: Observed, part: Partial, other: Partial) -> Joint | Non
     proposed = _proposed(observed, part, other, seen)
     if proposed is None:
         return None
-    moved = [moved_part(part, proposed, k) for k in range(len(proposed[0]))]
-    agreeing = np.array([_agreeing(observed, each, keypoint, points, JOINT_ERROR).sum() for each in moved])
+    as_proposed = (moved_part(part, proposed, k) for k in range(len(proposed[0])))
+    agreeing = np.array([_agreeing(observed, each, keypoint, points, JOINT_ERROR).sum() for each in as_proposed])
     place = np.searchsorted(part.frames, observed.keypoints.frame[keypoint])
     together = Correspondences(*map(torch.from_numpy, (place, observed.keypoints.uv[keypoint], points)))
     left, found = _distinct(proposed[0], agreeing), []
