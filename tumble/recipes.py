@@ -96,7 +96,10 @@ PAPER = Recipe(
             grow_score=5.0,
             grow_fraction=1.0,
             prune_opacity=0.005,
+            prune_weight=0.0,
+            fastgs=densify.FastGS(),
         ),
+        harmonics_every=1_000,
         pose_model="network",
     ),
     decompose=inverse_rendering.decompose.Config(
@@ -387,11 +390,15 @@ def scaled(recipe: Recipe, factor: float) -> Recipe:
     if isinstance(second, inverse_rendering.refine.Config):
         growth = second.densification
         every, most = fewer(growth.refine_every, 10), smaller(growth.max_gaussians, 500)
+        rules = growth.fastgs
+        if rules is not None:
+            rules = replace(rules, reset_every=every * round(rules.reset_every / growth.refine_every))
         second = replace(
             second,
             steps=fewer(second.steps, 1),
             points=smaller(second.points, 500),
-            densification=replace(growth, refine_every=every, max_gaussians=most),
+            harmonics_every=fewer(second.harmonics_every, 1),
+            densification=replace(growth, refine_every=every, max_gaussians=most, fastgs=rules),
         )
     if isinstance(third, inverse_rendering.decompose.Config):
         third = replace(
@@ -466,6 +473,7 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "projection": ("refine.weights.proj",),
     "light": (
         "refine.colour",
+        "refine.harmonics_every",
         "refine.shadow_start",
         "decompose.roughness",
         "decompose.start",

@@ -18,10 +18,10 @@ from tumble.maths.images import srgb_from_linear
 from tumble.maths.points import morton_order
 from tumble.maths.se3 import SE3, SO3, angle_between
 from tumble.maths.spherical_harmonics import basis as basis_of_harmonics
-from tumble.recipes import SMOKE
+from tumble.recipes import PAPER, SMOKE
 from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture, target_view
-from tumble.scene.gaussians import Gaussians, constant_sh, quats_from_normals
+from tumble.scene.gaussians import Gaussians, constant_sh, opacity, quats_from_normals
 from tumble.scene.trajectory import Trajectory
 
 GAMMA = torch.tensor(30.0)
@@ -151,6 +151,43 @@ def test_no_gaussian_is_pruned_before_every_frame_could_have_shown_it() -> None:
     assert len(state.memory["max_weight"]) < 600
     assert not state.memory["max_weight"].any()
     assert int(state.memory["watched_since"]) == 7
+
+
+def paper_like(every: int) -> refine.Config:
+    """Stage 2 of PAPER with 600 Gaussians and 50 steps: densification before step 5, late pruning before step 10."""
+    rules = densify.FastGS(reset_every=2 * every)
+    growth = replace(PAPER.refine.densification, refine_every=every, refine_stop=0.1, fastgs=rules)
+    return replace(PAPER.refine, steps=50, points=600, densification=growth, harmonics_every=0)
+
+
+def test_the_papers_densification_limits_opacities_and_prunes_late() -> None:
+    """At step 1 the limit is 0.8, at step 2 the one of a reset; at step 6 what has stayed faint is removed."""
+    _, true, capture = textured_sphere()
+    inputs, cfg = refine.Inputs(capture, Trajectory(true, "camera")), paper_like(1)
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+    largest = {}
+    for state.step in range(1, 7):
+        refine.prepare(cfg, inputs, state)
+        sdf, gamma = state.params.points.gaussians.sdf.detach(), state.params.gamma.detach()
+        largest[state.step] = float(opacity(sdf, gamma).max())
+        assert len(state.memory["max_weight"]) == len(sdf)
+        if state.step == 4:
+            sdf[::2] = 0
+    assert largest[1] == pytest.approx(0.8)
+    assert largest[2] == pytest.approx(0.01)
+    assert largest[6] == 1
+    assert opacity(sdf, gamma).min() > 0.1
+
+
+def test_harmonics_of_a_higher_degree_are_trained_later() -> None:
+    _, true, capture = textured_sphere()
+    inputs, cfg = refine.Inputs(capture, Trajectory(true, "camera")), replace(paper_like(100), harmonics_every=2)
+    state = refine.init(cfg, inputs, torch.Generator().manual_seed(0))
+    trained = []
+    for state.step in range(8):
+        refine.step(cfg, inputs, state)
+        trained.append(int(state.params.points.sh_rest.detach().any(0).any(-1).sum()))
+    assert trained == [0, 0, 3, 3, 8, 8, 15, 15]
 
 
 def test_gaussians_stay_in_morton_order_and_keep_their_moments() -> None:

@@ -182,6 +182,12 @@ def first_not_finite(named: Iterable[tuple[str, Tensor]]) -> str | None:
     return next((name for name, x in named if not bool(torch.isfinite(x).all())), None)
 
 
+def forget(leaf: Tensor, optimizer: Adam) -> None:
+    """Set the moments of a leaf to zero, after its values were changed by another rule."""
+    for moment in MOMENTS:
+        optimizer.state_of(leaf)[moment].zero_()
+
+
 # Leaves that change their shape ---------------------------------------------------------------------------------------
 
 

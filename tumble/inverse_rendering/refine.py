@@ -6,6 +6,7 @@ colour is shaded by one spherical-harmonic light (`sh_lighting`), or static per 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
@@ -36,7 +37,7 @@ from tumble.scene import (
     visual_hull,
 )
 
-VERSION = 18
+VERSION = 19
 VISIBILITY_VIEWS = 16
 """Maximum number of frames that are rendered to find the surface points from which visibility is traced."""
 COVERAGE_WEIGHT = 0.3
@@ -115,6 +116,8 @@ class Config:
     """Diameter of the object's sphere in the images up to which the numbers of Gaussians hold [pixels]. Where it is
     larger, both numbers grow by its power of 3/2, and `hull` by that of 3/4 (`for_resolution`). 0: they never
     grow."""
+    harmonics_every: int = 0
+    """Steps until the next degree of the static radiance's harmonics is trained. 0: all from the start."""
     opacity: float = 0.9
     """Initial opacity."""
     gamma: float = 30.0
@@ -308,6 +311,7 @@ def render(
     mask: Tensor | None = None,
     *,
     visibility: VisibilityTransfer | None = None,
+    harmonics: Index = 15,
 ) -> Buffers:
     """One view with stage 2's colour model, in linear radiance.
 
@@ -320,8 +324,9 @@ def render(
         camera: Intrinsics of the view.
         mask: Pixels that count in `Buffers.touched`; all when None.
         visibility: For self-shadowing; no self-shadowing when None.
+        harmonics: Number of the static radiance's harmonics of degree 1 to 3 that are trained; all count.
     """
-    gaussians = _with_radiance(points)
+    gaussians = _with_radiance(points, harmonics)
     if gaussians.sh.shape[1] == 1:
         lit = (visibility, R_env_obj, -(T_cam_obj.translation @ T_cam_obj.rotation.matrix()))
         colour = sh_lighting.radiance(light, gaussians, points.albedo_logits, *lit)
@@ -329,10 +334,15 @@ def render(
     return rasterize(gaussians, gamma, T_cam_obj, camera, {}, mask)
 
 
-def _with_radiance(points: Points) -> Gaussians:
-    """The Gaussians with all harmonics of their static radiance."""
-    gaussians = points.gaussians
-    return replace(gaussians, sh=torch.cat([gaussians.sh, points.sh_rest], 1)) if points.sh_rest.shape[1] else gaussians
+def _with_radiance(points: Points, harmonics: Index = 15) -> Gaussians:
+    """The Gaussians with all harmonics of their static radiance; those beyond a number get no gradient."""
+    gaussians, rest = points.gaussians, points.sh_rest
+    if not rest.shape[1]:
+        return gaussians
+    if not isinstance(harmonics, int) or harmonics < rest.shape[1]:
+        trained = torch.arange(rest.shape[1], device=rest.device)[:, None] < harmonics
+        rest = torch.where(trained, rest, rest.detach())
+    return replace(gaussians, sh=torch.cat([gaussians.sh, rest], 1))
 
 
 @dataclass(frozen=True)
@@ -345,6 +355,8 @@ class FrameNumbers:
     """Fraction of the weights of the normal and variance terms (`Config.ramp`)."""
     corrected: bool
     """Whether poses may differ from the initial ones."""
+    harmonics: Index
+    """Number of the static radiance's harmonics of degree 1 to 3 that are trained."""
 
 
 @threads_for_kernels()
@@ -364,13 +376,17 @@ def prepare(cfg: Config, inputs: Inputs, state: State) -> FrameNumbers:
     progress, every = state.step / cfg.steps, cfg.densification.refine_every
     if state.step and state.step % every == 0 and progress < cfg.densification.refine_stop:
         _densify(cfg, inputs, state)
+    elif densify.prunes_late(cfg.densification, state.step, cfg.steps):
+        _prune_late(cfg, inputs, state)
     if state.step % every == 0 and progress >= cfg.shadow_start and cfg.colour == "light":
         _trace_visibility(inputs, state)
     if state.step in _alignment_steps(cfg):
         _align_poses(inputs, state)
     optim.anneal(state.optimizer, _rate_factors(cfg, progress))
     ramp = min(1.0, progress / cfg.ramp) if cfg.ramp else 1.0
-    return FrameNumbers(_next_frame(state, len(inputs.capture)), ramp, _corrects_poses(cfg, state.step))
+    degree = min(3, state.step // cfg.harmonics_every) if cfg.harmonics_every else 3
+    frame, corrected = _next_frame(state, len(inputs.capture)), _corrects_poses(cfg, state.step)
+    return FrameNumbers(frame, ramp, corrected, (degree + 1) ** 2 - 1)
 
 
 def advance(cfg: Config, inputs: Inputs, state: State, numbers: FrameNumbers) -> dict[str, Tensor | float]:
@@ -380,7 +396,7 @@ def advance(cfg: Config, inputs: Inputs, state: State, numbers: FrameNumbers) ->
     T_cam_obj = pose(params, inputs, frame, corrected=numbers.corrected)
     R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
     arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, camera)
-    view = render(*arguments, visibility=cached_visibility(state))
+    view = render(*arguments, visibility=cached_visibility(state), harmonics=numbers.harmonics)
     largest = state.memory["max_weight"]
     torch.maximum(largest, view.weight.detach(), out=largest)
     terms = _terms(cfg, params, view, inputs.capture, frame, T_cam_obj, numbers.ramp)
@@ -455,28 +471,29 @@ def _terms(
 
 @torch.no_grad()
 def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
-    """Score the Gaussians over random frames, then split and prune."""
-    params, camera, growth = state.params, inputs.capture.camera, for_resolution(cfg, inputs).densification
+    """Score the Gaussians over random frames, then clone, split and prune."""
+    params, growth = state.params, for_resolution(cfg, inputs).densification
     assert state.optimizer is not None, "init makes one"
-    score = params.gamma.new_zeros(len(params.points.albedo_logits))
-    frames = torch.randperm(len(inputs.capture), generator=state.rng)[: growth.score_views].tolist()
-    for frame in frames:
-        T_cam_obj = pose(params, inputs, frame)
-        R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
-        arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, camera)
-        view = render(*arguments, visibility=cached_visibility(state))
-        truth = target_view(inputs.capture, frame, view.alpha)
-        error = (losses.srgb_as_captured(view.rgb, truth.image) - truth.image).abs().mean(-1)
-        bad = densify.bad_pixels(growth, error, truth.mask)
-        score += render(*arguments, mask=bad, visibility=cached_visibility(state)).touched / len(frames)
-    prune = opacity(params.points.gaussians.sdf, params.gamma) < growth.prune_opacity
+    rules, gaussians = growth.fastgs, params.points.gaussians
+    scores = _scores(cfg, inputs, state)
+    prune = opacity(gaussians.sdf, params.gamma) < growth.prune_opacity
     # Epochs are in random order: two of them, less one step, contain every frame.
     judged = state.step - int(state.memory["watched_since"]) >= 2 * len(inputs.capture) - 1
     if judged:
         prune |= state.memory["max_weight"] < growth.prune_weight
-    plan = densify.plan(growth, score, prune)
+    if rules is None:
+        plan = densify.plan(growth, scores.bad, prune)
+    else:
+        largest = gaussians.log_scales.amax(-1).exp()
+        plan = densify.plan_fastgs(growth, rules, scores, largest, prune, state.step, state.rng)
     points = optim.regrow(params.points, state.optimizer, plan.index, plan.fresh)
-    densify.place_children(points.gaussians, plan)
+    if rules is None:
+        densify.place_children(points.gaussians, plan)
+    else:
+        densify.sample_children(points.gaussians, plan, state.rng)
+        sdf = points.gaussians.sdf
+        sdf.copy_(densify.limited(rules, sdf, params.gamma, state.step))
+        optim.forget(sdf, state.optimizer)
     order = morton_order(points.gaussians.means)
     points = optim.regrow(points, state.optimizer, order, torch.zeros_like(plan.fresh))
     state.params = replace(params, points=points)
@@ -486,6 +503,33 @@ def _densify(cfg: Config, inputs: Inputs, state: State) -> None:
     else:  # new Gaussians have been watched for less long than the others: they are judged next time
         largest = state.memory["max_weight"][plan.index].masked_fill(plan.fresh, math.inf)
         state.memory["max_weight"] = largest[order]
+
+
+def _scores(cfg: Config, inputs: Inputs, state: State) -> densify.Scores:
+    """The Gaussians' scores over random frames."""
+    params, capture, growth = state.params, inputs.capture, cfg.densification
+
+    def view(frame: int) -> tuple[SE3, Callable[[Tensor | None], Buffers]]:
+        T_cam_obj = pose(params, inputs, frame)
+        R_env_obj = inputs.trajectory.R_env_obj_at(frame, T_cam_obj)
+        arguments = (params.points, params.gamma, params.light, T_cam_obj, R_env_obj, capture.camera)
+        return T_cam_obj, partial(render, *arguments, visibility=cached_visibility(state))
+
+    frames = torch.randperm(len(capture), generator=state.rng)[: growth.score_views].tolist()
+    return densify.score(growth, params.points.gaussians.means, capture, frames, view, ssim_weight=cfg.ssim)
+
+
+@torch.no_grad()
+def _prune_late(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Remove faint Gaussians, and those with the highest pruning scores."""
+    params, rules = state.params, cfg.densification.fastgs
+    assert rules is not None, "only FastGS prunes late"
+    assert state.optimizer is not None, "init makes one"
+    faint = opacity(params.points.gaussians.sdf, params.gamma) < rules.late_opacity
+    kept = torch.where(~faint & (_scores(cfg, inputs, state).prune <= rules.late_score))[0]
+    points = optim.regrow(params.points, state.optimizer, kept, torch.zeros_like(kept, dtype=torch.bool))
+    state.params = replace(params, points=points)
+    state.memory["max_weight"] = state.memory["max_weight"][kept]
 
 
 def _alignment_steps(cfg: Config) -> list[int]:
