@@ -9,7 +9,7 @@ import torch
 
 from tumble.export import photo_texture
 from tumble.export.atlas import UnwrappedMesh
-from tumble.export.bake import Texels, locate_texels
+from tumble.export.bake import Texels, Textures, locate_texels
 from tumble.maths.se3 import SE3, SO3
 from tumble.rendering import lit_frames
 from tumble.rendering.lit_frames import LitFrame
@@ -42,11 +42,14 @@ def pose(tilt: float, turn: float) -> SE3:
     return SE3(R.wxyz, torch.tensor([0.0, 0.0, 4.0]))
 
 
-def frame(T_cam_obj: SE3, number: int, *, height: float = 0.0, shift: tuple[float, float] = (0, 0)) -> LitFrame:
+def frame(
+    T_cam_obj: SE3, number: int, *, height: float = 0.0, shift: tuple[float, float] = (0, 0), hand: bool = False
+) -> LitFrame:
     """Photograph of the painted plane z = `height`, the mean over 6 x 6 rays per pixel.
 
     Args:
         shift: Position in the photograph minus that in the view [pixels].
+        hand: Whether the mask is unknown where x > 0.
     """
     fine = 6
     places = (np.arange(SIDE * fine) + 0.5) / fine
@@ -62,9 +65,10 @@ def frame(T_cam_obj: SE3, number: int, *, height: float = 0.0, shift: tuple[floa
     shape = (SIDE, SIDE, 3)
     diffuse, specular = (np.broadcast_to(v, shape).astype(np.float32) for v in (light, HIGHLIGHT))
     shown = (np.abs(np.stack([x, y])) < 0.7).all(0).reshape(SIDE, fine, SIDE, fine).mean((1, 3)) > 0.5
-    mask = np.where(shown, OBJECT, BACKGROUND).astype(np.uint8)
+    hidden = hand & (x.reshape(SIDE, fine, SIDE, fine).mean((1, 3)) > 0)
+    mask = np.where(shown, np.where(hidden, UNKNOWN, OBJECT), BACKGROUND).astype(np.uint8)
     photo = (albedo * diffuse + specular).astype(np.float32)
-    return LitFrame(photo, inside, diffuse, specular, mask, T_cam_obj, CAMERA)
+    return LitFrame(mask, T_cam_obj, CAMERA, photo, inside, diffuse, specular)
 
 
 POSES = [pose(tilt, turn) for tilt in (-0.7, 0.05, 0.6) for turn in (-0.6, 0.0, 0.7)]
@@ -105,6 +109,23 @@ def test_texels_that_no_photograph_shows_keep_the_baked_value(texels: Texels) ->
     assert (albedo[hidden] == blurred(texels)[hidden]).all()
     backs = [replace(f, T_cam_obj=SE3(f.T_cam_obj.wxyz, -f.T_cam_obj.xyz)) for f in FRAMES]
     assert (photo_texture.solve(blurred(texels), texels, backs)[0] == blurred(texels)).all()
+
+
+def test_what_a_hand_hides_continues_what_is_seen(texels: Texels) -> None:
+    """A hand hides what is beyond x = 0 in all frames but one; beyond x = 0.1 are other values, and a tilted normal."""
+    held = [frame(T, i, hand=i > 0) for i, T in enumerate(POSES)]
+    at, side = (texels.rows.numpy(), texels.columns.numpy()), 2 * SIDE
+    images = [np.zeros((side, side), np.uint8) for _ in range(3)]
+    for image, seen, hidden in zip(images, (200, 150, 128), (20, 30, 200), strict=True):
+        image[at] = torch.where(texels.points[:, 0] < 0.1, seen, hidden).numpy()
+    before = Textures(np.dstack([images[0]] * 3), images[1], np.dstack([images[2], images[2], images[2] | 255]))
+    after = photo_texture.continued(before, quad(), held)
+    inner = (texels.points[:, :2].abs() < 0.6).all(-1).numpy()
+    assert (after.base_color[at][inner] == 200).all()
+    assert (after.roughness[at][inner] == 150).all()
+    assert (after.normal[at][inner] == (128, 128, 255)).all()
+    same = photo_texture.continued(before, quad(), FRAMES)
+    assert (same.base_color[at][inner] == before.base_color[at][inner]).all()
 
 
 def test_a_hidden_surface_is_not_painted_with_the_one_before_it(texels: Texels) -> None:

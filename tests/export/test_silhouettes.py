@@ -42,7 +42,7 @@ def frame(turn: float, radius: float) -> LitFrame:
     hit = ((centre @ centre - along**2).clamp_min(0).sqrt() < radius).reshape(SIDE, SIDE).numpy()
     mask = np.where(hit, OBJECT, BACKGROUND).astype(np.uint8)
     empty = np.zeros((SIDE, SIDE, 3), np.float32)
-    return LitFrame(empty, hit, empty, empty, mask, T_cam_obj, CAMERA)
+    return LitFrame(mask, T_cam_obj, CAMERA, empty, hit, empty, empty)
 
 
 @pytest.mark.parametrize("offset", [0.1, 0.4])

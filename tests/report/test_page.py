@@ -87,7 +87,7 @@ def capture(asset: Asset) -> Capture:
 @pytest.fixture(scope="module")
 def page(asset: Asset, capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    export.write_textured_mesh(asset, export.extract_mesh(asset, SMALL), SMALL, 1.0, folder / "asset.glb")
+    export.write_textured_mesh(asset, export.extract_mesh(asset, SMALL), SMALL, folder / "asset.glb")
     masks = capture.masks.clone()
     masks[N - 1] = masks[N - 1].roll(SIDE // 4, 0)  # the health card names this frame
     names = tuple(f"{name} {HOSTILE}" for name in capture.names)

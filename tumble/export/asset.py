@@ -187,16 +187,22 @@ def textured_mesh(
     if frames:
         with progress.task("solving the albedo"):
             color = photo_texture.solved_base_color(textures.base_color, flat, frames)
-        textures = replace(textures, base_color=color)
+        textures = photo_texture.continued(replace(textures, base_color=color), flat, frames)
     return flat, textures.enlarged(preset.texture)
 
 
-def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, metres: float, path: Path) -> None:
-    """Unwrap the mesh for display only, bake its textures, and write the GLB."""
+def write_textured_mesh(asset: Asset, shape: Mesh, preset: Preset, path: Path, capture: Capture | None = None) -> None:
+    """Unwrap the mesh for display only, bake its textures, and write the GLB [object radius].
+
+    Args:
+        capture: Frames of the trajectory. What they show is then continued over what none of them shows.
+    """
     with progress.task("texture coordinates"):
         flat = atlas.unwrap_loosely(shape, preset.texture)
     flat, textures = textured_mesh(asset, flat, preset)
-    gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=metres)
+    if capture is not None:
+        textures = photo_texture.continued(textures, flat, lit_frames.masked_frames(asset, capture))
+    gltf.write_glb(path, flat, textures, f0=float(asset.material.f0), metres=1.0)
 
 
 def _write_light(asset: Asset, names: list[str], out: Path) -> None:

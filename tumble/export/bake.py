@@ -86,7 +86,7 @@ def bake(asset: Asset, mesh: UnwrappedMesh, *, resolution: int, views: int, pixe
     # A normal map cannot hold normals that point into the mesh.
     local = normalize(torch.cat([local[:, :2], local[:, 2:].clamp(min=0.05)], -1), dim=-1)
     encoded = torch.cat([srgb_from_linear(albedo), roughness, 0.5 + 0.5 * local], -1)
-    image, metalness = _texture_image(texels, encoded, resolution), asset.material.metalness
+    image, metalness = texture_image(texels, encoded, resolution), asset.material.metalness
     metal = None if metalness is None else _nearest_gaussian_image(metalness, asset, texels, resolution)
     return Textures(image[..., :3], image[..., 3], image[..., 4:], metal)
 
@@ -104,10 +104,10 @@ def _nearest_gaussian_image(
 ) -> UInt8[np.ndarray, "r r"]:
     """The texture of `nearest_gaussian_texture` for texels that are located already."""
     index = _nearest(texels.points, asset.gaussians.means)
-    return _texture_image(texels, values[index, None], resolution)[..., 0]
+    return texture_image(texels, values[index, None], resolution)[..., 0]
 
 
-def _texture_image(texels: Texels, values: Float[Tensor, "t c"], resolution: int) -> UInt8[np.ndarray, "r r c"]:
+def texture_image(texels: Texels, values: Float[Tensor, "t c"], resolution: int) -> UInt8[np.ndarray, "r r c"]:
     """8-bit texture of values in [0, 1] at texels; all other texels repeat the nearest of these."""
     image = np.zeros((resolution, resolution, values.shape[1]), np.uint8)
     covered = np.zeros((resolution, resolution), bool)

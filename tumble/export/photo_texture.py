@@ -3,7 +3,7 @@
 A pixel of a photograph shows the mean albedo of the texels that project into it, times its diffuse light, plus its
 highlight (`lit_frames.LitFrame`). The albedo of all texels is the least-squares solution of these equations over all
 pixels of all frames, with a Huber loss, regularised towards the texture baked from the Gaussians. Texels that no
-photograph shows keep the baked value.
+photograph shows keep the baked value; in the end what is seen is continued over them (`continued`).
 
 The solution is found by a few simultaneous iterations (SART, Andersen and Kak 1984), which recover coarse detail first
 and would reach the noise last. Two corrections keep photographs and texture registered: the surface is moved along its
@@ -20,16 +20,17 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from tumble.export import silhouettes
+from tumble.export import fill, silhouettes, unseen
 from tumble.export.atlas import UnwrappedMesh
-from tumble.export.bake import Texels, locate_texels, pad
+from tumble.export.bake import Texels, Textures, locate_texels, pad, texture_image
 from tumble.io import in_threads
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.rendering import lit_frames
-from tumble.scene import Camera
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -97,6 +98,46 @@ def solved_base_color(
     correction[at], covered[at] = solve(baked, texels, frames)[0] - baked, True
     correction = cv2.resize(pad(correction, covered), (resolution, resolution), interpolation=cv2.INTER_LINEAR)
     return to_srgb8(torch.from_numpy(linear + correction)).numpy()
+
+
+def continued(textures: Textures, mesh: UnwrappedMesh, frames: Sequence[lit_frames.MaskedFrame]) -> Textures:
+    """The textures with a smooth continuation of what frames show in the place of what none of them shows."""
+    resolution = len(textures.base_color)
+    side = min(resolution, solved_side(frames[0].camera))
+    coarse, texels = locate_texels(mesh, side), locate_texels(mesh, resolution)
+    seen, covered = np.zeros((side, side, 1), np.uint8), np.zeros((side, side), bool)
+    at = (coarse.rows.numpy(), coarse.columns.numpy())
+    seen[at], covered[at] = seen_texels(coarse, frames)[:, None], True
+    if seen[at].all() or not seen.any():
+        return textures
+    seen = cv2.resize(pad(seen, covered), (resolution, resolution), interpolation=cv2.INTER_NEAREST)
+    at = (texels.rows.numpy(), texels.columns.numpy())
+    scalars = [x for x in (textures.roughness, textures.metalness) if x is not None]
+    values, normals = np.dstack([textures.base_color, *scalars])[at], textures.normal[at]
+    values, normals = (torch.from_numpy(x).float() / 255 for x in (values, normals))
+    filled, certainty = fill.continued(values, torch.from_numpy(seen[at] > 0), texels.points)
+    flat = torch.tensor([0.5, 0.5, 1.0])
+    blended = torch.cat([flat + certainty * (normals - flat), filled + certainty * (values - filled)], -1)
+    image = texture_image(texels, blended, resolution)
+    metalness = None if textures.metalness is None else image[..., 7]
+    return Textures(image[..., 3:6], image[..., 6], image[..., :3], metalness)
+
+
+def seen_texels(texels: Texels, frames: Sequence[lit_frames.MaskedFrame]) -> Bool[np.ndarray, " t"]:
+    """Texels that enough frames show as object, by the rule of `unseen.seen_vertices`."""
+    shown, hidden = np.zeros((2, len(texels.points)), np.int64)
+    for label in in_threads(partial(_labels, texels), frames):
+        shown += label == OBJECT
+        hidden += label == UNKNOWN
+    return (shown >= unseen.MIN_FRAMES) & (shown >= unseen.MIN_SHOWN * (shown + hidden))
+
+
+def _labels(texels: Texels, frame: lit_frames.MaskedFrame) -> Int[np.ndarray, " t"]:
+    """What the mask of a frame says of each texel; background of those that the frame cannot show."""
+    index, pixel, _ = _in_front(texels, frame)
+    label = np.full(len(texels.points), BACKGROUND)
+    label[index.numpy()] = frame.mask.ravel()[pixel.numpy()]
+    return label
 
 
 def aligned_surface(
@@ -179,10 +220,9 @@ def _loss(equations: _Equations, albedo: Float[np.ndarray, "t 3"]) -> float:
     return float(np.average(np.where(size < 1, 0.5 * size**2, size - 0.5), weights=equations.weight[:, 0]))
 
 
-def _equations(texels: Texels, frame: lit_frames.LitFrame) -> _Equations:
-    """Equations of a frame's usable pixels, over the texels that face the camera and that no other texel hides."""
-    from scipy import sparse
-
+def _in_front(texels: Texels, frame: lit_frames.MaskedFrame) -> tuple[Tensor, Tensor, Tensor]:
+    """Texels that face the camera of a frame and that no other texel hides: their indices, pixels (counted row by row)
+    and the cosines between their normals and view directions."""
     camera = frame.camera
     to_camera = frame.T_cam_obj.inverse().xyz - texels.points
     cosine = (to_camera * texels.normals).sum(-1) / to_camera.norm(dim=-1)
@@ -196,14 +236,24 @@ def _equations(texels: Texels, frame: lit_frames.LitFrame) -> _Equations:
     # The nearest depth around a pixel excludes texels beside a depth edge, too.
     around = -max_pool2d(-nearest.view(1, camera.height, camera.width), 3, 1, 1).flatten()
     index = front[cosine[front] > MIN_COSINE]
-    index = index[torch.from_numpy(frame.usable).flatten()[pixel[index]]]
     slope = 3 / camera.fx_fy_cx_cy[0] * depth[index] * (cosine[index] ** -2 - 1).clamp(min=0).sqrt()
     index = index[depth[index] < around[pixel[index]] + DEPTH_TOLERANCE + slope]
-    shown = np.bincount(pixel[index].numpy(), minlength=camera.height * camera.width)
+    return index, pixel[index], cosine[index]
+
+
+def _equations(texels: Texels, frame: lit_frames.LitFrame) -> _Equations:
+    """Equations of a frame's usable pixels, over the texels that face the camera and that no other texel hides."""
+    from scipy import sparse
+
+    camera = frame.camera
+    index, pixel, cosine = _in_front(texels, frame)
+    kept = torch.from_numpy(frame.usable).flatten()[pixel]
+    index, pixel, cosine = index[kept], pixel[kept], cosine[kept]
+    shown = np.bincount(pixel.numpy(), minlength=camera.height * camera.width)
     pixels = np.nonzero(shown)[0]
-    of_texel = (np.cumsum(shown > 0) - 1)[pixel[index].numpy()]
+    of_texel = (np.cumsum(shown > 0) - 1)[pixel.numpy()]
     # A texel's area in the image is proportional to its cosine; its distance hardly varies within a pixel.
-    facing = cosine[index].numpy().astype(np.float32)
+    facing = cosine.numpy().astype(np.float32)
     area = np.bincount(of_texel, facing, len(pixels))
     shape, places = (len(pixels), len(texels.points)), (of_texel, index.numpy())
     shows = sparse.csr_matrix(((facing / area[of_texel]).astype(np.float32), places), shape)

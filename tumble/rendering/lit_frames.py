@@ -33,7 +33,17 @@ SATURATED = 250
 
 
 @dataclass(frozen=True)
-class LitFrame:
+class MaskedFrame:
+    """The mask of a photograph, and its view."""
+
+    mask: UInt8[np.ndarray, "h w"]
+    """Mask of the capture."""
+    T_cam_obj: SE3
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class LitFrame(MaskedFrame):
     """One photograph, the light of its pixels, and its view."""
 
     photo: Float[np.ndarray, "h w 3"]
@@ -44,10 +54,6 @@ class LitFrame:
     """Radiance per albedo; on a dielectric that of a white surface without highlights."""
     specular: Float[np.ndarray, "h w 3"]
     """Radiance of the highlights."""
-    mask: UInt8[np.ndarray, "h w"]
-    """Mask of the capture."""
-    T_cam_obj: SE3
-    camera: Camera
 
 
 def usable_pixels(
@@ -71,10 +77,19 @@ def frame_numbers(capture: Capture) -> list[int]:
     return torch.linspace(0, len(capture) - 1, min(MAX_FRAMES, len(capture))).round().long().tolist()
 
 
+def masked_frames(asset: Asset, capture: Capture) -> list[MaskedFrame]:
+    """Up to `MAX_FRAMES` masks with their views; the capture's frames are those of the asset's trajectory."""
+    T_cam_obj, camera = asset.trajectory.T_cam_obj, asset.camera
+    lens = Camera(camera.fx_fy_cx_cy.cpu(), camera.height, camera.width)
+    wxyz, xyz = T_cam_obj.wxyz.cpu(), T_cam_obj.xyz.cpu()
+    numbers = frame_numbers(capture)
+    return [MaskedFrame(capture.masks[i].cpu().numpy(), SE3(wxyz[i], xyz[i]), lens) for i in numbers]
+
+
 @torch.no_grad()
 def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
     """Up to `MAX_FRAMES` photographs with their light; the capture's frames are those of the asset's trajectory."""
-    frames = frame_numbers(capture)
+    frames, masked = frame_numbers(capture), masked_frames(asset, capture)
     gaussians, material, camera = asset.gaussians, asset.material, asset.camera
     poses = [asset.trajectory.T_cam_obj[i] for i in frames]
     light, directions = prefilter(asset.environment), fibonacci_sphere(DIRECTIONS).to(gaussians.means)
@@ -82,10 +97,9 @@ def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
     tracer = build_tracer(gaussians, asset.gamma)
     traced = visibility(tracer, points, gaussians.normals, directions, blockers=True)
     bounce = Bounce(material.diffuse_albedo, transfer([traced], gaussians.normals))
-    for i, T_cam_obj in zip(frames, poses, strict=True):
+    for i, T_cam_obj, frame in zip(frames, poses, masked, strict=True):
         view = render_gbuffer(asset, T_cam_obj, camera)
-        code_values, mask = capture.images[i].cpu().numpy(), capture.masks[i].cpu().numpy()
-        usable = usable_pixels(code_values, mask, view.alpha.cpu().numpy())
+        usable = usable_pixels(capture.images[i].cpu().numpy(), frame.mask, view.alpha.cpu().numpy())
         pixels = torch.where(torch.from_numpy(usable).to(view.alpha.device).flatten())[0]
         shown = surface(view, T_cam_obj, camera, pixels=pixels)
         gaussian = view.dominant.flatten()[pixels].clamp_min(0).long()
@@ -94,6 +108,4 @@ def lit_frames(asset: Asset, capture: Capture) -> Iterator[LitFrame]:
         lobes = coloured_lobes(*lit, f0=float(material.f0), bounce=bounce, metalness=metalness)
         diffuse, specular = (shown.paint(x, camera.height, camera.width).cpu().numpy() for x in lobes)
         photo = linear_from_srgb(capture.images[i].float() / 255).cpu().numpy()
-        pose = SE3(T_cam_obj.wxyz.cpu(), T_cam_obj.xyz.cpu())
-        lens = Camera(camera.fx_fy_cx_cy.cpu(), camera.height, camera.width)
-        yield LitFrame(photo, usable, diffuse, specular, mask, pose, lens)
+        yield LitFrame(frame.mask, frame.T_cam_obj, frame.camera, photo, usable, diffuse, specular)

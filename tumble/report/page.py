@@ -169,7 +169,7 @@ def write_model(asset: Asset, folder: Path, capture: Capture) -> Path | None:
     except ValueError:
         return None
     try:
-        write_textured_mesh(asset, shape, MESH, 1.0, folder / "asset.glb")
+        write_textured_mesh(asset, shape, MESH, folder / "asset.glb", capture)
     except ModuleNotFoundError as error:
         warnings.warn(f"{error}; the report has no live view without a mesh", stacklevel=2)
         return None
