@@ -97,6 +97,13 @@ def test_half_as_many_as_may_be_pruned_are_drawn_by_their_score() -> None:
         assert removed <= set(range(10))
 
 
+def test_late_pruning_keeps_what_is_opaque_and_well_rendered() -> None:
+    scores = densify.Scores(torch.zeros(4), torch.tensor([0.0, 0.95, 0.9, 0.0]), torch.zeros(4))
+    kept = densify.kept_late(densify.FastGS(), torch.tensor([0.2, 0.2, 0.1, 0.09]), scores)
+    assert kept.tolist() == [0, 2]
+    assert densify.kept_late(densify.FastGS(), torch.full((4,), 0.01), scores).tolist() == [0, 1, 2, 3]
+
+
 def test_the_gradient_on_the_screen_is_that_of_a_projected_point() -> None:
     """Of u + 2 v in units of half the image's sides, for two points in front of a turned and shifted object."""
     camera = Camera(torch.tensor([90.0, 110.0, 31.0, 22.0]), 48, 64)

@@ -161,6 +161,12 @@ def prunes_late(cfg: Config, step: int, steps: int) -> bool:
     return step % rules.reset_every == 0
 
 
+def kept_late(rules: FastGS, opacities: Float[Tensor, " n"], scores: Scores) -> Int[Tensor, " m"]:
+    """Indices of the Gaussians that stay in late pruning; all if none would, as when few steps follow a reset."""
+    kept = torch.where((opacities >= rules.late_opacity) & (scores.prune <= rules.late_score))[0]
+    return kept if len(kept) else torch.arange(len(opacities), device=opacities.device)
+
+
 def plan(cfg: Config, score: Float[Tensor, " n"], prune: Bool[Tensor, " n"]) -> Plan:
     """Split the Gaussians with the highest scores, within the limits of the settings, and remove pruned ones.
 

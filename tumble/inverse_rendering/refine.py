@@ -525,8 +525,8 @@ def _prune_late(cfg: Config, inputs: Inputs, state: State) -> None:
     params, rules = state.params, cfg.densification.fastgs
     assert rules is not None, "only FastGS prunes late"
     assert state.optimizer is not None, "init makes one"
-    faint = opacity(params.points.gaussians.sdf, params.gamma) < rules.late_opacity
-    kept = torch.where(~faint & (_scores(cfg, inputs, state).prune <= rules.late_score))[0]
+    opacities = opacity(params.points.gaussians.sdf, params.gamma)
+    kept = densify.kept_late(rules, opacities, _scores(cfg, inputs, state))
     points = optim.regrow(params.points, state.optimizer, kept, torch.zeros_like(kept, dtype=torch.bool))
     state.params = replace(params, points=points)
     state.memory["max_weight"] = state.memory["max_weight"][kept]
