@@ -121,8 +121,8 @@ PAPER = Recipe(
 
 Where the paper prints no number, the work that it follows decides. 3DGS: rates of the Gaussians' centres, rotations,
 scales and harmonics; only that of the centres decays. DiscretizedSDF: number and opacity of the first Gaussians, start
-and rate of gamma, rate of the signed distances, the factor 5 on the centres' rate. FastGS: end of densification (15,000
-steps), thresholds on error, score and opacity. R3DG: cross entropy, rates of geometry in stage 3. SVG-IR: level of
+and rate of gamma, rate of the signed distances, the factor 5 on the centres' rate. FastGS: densification and
+pruning, which end after 15,000 and 30,000 steps. R3DG: cross entropy, rates of geometry in stage 3. SVG-IR: level of
 the first albedo, and roughness. IRGS: rays per step of stage 3 (2^18). The poses' rate in stages 2 and 3 is that of
 stage 1. Never run to the end: only `scaled` versions were.
 """
