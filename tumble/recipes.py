@@ -94,7 +94,6 @@ PAPER = Recipe(
             max_gaussians=1_000_000,
             bad_min_error=0.0,
             grow_score=5.0,
-            grow_fraction=1.0,
             prune_opacity=0.005,
             prune_weight=0.0,
             fastgs=densify.FastGS(),

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -30,7 +30,7 @@ from tumble.export.bake import Texels, Textures, locate_texels, pad, texture_ima
 from tumble.io import in_threads
 from tumble.maths import linear_from_srgb, to_srgb8
 from tumble.rendering import lit_frames
-from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera
+from tumble.scene import BACKGROUND, Camera
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -107,7 +107,8 @@ def continued(textures: Textures, mesh: UnwrappedMesh, frames: Sequence[lit_fram
     coarse, texels = locate_texels(mesh, side), locate_texels(mesh, resolution)
     seen, covered = np.zeros((side, side, 1), np.uint8), np.zeros((side, side), bool)
     at = (coarse.rows.numpy(), coarse.columns.numpy())
-    seen[at], covered[at] = seen_texels(coarse, frames)[:, None], True
+    labels = in_threads(partial(_labels, coarse), frames)
+    seen[at], covered[at] = unseen.enough_show(len(coarse.points), labels)[:, None], True
     if seen[at].all() or not seen.any():
         return textures
     seen = cv2.resize(pad(seen, covered), (resolution, resolution), interpolation=cv2.INTER_NEAREST)
@@ -121,15 +122,6 @@ def continued(textures: Textures, mesh: UnwrappedMesh, frames: Sequence[lit_fram
     image = texture_image(texels, blended, resolution)
     metalness = None if textures.metalness is None else image[..., 7]
     return Textures(image[..., 3:6], image[..., 6], image[..., :3], metalness)
-
-
-def seen_texels(texels: Texels, frames: Sequence[lit_frames.MaskedFrame]) -> Bool[np.ndarray, " t"]:
-    """Texels that enough frames show as object, by the rule of `unseen.seen_vertices`."""
-    shown, hidden = np.zeros((2, len(texels.points)), np.int64)
-    for label in in_threads(partial(_labels, texels), frames):
-        shown += label == OBJECT
-        hidden += label == UNKNOWN
-    return (shown >= unseen.MIN_FRAMES) & (shown >= unseen.MIN_SHOWN * (shown + hidden))
 
 
 def _labels(texels: Texels, frame: lit_frames.MaskedFrame) -> Int[np.ndarray, " t"]:

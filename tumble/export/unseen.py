@@ -4,9 +4,11 @@ Nothing is known of such a part, and the surface of the Gaussians has lumps, hol
 The smallest surface between what was seen takes its place; the confidence marks it as it marks all that was not seen.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from tumble.export.mesh import Mesh, components, neighbour_means, vertex_normals
@@ -54,12 +56,21 @@ def spanned(mesh: Mesh, asset: Asset, capture: Capture) -> Mesh:
 def seen_vertices(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray, " v"]:
     """Vertices that enough frames show as object: in front, and not too obliquely."""
     x_obj, normals = (torch.from_numpy(x).to(asset.gaussians.means) for x in (mesh.vertices, vertex_normals(mesh)))
-    shown, hidden = torch.zeros(2, len(x_obj), dtype=torch.long, device=x_obj.device)
-    for i in lit_frames.frame_numbers(capture):
-        label = _labels(asset, i, capture.masks[i].to(x_obj.device), x_obj, normals)
+    masks = ((i, capture.masks[i].to(x_obj.device)) for i in lit_frames.frame_numbers(capture))
+    return enough_show(len(x_obj), (_labels(asset, i, mask, x_obj, normals).cpu().numpy() for i, mask in masks))
+
+
+def enough_show(n: int, labels: Iterable[Shaped[np.ndarray, " n"]]) -> Bool[np.ndarray, " n"]:
+    """Which of n points at least `MIN_FRAMES` frames show as object, and `MIN_SHOWN` of those in which it is in front.
+
+    Args:
+        labels: What the mask of each frame says of each point; neither object nor unknown of those that it cannot show.
+    """
+    shown, hidden = np.zeros((2, n), np.int64)
+    for label in labels:
         shown += label == OBJECT
         hidden += label == UNKNOWN
-    return ((shown >= MIN_FRAMES) & (shown >= MIN_SHOWN * (shown + hidden))).cpu().numpy()
+    return (shown >= MIN_FRAMES) & (shown >= MIN_SHOWN * (shown + hidden))
 
 
 def _labels(

@@ -2,7 +2,7 @@
 
 A *plan* lists the parent row of every Gaussian afterwards: kept rows appear once, cloned and split rows twice, pruned
 rows not at all. The score of a Gaussian is that of FastGS: the number of badly rendered pixels that it contributes to,
-as a mean over several views. Ours splits the highest scores; `FastGS` holds what that method does besides.
+as a mean over several views. Ours splits the highest scores; `FastGS` adds gradients, clones and a budget of pruning.
 """
 
 import math
@@ -21,8 +21,7 @@ from tumble.scene import Camera, Capture, Gaussians, sdf_from_opacity, target_vi
 
 @dataclass(frozen=True)
 class FastGS:
-    """Settings of FastGS (Ren et al. 2026) that ours has not, named as in its program; of two cases that it tells
-    apart by the largest scale, small Gaussians are cloned and large ones split."""
+    """Settings of FastGS (Ren et al. 2026) beyond those of `Config`. Small Gaussians are cloned, large ones split."""
 
     gradient: float = 2e-4
     """Gradient of the photometric term by a centre in the image, mean over the views that show it, from which on a
@@ -72,7 +71,7 @@ class Config:
     """Blending weight [pixels] that a Gaussian must reach in some view, once all were rendered; otherwise it is
     removed, since it lies inside the object. 0: it is not."""
     fastgs: FastGS | None = None
-    """What is done besides splitting the highest scores; None for nothing."""
+    """FastGS in place of splitting the highest scores; `grow_fraction` does not count then."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Plan:
     index: Int[Tensor, " m"]
     """Parent row of every Gaussian."""
     fresh: Bool[Tensor, " m"]
-    """Whether a Gaussian is the child of a split; its optimizer moments start at zero."""
+    """Whether a Gaussian is a clone or the child of a split; its optimizer moments start at zero."""
     n_kept: int
     """Number of kept rows, which come first; then follow clones, all first children, and all second children."""
     n_clones: int = 0
@@ -183,11 +182,7 @@ def plan(cfg: Config, score: Float[Tensor, " n"], prune: Bool[Tensor, " n"]) -> 
     split = order[candidates[order] > cfg.grow_score]
     keep = ~prune
     keep[split] = False
-    kept = torch.where(keep)[0]
-    index = torch.cat([kept, split, split])
-    fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
-    fresh[len(kept) :] = True
-    return Plan(index, fresh, len(kept))
+    return _plan(torch.where(keep)[0], split[:0], split)
 
 
 def plan_fastgs(
@@ -222,7 +217,11 @@ def plan_fastgs(
         drawn = torch.multinomial(weights, budget, generator=rng).to(candidates.device)
         keep[drawn] = ~candidates[drawn]
     keep[split] = False
-    kept = torch.where(keep)[0]
+    return _plan(torch.where(keep)[0], cloned, split)
+
+
+def _plan(kept: Int[Tensor, " k"], cloned: Int[Tensor, " c"], split: Int[Tensor, " s"]) -> Plan:
+    """The plan that keeps some rows, clones some of them, and splits others."""
     index = torch.cat([kept, cloned, split, split])
     fresh = torch.arange(len(index), device=index.device) >= len(kept)
     return Plan(index, fresh, len(kept), len(cloned))
