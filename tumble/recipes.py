@@ -138,6 +138,7 @@ STANDARD = replace(
         warmup=1_000,
         doublings=3,
         try_matte=True,
+        region_trials=3,
         solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=0.005, material=0.02, mask=MASK, specular=0.0),
         rates=inverse_rendering.decompose.Rates(
@@ -169,6 +170,7 @@ DRAFT = replace(
         side=128,
         doublings=1,
         try_matte=True,
+        region_trials=3,
         solve_albedo=True,
         weights=inverse_rendering.decompose.Weights(light=5e-4, material=0.01, mask=MASK, specular=0.0),
         rates=inverse_rendering.decompose.Rates(
@@ -281,7 +283,8 @@ def recap(lights: int, recipe: Recipe) -> Recipe:
     As in ReCap opacity is a free parameter and there are no shadows and no indirect light.
     """
     recipe = no_specular_fit(no_sdf(static_colour(recipe)))
-    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False)
+    # The frames of a block are too few for a trial of the roughness of regions.
+    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False, region_trials=0)
     # The light of a block is trained in few of the steps.
     rates = replace(_faster(base.rates, light=4.0), poses=0.0)
     return replace(recipe, decompose=inverse_rendering.separate_lights.Config(replace(base, rates=rates), lights))
@@ -339,12 +342,12 @@ def no_albedo_solve(recipe: Recipe) -> Recipe:
 
 
 def no_specular_fit(recipe: Recipe) -> Recipe:
-    """Ablation: no trial whether the object has a specular lobe but a penalty on it, and the roughness of a corner
-    depends only on the pixels that show it."""
+    """Ablation: no trial whether the object has a specular lobe but a penalty on it, none of the roughness of regions,
+    and the roughness of a corner depends only on the pixels that show it."""
     stage = _decompose_of(recipe)
     weights = replace(stage.weights, specular=inverse_rendering.decompose.Weights().specular)
     rates = replace(stage.rates, roughness_shift=0.0)
-    return _replace_decompose(recipe, try_matte=False, roughness=0.4, weights=weights, rates=rates)
+    return _replace_decompose(recipe, try_matte=False, region_trials=0, roughness=0.4, weights=weights, rates=rates)
 
 
 def progressive_poses(recipe: Recipe) -> Recipe:
@@ -504,7 +507,10 @@ DEPARTURES: dict[str, tuple[str, ...]] = {
     "cached-visibility": ("decompose.shadows",),
     "split-sum": ("decompose.lobes",),
     "frame-bounce": ("decompose.bounce",),
-    "specular-fit": ("decompose.try_matte", "decompose.rates.roughness_shift", "decompose.rates.metalness"),
+    "specular-fit": (
+        *("decompose.try_matte", "decompose.region_trials"),
+        *("decompose.rates.roughness_shift", "decompose.rates.metalness"),
+    ),
     "albedo-solve": ("decompose.solve_albedo",),
 }
 """Our departures from the paper, in the order of the ladder: by name, the settings that are ours from there on."""

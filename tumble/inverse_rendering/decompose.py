@@ -23,6 +23,7 @@ from tumble.inverse_rendering.material_params import (
     ALBEDO_RANGE,
     NO_LOBE,
     Params,
+    Rates,
     absorbed,
     shifted_material,
     with_half_the_contrast,
@@ -70,7 +71,7 @@ from tumble.scene import (
     target_view,
 )
 
-VERSION = 25
+VERSION = 26
 DISPLACEMENT_CHECK_EVERY = 100
 """Steps between two measurements of the displacement of the geometry."""
 PENALTY_SCALE = 0.2
@@ -108,39 +109,6 @@ class Weights:
     specular: float = 0.01
     """Weight of the penalty on the specular lobe, which hardly depends on the lobe's scale. Without a trial
     (`Config.try_matte`) it keeps a Lambertian object from a lobe that compensates for errors of the light."""
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Adam's learning rates; material and light from appendix A. For geometry the paper refers to SVG-IR."""
-
-    albedo: float = 0.025
-    """Learning rate of the albedo logits."""
-    roughness: float = 0.025
-    """Learning rate of the roughness logits."""
-    roughness_shift: float = 0.0
-    """Learning rate of the common shift of all roughness logits; the paper has none."""
-    metalness: float = 0.0
-    """Learning rate of the metalness logits. If it is 0, no object has metal, as in the paper."""
-    normal: float = 1e-3
-    """Learning rate of the normal offsets."""
-    specular_scale: float = 0.0
-    """Learning rate of the logarithmic specular scale. If it is 0, F0 is 0.04, as in the paper."""
-    light: float = 0.01
-    """Learning rate of the logarithmic radiance of the environment map."""
-    means: float = 1.6e-5
-    """Learning rate of the centres after the warm-up [object radius]."""
-    quats: float = 1e-4
-    """Learning rate of the rotations after the warm-up."""
-    log_scales: float = 5e-4
-    """Learning rate of the logarithmic scales after the warm-up."""
-    sdf: float = 5e-3
-    """Learning rate of the signed distances after the warm-up [object radius]."""
-    poses: float = 0.0
-    """Learning rate of the tangents of all poses after the warm-up, or of the network that predicts them; 0 keeps the
-    poses of stage 2."""
-    decay: float = 0.1
-    """Factor by which all learning rates decay over the run."""
 
 
 @dataclass(frozen=True)
@@ -190,6 +158,8 @@ class Config:
     the light of the frame."""
     corners: bool = True
     """Whether the material varies between the corners of a Gaussian."""
+    region_trials: int = 0
+    """How often, at even intervals, the best roughness of every region is looked for (`specular_fit.of_regions`)."""
     solve_albedo: bool = False
     """Whether the albedo is solved from the photographs in the end, in absolute colour (`albedo_solve.solved`)."""
     pose_model: Literal["tangents", "network"] = "tangents"
@@ -261,7 +231,7 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     """
     params, coarse = state.params, _coarse(cfg, inputs)
     before = params.log_specular_scale.detach().exp()
-    samples = _samples(cfg, inputs, state)
+    samples = _samples(cfg, inputs, state, state.rng)[0]
     fitted = specular_fit.fit(samples, len(params.gaussians.means))
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
     glossy = with_lobe(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
@@ -299,7 +269,7 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
     Geometry and the resolution of the light stay as they are, so that visibility does, too.
     """
     steps = max(1, min(cfg.steps // 3, TRIAL_STEPS))
-    cfg = replace(cfg, warmup=steps, doublings=0)
+    cfg = replace(cfg, warmup=steps, doublings=0, region_trials=0)
     params, rng = optim.leaves(start), torch.Generator()
     rng.set_state(before.rng.get_state())
     state = State(0, params, optim.adam(params, learning_rates(cfg, params.material)), rng, dict(before.memory))
@@ -312,8 +282,11 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
 
 
 @torch.no_grad()
-def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
-    """Pixels of the object in several frames with both lobes under the current light."""
+def _samples(
+    cfg: Config, inputs: Inputs, state: State, rng: torch.Generator, roughnesses: tuple[float, ...] = ()
+) -> list[specular_fit.Samples]:
+    """Pixels of the object in several frames with both lobes under the current light, for each of some roughnesses, or
+    for the first one of stage 3."""
     params, capture, parts = state.params, inputs.capture, []
     n = pixels_per_step(cfg.pixels, cfg.side, capture.camera)
     bounce, light = _bounce(cfg, state, params, corner_features(params.material)[1]), prefilter(params.environment)
@@ -322,16 +295,39 @@ def _samples(cfg: Config, inputs: Inputs, state: State) -> specular_fit.Samples:
         view = render_gbuffer(params, T_cam_obj, capture.camera)
         truth = target_view(capture, frame, view.alpha)
         inner = -max_pool2d(-truth.mask[None], 3, 1, 1)[0]  # pixels at the contour contain background
-        pixels = sample_pixels(FIT_PIXELS * n, view.alpha, inner > 0.5, state.rng)
+        pixels = sample_pixels(FIT_PIXELS * n, view.alpha, inner > 0.5, rng)
         points = surface(view, T_cam_obj, capture.camera, pixels=pixels[pixels >= 0])
-        R_env_obj = inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj)
-        gaussian, rough = _dominant_gaussian(view, points), torch.full_like(points.normals[:, :1], cfg.roughness)
+        gaussian, photo = _dominant_gaussian(view, points), linear_from_srgb(points.sample(truth.image))
         visible = _pixel_visibility(cfg, state, params, points, gaussian)
-        lobes = split_lobes(points, rough, light, R_env_obj, visible, bounce=bounce)
-        parts.append(
-            (gaussian, lobes.diffuse, DIELECTRIC * lobes.specular, linear_from_srgb(points.sample(truth.image)))
-        )
-    return specular_fit.Samples(*(torch.cat(x) for x in zip(*parts, strict=True)))
+        lit = (light, inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj), visible)
+        for roughness in roughnesses or (cfg.roughness,):
+            rough = torch.full_like(points.normals[:, :1], roughness)
+            lobes = split_lobes(points, rough, *lit, bounce=bounce)
+            parts.append((gaussian, lobes.diffuse, DIELECTRIC * lobes.specular, photo))
+    step = len(roughnesses) or 1
+    by_roughness = (zip(*parts[i::step], strict=True) for i in range(step))
+    return [specular_fit.Samples(*(torch.cat(x) for x in part)) for part in by_roughness]
+
+
+@torch.no_grad()
+def _find_regions(cfg: Config, inputs: Inputs, state: State) -> None:
+    """Give every region its own best roughness when it is due and regions differ.
+
+    Descent finds the roughness of an object, but hardly leaves it for that of a part (docs/method.md). The mean over
+    the pixels stays as it is: that with the least error of all of them together is biased by the blurred light.
+    """
+    due = [cfg.steps * i // (cfg.region_trials + 1) for i in range(1, cfg.region_trials + 1)]
+    params, material = state.params, state.params.material
+    if state.step not in due or material.metal_logits is not None or (params.log_specular_scale <= NO_LOBE).all():
+        return
+    scale = params.log_specular_scale.exp() * material.f0 / DIELECTRIC
+    rng = torch.Generator().manual_seed(state.step)  # the numbers of the steps do not depend on the trial
+    samples = _samples(cfg, inputs, state, rng, specular_fit.ROUGHNESSES)
+    samples = [replace(x, specular=scale * x.specular) for x in samples]
+    before = material.roughness_logits.mean(1)
+    logits = specular_fit.of_regions(samples, params.gaussians.means, material.albedo.mean(1), before)
+    if logits is not None:
+        material.roughness_logits.copy_(logits[:, None].expand_as(material.roughness_logits))
 
 
 def _learns_network(cfg: Config) -> bool:
@@ -436,6 +432,7 @@ def prepare(cfg: Config, inputs: Inputs, state: State) -> PixelNumbers:
     assert state.optimizer is not None, "init makes one"
     _upsample_light(cfg, state)
     _retrace_if_moved(cfg, inputs, state)
+    _find_regions(cfg, inputs, state)
     decayed = cfg.rates.decay ** (state.step / cfg.steps)
     later = decayed * (state.step >= cfg.warmup)
     optim.anneal(state.optimizer, {"": decayed, "gaussians": later, "poses": later, "pose_network": later})

@@ -1,4 +1,4 @@
-"""The parameters of stage 3, and equal or simpler ones."""
+"""The parameters of stage 3, their learning rates, and equal or simpler parameters."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -38,6 +38,39 @@ class Params:
     at once, while the logits of a corner, which few pixels show, hardly leave their start."""
     pose_network: dict[str, Tensor] = field(default_factory=dict)
     """Network that predicts the tangents of the poses (`pose_network`); empty if there is none."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates; material and light from appendix A. For geometry the paper refers to SVG-IR."""
+
+    albedo: float = 0.025
+    """Learning rate of the albedo logits."""
+    roughness: float = 0.025
+    """Learning rate of the roughness logits."""
+    roughness_shift: float = 0.0
+    """Learning rate of the common shift of all roughness logits; the paper has none."""
+    metalness: float = 0.0
+    """Learning rate of the metalness logits. If it is 0, no object has metal, as in the paper."""
+    normal: float = 1e-3
+    """Learning rate of the normal offsets."""
+    specular_scale: float = 0.0
+    """Learning rate of the logarithmic specular scale. If it is 0, F0 is 0.04, as in the paper."""
+    light: float = 0.01
+    """Learning rate of the logarithmic radiance of the environment map."""
+    means: float = 1.6e-5
+    """Learning rate of the centres after the warm-up [object radius]."""
+    quats: float = 1e-4
+    """Learning rate of the rotations after the warm-up."""
+    log_scales: float = 5e-4
+    """Learning rate of the logarithmic scales after the warm-up."""
+    sdf: float = 5e-3
+    """Learning rate of the signed distances after the warm-up [object radius]."""
+    poses: float = 0.0
+    """Learning rate of the tangents of all poses after the warm-up, or of the network that predicts them; 0 keeps the
+    poses of stage 2."""
+    decay: float = 0.1
+    """Factor by which all learning rates decay over the run."""
 
 
 @torch.no_grad()

@@ -1,4 +1,5 @@
-"""Albedos of all Gaussians by least squares under a given light and specular lobe, and the specular scale in the end.
+"""Albedos of all Gaussians by least squares under a given light and specular lobe, the roughness of regions, and the
+specular scale in the end.
 
     radiance of a pixel that shows Gaussian i = albedo_i * diffuse + specular_scale * specular
 
@@ -8,6 +9,7 @@ starts from the best albedos for its lobe (variable projection, Golub and Pereyr
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +17,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from tumble.maths import neighbours
-from tumble.scene import DIELECTRIC, Material
+from tumble.scene import DIELECTRIC, TEMPERATURE, Material
 
 MAX_ALBEDO = 0.9
 """Upper limit of the 95 % quantile of an object's albedo."""
@@ -32,6 +34,16 @@ NEIGHBOURS = 256
 MAX_ERROR_RATIO = math.sqrt(2)
 """Largest error as metal, relative to that as a dielectric, of a region that may be metal. Under the blurred light of
 stage 2 the ratio is about 1 where there is metal, and 2 where there is none."""
+ROUGHNESSES = tuple(i / 10 for i in range(1, 10))
+"""Roughnesses that are tried for a region."""
+ALBEDO_DISTANCE = 0.2
+"""How far apart Gaussians count whose albedos differ by a factor of e [object radius]: one material has one colour
+more often than not, but print also lies on one material."""
+PRIOR = 0.1
+"""Weight of the whole object's error per pixel beside that of a region, whose own highlights may say nothing."""
+MIN_SPREAD = 0.08
+"""Standard deviation of the roughness over all pixels above which regions count as different. That of an object of one
+roughness is 0.03 to 0.06, since errors of light and shape differ from region to region."""
 ERROR_FLOOR = 0.005
 """Absolute error below which all residuals have the same weight [sRGB]."""
 
@@ -72,8 +84,7 @@ def fit(samples: Samples, n: int) -> SpecularFit:
     a limit of 0 would bias the scale downwards on dark texture.
     """
     x, s, y = samples.diffuse, samples.specular, samples.photo
-    # The derivative of sRGB's curve, finite at black.
-    sensitivity = 1.055 / 2.4 * y.clamp(0.004, 1) ** (1 / 2.4 - 1) * (y < CLIPPED)
+    sensitivity = _sensitivity(y)
     scale, of_lobe, weight, rest, lobe = y.new_zeros(()), y.new_zeros(n, 3), sensitivity.square(), y, s
 
     def sum_by_gaussian(values: Tensor) -> Tensor:
@@ -108,6 +119,69 @@ def metal_regions(fitted: SpecularFit, means: Float[Tensor, "n 3"]) -> Bool[Tens
     parts = [errors[near].sum(1) for near in neighbours(means, min(NEIGHBOURS, len(means)))]
     as_dielectric, as_metal = torch.cat(parts).unbind(-1)
     return as_metal < MAX_ERROR_RATIO * as_dielectric
+
+
+@torch.no_grad()
+def of_regions(
+    samples: Sequence[Samples], means: Float[Tensor, "n 3"], albedo: Float[Tensor, "n 3"], before: Float[Tensor, " n"]
+) -> Float[Tensor, " n"] | None:
+    """Roughness logits with the least absolute error of every region in sRGB, each Gaussian having its best albedo.
+
+    A region is made of the `NEIGHBOURS` nearest Gaussians of similar albedo. The mean over all pixels is kept.
+
+    Args:
+        samples: The same pixels with the lobes of each of `ROUGHNESSES`.
+        means: Centres of the Gaussians.
+        albedo: Their linear albedos.
+        before: Their roughness logits, which stay where no pixel shows a Gaussian.
+
+    Returns:
+        The logits; None if there are no pixels, or regions differ by no more than `MIN_SPREAD`.
+    """
+    errors = torch.stack([_least_error(x, len(means)) for x in samples])
+    pixels = torch.bincount(samples[0].gaussian, minlength=len(means)).to(errors)
+    seen = torch.where(pixels > 0)[0]
+    if not len(seen):
+        return None
+    of_object = errors.sum(1) / pixels.sum()
+    features = torch.cat([means, ALBEDO_DISTANCE * albedo.clamp_min(0.01).log()], -1)[seen]
+    own = errors[:, seen] + PRIOR * pixels[seen] * of_object[:, None]
+    of_region = torch.cat([own[:, near].sum(-1) for near in neighbours(features, min(NEIGHBOURS, len(seen)))], -1)
+    roughness, weight = _lowest(of_region), pixels[seen] / pixels.sum()
+    if (weight * (roughness - (weight * roughness).sum()).square()).sum().sqrt() < MIN_SPREAD:
+        return None
+    logits = TEMPERATURE * torch.logit(roughness)
+    return before.index_copy(0, seen, logits + (weight * (before[seen] - logits)).sum())
+
+
+def _least_error(samples: Samples, n: int) -> Float[Tensor, " n"]:
+    """Sum of the absolute errors of each Gaussian's pixels with its best albedo [sRGB]."""
+    x, y = samples.diffuse, samples.photo - samples.specular
+    sensitivity = _sensitivity(samples.photo)
+    weight, residual = sensitivity.square(), y
+
+    def sum_by_gaussian(values: Tensor) -> Tensor:
+        return values.new_zeros(n, 3).index_add_(0, samples.gaussian, values)
+
+    for _ in range(REWEIGHTINGS):
+        albedo = sum_by_gaussian(weight * x * y) / sum_by_gaussian(weight * x.square()).clamp_min(1e-9)
+        residual = ((y - albedo[samples.gaussian] * x) * sensitivity).abs()
+        weight = sensitivity.square() / (residual + ERROR_FLOOR)
+    return sum_by_gaussian(residual).sum(-1)
+
+
+def _lowest(errors: Float[Tensor, "r m"]) -> Float[Tensor, " m"]:
+    """Roughness at the lowest point of the parabola through the lowest error and its neighbours, of each column."""
+    middle = errors.argmin(0).clamp(1, len(errors) - 2)
+    low, mid, high = (errors.gather(0, (middle + i)[None])[0] for i in (-1, 0, 1))
+    offset = (0.5 * (low - high) / (low - 2 * mid + high).clamp_min(1e-12)).clamp(-1, 1)
+    first, second = ROUGHNESSES[:2]
+    return first + (middle + offset) * (second - first)
+
+
+def _sensitivity(photo: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
+    """The derivative of sRGB's curve, finite at black; 0 where the photo is clipped."""
+    return 1.055 / 2.4 * photo.clamp(0.004, 1) ** (1 / 2.4 - 1) * (photo < CLIPPED)
 
 
 @torch.no_grad()

@@ -23,7 +23,7 @@ def nearest(x: Float[Tensor, "a 3"], y: Float[Tensor, "b 3"]) -> Int64[Tensor, "
     return torch.cat([*indices, torch.zeros(0, dtype=torch.long, device=x.device)])
 
 
-def neighbours(x: Float[Tensor, "n 3"], k: int) -> Iterator[Int64[Tensor, "rows {k}"]]:
+def neighbours(x: Float[Tensor, "points d"], k: int) -> Iterator[Int64[Tensor, "rows {k}"]]:
     """Indices of the `k` points nearest to each point, itself among them, some rows at a time."""
     if x.device.type == "cpu":
         from scipy.spatial import KDTree
