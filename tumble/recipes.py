@@ -283,8 +283,7 @@ def recap(lights: int, recipe: Recipe) -> Recipe:
     As in ReCap opacity is a free parameter and there are no shadows and no indirect light.
     """
     recipe = no_specular_fit(no_sdf(static_colour(recipe)))
-    # The frames of a block are too few for a trial of the roughness of regions.
-    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False, region_trials=0)
+    base = replace(_decompose_of(recipe), visibility=False, bounce="none", corners=False)
     # The light of a block is trained in few of the steps.
     rates = replace(_faster(base.rates, light=4.0), poses=0.0)
     return replace(recipe, decompose=inverse_rendering.separate_lights.Config(replace(base, rates=rates), lights))

@@ -145,7 +145,7 @@ def test_lobes_are_fitted_to_the_radiance_inside_of_the_object_alone() -> None:
     painted = recoloured(inputs, torch.from_numpy(inner == 0), 20)
     painted = recoloured(painted, torch.from_numpy(inner > 0), 188)
     state = decompose.init(QUICK, painted, torch.Generator().manual_seed(0))
-    photo = decompose._samples(QUICK, painted, state, state.rng)[0].photo
+    photo = decompose._samples(QUICK, painted, state, state.rng, (0.5,))[0].photo
     assert len(photo) > 100
     linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
     torch.testing.assert_close(photo, torch.full_like(photo, linear), rtol=1e-4, atol=0)

@@ -36,7 +36,12 @@ def found_roughness(cfg: decompose.Config, asset: Asset, capture: Capture) -> Te
 
 QUICK = replace(
     DRAFT.decompose,
-    **{"try_matte": False, "region_trials": 0, "steps": 150, "warmup": 150, "pixels": 512, "sets": 2},
+    try_matte=False,
+    region_trials=0,
+    steps=150,
+    warmup=150,
+    pixels=512,
+    sets=2,
     rates=replace(DRAFT.decompose.rates, light=0.0),
 )
 
@@ -64,7 +69,6 @@ def test_trials_of_regions_tell_the_roughnesses_of_parts_apart() -> None:
     for trials in (0, 2):
         found = found_roughness(replace(QUICK, region_trials=trials), asset, capture)
         contrast[trials] = float(found[~is_glossy].mean() - found[is_glossy].mean())
-    print(contrast)
     assert contrast[2] > contrast[0] + 0.1, contrast
 
 

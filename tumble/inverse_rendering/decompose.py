@@ -231,7 +231,7 @@ def choose_start(cfg: Config, inputs: Inputs, state: State) -> State:
     """
     params, coarse = state.params, _coarse(cfg, inputs)
     before = params.log_specular_scale.detach().exp()
-    samples = _samples(cfg, inputs, state, state.rng)[0]
+    samples = _samples(cfg, inputs, state, state.rng, (cfg.roughness,))[0]
     fitted = specular_fit.fit(samples, len(params.gaussians.means))
     scale = min(fitted.specular_scale, max(1.0, float(before.mean())))
     glossy = with_lobe(params, (before - scale) * fitted.albedo_per_scale, math.log(scale))
@@ -283,10 +283,9 @@ def _trial(cfg: Config, inputs: Inputs, before: State, start: Params) -> tuple[S
 
 @torch.no_grad()
 def _samples(
-    cfg: Config, inputs: Inputs, state: State, rng: torch.Generator, roughnesses: tuple[float, ...] = ()
+    cfg: Config, inputs: Inputs, state: State, rng: torch.Generator, roughnesses: tuple[float, ...]
 ) -> list[specular_fit.Samples]:
-    """Pixels of the object in several frames with both lobes under the current light, for each of some roughnesses, or
-    for the first one of stage 3."""
+    """Pixels of the object in several frames with both lobes under the current light, for each of the roughnesses."""
     params, capture, parts = state.params, inputs.capture, []
     n = pixels_per_step(cfg.pixels, cfg.side, capture.camera)
     bounce, light = _bounce(cfg, state, params, corner_features(params.material)[1]), prefilter(params.environment)
@@ -300,13 +299,12 @@ def _samples(
         gaussian, photo = _dominant_gaussian(view, points), linear_from_srgb(points.sample(truth.image))
         visible = _pixel_visibility(cfg, state, params, points, gaussian)
         lit = (light, inputs.refined.trajectory.R_env_obj_at(frame, T_cam_obj), visible)
-        for roughness in roughnesses or (cfg.roughness,):
-            rough = torch.full_like(points.normals[:, :1], roughness)
-            lobes = split_lobes(points, rough, *lit, bounce=bounce)
-            parts.append((gaussian, lobes.diffuse, DIELECTRIC * lobes.specular, photo))
-    step = len(roughnesses) or 1
-    by_roughness = (zip(*parts[i::step], strict=True) for i in range(step))
-    return [specular_fit.Samples(*(torch.cat(x) for x in part)) for part in by_roughness]
+        rough = (torch.full_like(points.normals[:, :1], x) for x in roughnesses)
+        lobes = [split_lobes(points, x, *lit, bounce=bounce) for x in rough]
+        specular = DIELECTRIC * torch.stack([x.specular for x in lobes], 1)
+        parts.append((gaussian, lobes[0].diffuse, specular, photo))
+    gaussian, diffuse, specular, photo = (torch.cat(x) for x in zip(*parts, strict=True))
+    return [specular_fit.Samples(gaussian, diffuse, x, photo) for x in specular.unbind(1)]
 
 
 @torch.no_grad()
@@ -327,7 +325,7 @@ def _find_regions(cfg: Config, inputs: Inputs, state: State) -> None:
     before = material.roughness_logits.mean(1)
     logits = specular_fit.of_regions(samples, params.gaussians.means, material.albedo.mean(1), before)
     if logits is not None:
-        material.roughness_logits.copy_(logits[:, None].expand_as(material.roughness_logits))
+        material.roughness_logits.copy_(logits[:, None])
 
 
 def _learns_network(cfg: Config) -> bool:

@@ -88,7 +88,7 @@ def fit(samples: Samples, n: int) -> SpecularFit:
     scale, of_lobe, weight, rest, lobe = y.new_zeros(()), y.new_zeros(n, 3), sensitivity.square(), y, s
 
     def sum_by_gaussian(values: Tensor) -> Tensor:
-        return values.new_zeros(n, 3).index_add_(0, samples.gaussian, values)
+        return _sums(samples.gaussian, values, n)
 
     for _ in range(REWEIGHTINGS):
         energy = sum_by_gaussian(weight * x.square()).clamp_min(1e-9)
@@ -97,14 +97,9 @@ def fit(samples: Samples, n: int) -> SpecularFit:
         rest, lobe = (z - albedo[samples.gaussian] * x for z, albedo in ((y, of_photo), (s, of_lobe)))
         scale = (weight * lobe * rest).sum() / (weight * lobe.square()).sum().clamp_min(1e-12)
         weight = sensitivity.square() / ((rest - scale * lobe).mul(sensitivity).abs() + ERROR_FLOOR)
-    as_dielectric = ((rest - scale * lobe) * sensitivity).abs()
-    as_metal, weight = as_dielectric, sensitivity.square()
-    for _ in range(REWEIGHTINGS):
-        colour = sum_by_gaussian(weight * s * y) / sum_by_gaussian(weight * s.square()).clamp_min(1e-9)
-        as_metal = ((y - colour[samples.gaussian] * s) * sensitivity).abs()
-        weight = sensitivity.square() / (as_metal + ERROR_FLOOR)
-    errors = (sum_by_gaussian(x).sum(-1) for x in (as_dielectric, as_metal))
-    return SpecularFit(max(float(scale), MIN_SCALE), of_lobe, *errors)
+    as_dielectric = sum_by_gaussian(((rest - scale * lobe) * sensitivity).abs()).sum(-1)
+    as_metal = _least_error(samples.gaussian, s, y, sensitivity, n)
+    return SpecularFit(max(float(scale), MIN_SCALE), of_lobe, as_dielectric, as_metal)
 
 
 @torch.no_grad()
@@ -138,8 +133,10 @@ def of_regions(
     Returns:
         The logits; None if there are no pixels, or regions differ by no more than `MIN_SPREAD`.
     """
-    errors = torch.stack([_least_error(x, len(means)) for x in samples])
-    pixels = torch.bincount(samples[0].gaussian, minlength=len(means)).to(errors)
+    gaussian, sensitivity = samples[0].gaussian, _sensitivity(samples[0].photo)
+    without_lobes = ((x.diffuse, x.photo - x.specular) for x in samples)
+    errors = torch.stack([_least_error(gaussian, *lit, sensitivity, len(means)) for lit in without_lobes])
+    pixels = torch.bincount(gaussian, minlength=len(means)).to(errors)
     seen = torch.where(pixels > 0)[0]
     if not len(seen):
         return None
@@ -154,20 +151,26 @@ def of_regions(
     return before.index_copy(0, seen, logits + (weight * (before[seen] - logits)).sum())
 
 
-def _least_error(samples: Samples, n: int) -> Float[Tensor, " n"]:
-    """Sum of the absolute errors of each Gaussian's pixels with its best albedo [sRGB]."""
-    x, y = samples.diffuse, samples.photo - samples.specular
-    sensitivity = _sensitivity(samples.photo)
-    weight, residual = sensitivity.square(), y
-
-    def sum_by_gaussian(values: Tensor) -> Tensor:
-        return values.new_zeros(n, 3).index_add_(0, samples.gaussian, values)
-
+def _least_error(
+    gaussian: Int64[Tensor, " p"],
+    lobe: Float[Tensor, "p 3"],
+    radiance: Float[Tensor, "p 3"],
+    sensitivity: Float[Tensor, "p 3"],
+    n: int,
+) -> Float[Tensor, " n"]:
+    """Sum of the absolute errors of each Gaussian's pixels with a lobe in its best colour [sRGB]."""
+    weight, residual = sensitivity.square(), radiance
     for _ in range(REWEIGHTINGS):
-        albedo = sum_by_gaussian(weight * x * y) / sum_by_gaussian(weight * x.square()).clamp_min(1e-9)
-        residual = ((y - albedo[samples.gaussian] * x) * sensitivity).abs()
+        energy = _sums(gaussian, weight * lobe.square(), n).clamp_min(1e-9)
+        colour = _sums(gaussian, weight * lobe * radiance, n) / energy
+        residual = ((radiance - colour[gaussian] * lobe) * sensitivity).abs()
         weight = sensitivity.square() / (residual + ERROR_FLOOR)
-    return sum_by_gaussian(residual).sum(-1)
+    return _sums(gaussian, residual, n).sum(-1)
+
+
+def _sums(gaussian: Int64[Tensor, " p"], values: Float[Tensor, "p 3"], n: int) -> Float[Tensor, "n 3"]:
+    """Sums of the values of each Gaussian's pixels."""
+    return values.new_zeros(n, 3).index_add_(0, gaussian, values)
 
 
 def _lowest(errors: Float[Tensor, "r m"]) -> Float[Tensor, " m"]:
