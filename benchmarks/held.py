@@ -1,14 +1,17 @@
-"""Masks and poses of synthetic films in which a hand holds the object, against the truth.
+"""Masks, poses and assets of synthetic films in which a hand holds the object, against the truth.
 
-`python -m benchmarks.held CAPTURE... [--until masks|poses] [--draw FOLDER]` takes captures of `tumble synth --hand
---film`, reads their film as `tumble run` does, with the box and the focal length of `film.json`, and writes
-`benchmarks/held.json` and the table `benchmarks/held.md`. Truth is used for the scores only. Masks are scored where the
-truth is certain: a pixel is object or hand if nine tenths of it are.
+`python -m benchmarks.held CAPTURE... [--until masks|poses|asset] [--draw FOLDER] [--runs FOLDER]` takes captures of
+`tumble synth --film`, with `--hand` and without it (the twin), reads their film as `tumble run` does, with the box and
+the focal length of `film.json`, and writes `benchmarks/held.json` and the table `benchmarks/held.md`. Truth is used for
+the scores only. Masks are scored where the truth is certain: a pixel is object or hand if nine tenths of it are.
+With `--until asset` poses are those of `tumble run`, and its asset is scored by `tumble evaluate`.
 """
 
 import argparse
 import json
 import math
+import subprocess
+import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +25,9 @@ import tumble
 from benchmarks.kernels import machine
 from benchmarks.poses import line, pose_scores
 from tumble.bench import current_code
+from tumble.engine import run as runs
 from tumble.io import files
+from tumble.poses import PoseResult
 from tumble.preprocess import FootageOptions, Survey, survey_footage
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Trajectory
 
@@ -44,6 +49,9 @@ SCORES = {
     "claimed_degrees": "estimated [deg]",
     "verdict": "rating",
     "pose_seconds": "poses [s]",
+    "albedo.psnr_fg_srgb": "albedo fg [dB]",
+    "normal.mean_fg_degrees": "normal [deg]",
+    "silhouette.iou": "shape, IoU",
     "code": "code",
 }
 """Column titles by the key of a row."""
@@ -52,13 +60,14 @@ SCORES = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, nargs="+")
-    parser.add_argument("--until", choices=["masks", "poses"], default="poses")
+    parser.add_argument("--until", choices=["masks", "poses", "asset"], default="poses")
     parser.add_argument("--draw", type=Path, help="folder of the contact sheets of the masks")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the runs of --until asset")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     arguments = parser.parse_args()
     rows: list[Row] = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
     for path in arguments.captures:
-        row = measure(path, arguments.until, arguments.draw)
+        row = measure(path, arguments.until, arguments.draw, arguments.runs / path.name)
         rows = [each for each in rows if each["name"] != row["name"]] + [row]
         print(line(["name", *SCORES], row), flush=True)
         files.write_json(arguments.out, {"command": COMMAND, "machine": machine(), "rows": rows})
@@ -79,12 +88,14 @@ def report(rows: list[Row]) -> str:
         "frame. Known to the program: the box of `film.json` on the first frame, and the focal length. Overlap "
         '(IoU) leaves out unknown pixels; "hand in the mask" is the fraction of the mask\'s pixels, '
         '"object unknown" that of the true object\'s. Rotation errors are of the frames with a pose; rows without them '
-        "were run with `--until masks`. Time on one thread of a 2-core x86_64 CPU shared with other work.\n"
+        "were run with `--until masks`, rows with scores of the asset with `--until asset`. Rows of a twin are of the "
+        "same object, motion, light and background without the hand. Time on one thread of a 2-core x86_64 CPU shared "
+        "with other work.\n"
     )
     return text + "\n" + "\n".join(lines) + "\n"
 
 
-def measure(path: Path, until: str, draw: Path | None) -> Row:
+def measure(path: Path, until: str, draw: Path | None, run: Path) -> Row:
     """A row of figures for a capture with a film."""
     film = json.loads((path / "film.json").read_text())
     options = FootageOptions(box=tuple(film["box"]), at=film["frame"], focal=film["focal"])
@@ -95,27 +106,48 @@ def measure(path: Path, until: str, draw: Path | None) -> Row:
     if draw:
         draw.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(draw / f"{path.name}.png"), contact_sheet(survey, path)[..., ::-1])
-    return row if until == "masks" else row | poses(path, options)
+    if until == "masks":
+        return row
+    return row | (poses(path, options) if until == "poses" else asset(path, options, run))
 
 
 def poses(path: Path, options: FootageOptions) -> Row:
     """Scores of the poses of the capture made from the film."""
     with TemporaryDirectory() as folder:
-        capture = tumble.read_capture(tumble.video_to_capture(path / "film.mp4", Path(folder) / "capture", options))
-        numbers = json.loads((Path(folder) / "capture" / "ingest.json").read_text())["frames"]
-    started = time.perf_counter()
-    result = tumble.estimate_poses(capture)
-    truth = true_trajectory(path, [each["source_frame"] for each in numbers])
+        capture = tumble.video_to_capture(path / "film.mp4", Path(folder) / "capture", options)
+        started = time.perf_counter()
+        result = tumble.estimate_poses(tumble.read_capture(capture))
+        seconds = round(time.perf_counter() - started)
+        return {**scores_of_poses(path, capture, result), "pose_seconds": seconds}
+
+
+def asset(path: Path, options: FootageOptions, run: Path) -> Row:
+    """Scores of the poses and of the asset of `tumble run`."""
+    given = ["--box", *options.box, "--at", options.at, "--focal", options.focal] if options.box else []
+    for words in (["run", path / "film.mp4", *given, "-o", run], ["evaluate", run, path]):
+        subprocess.run([sys.executable, "-m", "tumble", *map(str, words)], check=True)
+    result = runs.output(run, runs.TRACK, PoseResult)
+    assert result is not None, "the run has estimated poses"
+    scores = files.read_json(run / "report.json")["regions"]["shared"]
+    return {
+        **scores_of_poses(path, run / "capture", result),
+        **{name: round(scores[name], 3) for name in SCORES if name in scores},
+    }
+
+
+def scores_of_poses(path: Path, capture: Path, result: PoseResult) -> Row:
+    """Scores of poses of a capture that was made from the film."""
+    numbers = [each["source_frame"] for each in files.read_json(capture / "ingest.json")["frames"]]
+    truth = true_trajectory(path, numbers)
     kept = (~result.quality.lost).nonzero()[:, 0]
     scores = pose_scores(result.trajectory.select(kept), truth.select(kept)) if len(kept) > 2 else {}
     return {
-        "frames": len(capture),
-        "posed_percent": round(100 * len(kept) / len(capture)),
+        "frames": len(numbers),
+        "posed_percent": round(100 * len(kept) / len(numbers)),
         **{name: round(value, 2) for name, value in scores.items()},
         "claimed_degrees": round(math.degrees(result.quality.uncertainty), 2),
         "verdict": result.quality.rating,
         "sentence": result.quality.sentence,
-        "pose_seconds": round(time.perf_counter() - started),
     }
 
 

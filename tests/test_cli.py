@@ -11,7 +11,7 @@ import torch
 import tumble
 from tests.films import scene, written
 from tests.test_interrupt import capture, whole  # noqa: F401 (fixtures)
-from tumble import actions, cli, pipeline
+from tumble import __main__, actions, cli, pipeline
 from tumble.preprocess.options import FRAMES_AND_SIZE, FootageOptions
 from tumble.recipes import DRAFT, PAPER, QUICK_TRACK, Recipe
 from tumble.scene.environment import Environment
@@ -36,6 +36,23 @@ def test_every_command_explains_itself(
 ) -> None:
     assert run(monkeypatch, command, "--help") == 0
     assert f"tumble {command}" in capsys.readouterr().out
+
+
+def test_ctrl_c_while_the_command_line_is_imported_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Interrupted:
+        @staticmethod
+        def find_spec(name: str, path: object = None, target: object = None) -> None:
+            if name == "tumble.cli":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "tumble.cli")
+    monkeypatch.setattr(sys, "meta_path", [Interrupted, *sys.meta_path])
+    with pytest.raises(SystemExit) as end:
+        __main__.main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "tumble: interrupted; repeat the command\n"
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
