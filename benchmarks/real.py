@@ -115,9 +115,11 @@ def main() -> None:
     target = Path(__file__).with_suffix(".json")
     rows: list[Row] = json.loads(target.read_text())["rows"] if target.exists() else []
     for name, path in (each.split("=", 1) for each in arguments.inputs):
+        # First, as a scan that cannot be read would end the benchmark after the run.
+        rendered = render_scan(Path(scans[name]), arguments.out / f"{name}-scan") if name in scans else None
         row = measure(name, Path(path), arguments.out / name)
-        if name in scans and "frames" in row:
-            row |= compare(name, Path(path), arguments.out / name, Path(scans[name]))
+        if rendered is not None and "frames" in row:
+            row |= compare(name, Path(path), arguments.out / name, rendered)
         rows = [each for each in rows if each["name"] != name] + [row]
         print(line([*TITLES], row), flush=True)
         files.write_json(target, {"command": COMMAND, "machine": machine(), "rows": rows})
@@ -223,11 +225,15 @@ def shrunk(pixels: np.ndarray) -> np.ndarray:
 # Comparison with a scan -----------------------------------------------------------------------------------------------
 
 
-def compare(name: str, film: Path, run: Path, scan: Path) -> Row:
-    """Errors of the poses and of the surface against a scan of the object."""
-    rendered = run.parent / f"{name}-scan"
+def render_scan(scan: Path, out: Path) -> Path:
+    """A capture folder with the scan from all directions."""
     options = SynthOptions(env="white", views=2, eval_shared=0, eval_sphere=VIEWS, resolution=VIEW, samples=1)
-    reader = reader_for(render_capture(scan, rendered, options))
+    return render_capture(scan, out, options)
+
+
+def compare(name: str, film: Path, run: Path, rendered: Path) -> Row:
+    """Errors of the poses and of the surface against a scan of the object (`render_scan`)."""
+    reader = reader_for(rendered)
     views = rendered_features(reader.load_truth(rendered), reader.load(rendered).camera)
     numbers = {
         each["name"]: each["source_frame"] for each in files.read_json(run / "capture" / "ingest.json")["frames"]
