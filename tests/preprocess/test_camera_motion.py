@@ -1,5 +1,7 @@
 """The motion of the camera is that of the background, whatever the object does."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -28,3 +30,16 @@ def test_an_object_that_rotates_over_black_does_not_count_as_camera_motion() -> 
     # Where the mask is lost on some frames, the object is not covered.
     covered[[4, 11]] = False
     assert background_shift(pictures, fill_unknown(background, estimate_background(pictures)), covered).max() == 0
+
+
+def test_what_moves_before_a_plain_wall_does_not_count_as_camera_motion() -> None:
+    """The background of a place that is always covered is unknown, and its border is the only edge of the wall."""
+    texture = np.random.default_rng(0).integers(0, 256, (12, 12, 3), np.uint8)
+    texture = cv2.resize(texture, (120, 120), interpolation=cv2.INTER_CUBIC)
+    pictures = np.full((8, 100, 140, 3), 190, np.uint8)
+    for i, picture in enumerate(pictures):
+        picture[30:80, 40:100] = texture[5 * i : 5 * i + 50, 5 * i : 5 * i + 60]
+    covered = np.zeros(pictures.shape[:3], bool)
+    covered[:, 30:80, 40:100] = True
+    reference = replace(estimate_background(pictures), known=~covered[0])
+    assert background_shift(pictures, reference, covered).max() == 0

@@ -13,6 +13,8 @@ N_MOTION_SAMPLES = 12
 """Number of frames on which the motion of the camera is measured."""
 MIN_GRADIENT = 16
 """Minimum Sobel gradient of a pixel whose optical flow is used: 2 code values per pixel."""
+FLOW_PATCH = 8
+"""Side of the patches that the optical flow compares [pixels]; those of usable pixels show nothing but background."""
 MIN_USABLE_FRACTION = 0.01
 """Minimum fraction of usable pixels of an image; with fewer, its shift is not estimated."""
 
@@ -36,7 +38,8 @@ def background_shift(
     """Displacement of the background per frame, as a fraction of the longer side; 0 if there is too little texture.
 
     The median length of the optical flow over textured background. Pixels that the object covers in some frame count
-    only where the background is known, because elsewhere the reference may show the object itself.
+    only where the background is known, because elsewhere the reference may show the object itself. Before a plain wall
+    the edges of such places were most of the texture, and a still camera seemed to move.
 
     Args:
         reference: The background from which the shift is measured.
@@ -46,11 +49,16 @@ def background_shift(
     gray = cv2.cvtColor(reference.image, cv2.COLOR_RGB2GRAY)
     textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > MIN_GRADIENT
     object_path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
-    textured &= reference.known | ~object_path
+    textured &= ~_near(object_path & ~reference.known)
     shift = np.zeros(len(images), np.float32)
     for i, image in enumerate(images):
-        keep = textured & ~covered[i]
+        keep = textured & ~_near(covered[i])
         if keep.mean() >= MIN_USABLE_FRACTION:
             flow = dis.calc(gray, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.zeros((*gray.shape, 2), np.float32))
             shift[i] = np.median(np.linalg.norm(flow[keep], axis=-1)) / max(gray.shape)
     return shift
+
+
+def _near(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose patch, which the optical flow compares, contains pixels of a mask."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * FLOW_PATCH + 1,) * 2)) > 0
