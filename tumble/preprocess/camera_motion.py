@@ -1,5 +1,7 @@
 """Whether the camera moved, from the optical flow of the background."""
 
+import math
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -24,18 +26,22 @@ def camera_motion(
 ) -> float:
     """Upper quartile over frames of the motion of the background, as a fraction of the image's longer side.
 
+    Not a number if the background has too little texture in all of them.
+
     Args:
         background: The background from which it is measured.
         labels: Masks of the frames.
     """
     samples = np.unique(np.linspace(0, len(images) - 1, N_MOTION_SAMPLES).round().astype(int))
-    return float(np.percentile(background_shift(images[samples], background, labels[samples] != BACKGROUND), 75))
+    shift = background_shift(images[samples], background, labels[samples] != BACKGROUND)
+    measured = shift[~np.isnan(shift)]
+    return float(np.percentile(measured, 75)) if len(measured) else math.nan
 
 
 def background_shift(
     images: UInt8[np.ndarray, "t h w 3"], reference: Background, covered: Bool[np.ndarray, "t h w"]
 ) -> Float32[np.ndarray, " t"]:
-    """Displacement of the background per frame, as a fraction of the longer side; 0 if there is too little texture.
+    """Displacement of the background per frame, as a fraction of the longer side; not a number without texture.
 
     The median length of the optical flow over textured background. Pixels that the object covers in some frame count
     only where the background is known, because elsewhere the reference may show the object itself. Before a plain wall
@@ -50,7 +56,7 @@ def background_shift(
     textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > MIN_GRADIENT
     object_path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
     textured &= ~_near(object_path & ~reference.known)
-    shift = np.zeros(len(images), np.float32)
+    shift = np.full(len(images), np.nan, np.float32)
     for i, image in enumerate(images):
         keep = textured & ~_near(covered[i])
         if keep.mean() >= MIN_USABLE_FRACTION:

@@ -161,6 +161,8 @@ def _inputs(survey: Survey) -> Finding:
 
 
 def _camera(survey: Survey) -> Finding:
+    if math.isnan(survey.camera_motion):
+        return _finding("camera", "good", "the background is too plain to see whether the camera moves", "")
     state = f"the background moves by {100 * survey.camera_motion:.1f} % of the image"
     rating = _rate(survey.camera_motion, CAMERA_MOTION)
     if survey.still_camera or rating == "good":

@@ -87,7 +87,7 @@ class Survey:
     still_camera: bool
     """Whether the masks suppose that the camera stood still; those that were given, and SAM's, do not."""
     camera_motion: float
-    """Motion of the background [longer side of the image]."""
+    """Motion of the background, not a number if that is too plain to show any [longer side of the image]."""
     rotation: Float64[np.ndarray, " t"]
     """Angle by which the object has rotated since the first frame, summed along the path [radians]."""
 
