@@ -17,6 +17,9 @@ MIN_GRADIENT = 16
 """Minimum Sobel gradient of a pixel whose optical flow is used: 2 code values per pixel."""
 FLOW_PATCH = 8
 """Side of the patches that the optical flow compares [pixels]; those of usable pixels show nothing but background."""
+MIN_STATIC_FRACTION = 0.5
+"""Fraction of the image with a known background from which it is static, though too plain to measure its motion: before
+a plain wall 0.9 is known, for a camera on a head 0.3 to 0.4."""
 MIN_USABLE_FRACTION = 0.01
 """Minimum fraction of usable pixels of an image; with fewer, its shift is not estimated."""
 
@@ -41,11 +44,12 @@ def camera_motion(
 def background_shift(
     images: UInt8[np.ndarray, "t h w 3"], reference: Background, covered: Bool[np.ndarray, "t h w"]
 ) -> Float32[np.ndarray, " t"]:
-    """Displacement of the background per frame, as a fraction of the longer side; not a number without texture.
+    """Displacement of the background per frame, as a fraction of the longer side; not a number if it is too plain.
 
     The median length of the optical flow over textured background. Pixels that the object covers in some frame count
-    only where the background is known, because elsewhere the reference may show the object itself. Before a plain wall
-    the edges of such places were most of the texture, and a still camera seemed to move.
+    only where the background is known, because elsewhere the reference may show the object itself, and away from such
+    places: before a plain wall their edges were most of the texture, and a still camera seemed to move. Only where
+    nothing else tells of a background that is not static do pixels beside them count.
 
     Args:
         reference: The background from which the shift is measured.
@@ -55,10 +59,12 @@ def background_shift(
     gray = cv2.cvtColor(reference.image, cv2.COLOR_RGB2GRAY)
     textured = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) > MIN_GRADIENT
     object_path = cv2.dilate(np.asarray(covered.any(0), np.uint8), np.ones((5, 5))) > 0
-    textured &= ~_near(object_path & ~reference.known)
+    doubtful, is_static = object_path & ~reference.known, reference.known.mean() >= MIN_STATIC_FRACTION
     shift = np.full(len(images), np.nan, np.float32)
     for i, image in enumerate(images):
-        keep = textured & ~_near(covered[i])
+        keep = textured & ~_near(doubtful | covered[i])
+        if keep.mean() < MIN_USABLE_FRACTION and not is_static:
+            keep = textured & ~doubtful & ~covered[i]
         if keep.mean() >= MIN_USABLE_FRACTION:
             flow = dis.calc(gray, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.zeros((*gray.shape, 2), np.float32))
             shift[i] = np.median(np.linalg.norm(flow[keep], axis=-1)) / max(gray.shape)
