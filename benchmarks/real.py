@@ -67,6 +67,7 @@ INPUTS = {
     "GSF12": Input("HO-3D, scissors, 108 frames", "--box 240 214 122 262 --focal 617", 617),
     "cube": Input("ViSP, cube_video.mp4, 989 frames", "--part 0 599 --box 390 155 222 222 --at 300 --focal 605", 605),
     "box": Input("OpenCV, box.mp4, 455 frames", "--box 292 16 308 225"),
+    "cup": Input("OpenCV, cup.mp4, 217 frames", "--box 300 118 122 272"),
     "dtu": Input("DTU scan 65 in the layout of NeuS: a skull, 49 photographs from a dome, their masks and poses", ""),
     "dinosaur": Input("Oxford dinosaur, turntable, 36 photographs as a film", "--box 80 8 372 468 --focal 3217"),
 }
