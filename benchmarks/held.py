@@ -25,9 +25,8 @@ import tumble
 from benchmarks.kernels import machine
 from benchmarks.poses import line, pose_scores
 from tumble.bench import current_code
-from tumble.engine import run as runs
 from tumble.io import files
-from tumble.poses import PoseResult
+from tumble.poses import PoseResult, mask_refinement
 from tumble.preprocess import FootageOptions, Survey, survey_footage
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Trajectory
 
@@ -123,10 +122,11 @@ def poses(path: Path, options: FootageOptions) -> Row:
 
 def asset(path: Path, options: FootageOptions, run: Path) -> Row:
     """Scores of the poses and of the asset of `tumble run`."""
-    given = ["--box", *options.box, "--at", options.at, "--focal", options.focal] if options.box else []
+    assert options.box is not None, "film.json has it"
+    given = ["--box", *options.box, "--at", options.at, "--focal", options.focal]
     for words in (["run", path / "film.mp4", *given, "-o", run], ["evaluate", run, path]):
         subprocess.run([sys.executable, "-m", "tumble", *map(str, words)], check=True)
-    result = runs.output(run, runs.TRACK, PoseResult)
+    result, _ = mask_refinement.stored_result(run, tumble.read_capture(run / "capture"))
     assert result is not None, "the run has estimated poses"
     scores = files.read_json(run / "report.json")["regions"]["shared"]
     return {

@@ -28,7 +28,7 @@ from tumble.actions import GLB_SCORES
 from tumble.datasets import folder
 from tumble.engine import run as runs
 from tumble.io import files
-from tumble.poses import PoseResult
+from tumble.poses import mask_refinement
 from tumble.preprocess import FootageOptions
 from tumble.scene import OBJECT
 from tumble.synthetic import SynthOptions, render_capture
@@ -132,7 +132,9 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
         "run_seconds": reconstruction["seconds"],
         "run_memory_MiB": reconstruction["memory_MiB"],
     }
-    tracked = runs.output(run, runs.TRACK, PoseResult)
+    tracked = None
+    if (run / "capture").exists():
+        tracked, _ = mask_refinement.stored_result(run, folder.load(run / "capture"))
     if tracked is not None:
         row |= {"verdict": tracked.quality.rating, "verdict_sentence": tracked.quality.sentence}
     if reconstruction["exit"] != 0:
