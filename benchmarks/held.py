@@ -25,6 +25,7 @@ import tumble
 from benchmarks.kernels import machine
 from benchmarks.poses import line, pose_scores
 from tumble.bench import current_code
+from tumble.engine import run as runs
 from tumble.io import files
 from tumble.poses import PoseResult, mask_refinement
 from tumble.preprocess import FootageOptions, Survey, survey_footage
@@ -113,11 +114,12 @@ def measure(path: Path, until: str, draw: Path | None, run: Path) -> Row:
 def poses(path: Path, options: FootageOptions) -> Row:
     """Scores of the poses of the capture made from the film."""
     with TemporaryDirectory() as folder:
-        capture = tumble.video_to_capture(path / "film.mp4", Path(folder) / "capture", options)
+        made = tumble.video_to_capture(path / "film.mp4", Path(folder) / "capture", options)
+        capture = tumble.read_capture(made)
         started = time.perf_counter()
-        result = tumble.estimate_poses(tumble.read_capture(capture))
+        result = tumble.estimate_poses(capture)
         seconds = round(time.perf_counter() - started)
-        return {**scores_of_poses(path, capture, result), "pose_seconds": seconds}
+        return {**scores_of_poses(path, made, result), "pose_seconds": seconds}
 
 
 def asset(path: Path, options: FootageOptions, run: Path) -> Row:
@@ -126,11 +128,12 @@ def asset(path: Path, options: FootageOptions, run: Path) -> Row:
     given = ["--box", *options.box, "--at", options.at, "--focal", options.focal]
     for words in (["run", path / "film.mp4", *given, "-o", run], ["evaluate", run, path]):
         subprocess.run([sys.executable, "-m", "tumble", *map(str, words)], check=True)
-    result, _ = mask_refinement.stored_result(run, tumble.read_capture(run / "capture"))
+    made = run / runs.CAPTURE
+    result, _ = mask_refinement.stored_result(run, tumble.read_capture(made))
     assert result is not None, "the run has estimated poses"
     scores = files.read_json(run / "report.json")["regions"]["shared"]
     return {
-        **scores_of_poses(path, run / "capture", result),
+        **scores_of_poses(path, made, result),
         **{name: round(scores[name], 3) for name in SCORES if name in scores},
     }
 

@@ -132,11 +132,10 @@ def measure(model: str, capture: Path, run: Path, quality: str) -> Row:
         "run_seconds": reconstruction["seconds"],
         "run_memory_MiB": reconstruction["memory_MiB"],
     }
-    tracked = None
-    if (run / "capture").exists():
-        tracked, _ = mask_refinement.stored_result(run, folder.load(run / "capture"))
-    if tracked is not None:
-        row |= {"verdict": tracked.quality.rating, "verdict_sentence": tracked.quality.sentence}
+    if (run / runs.CAPTURE).exists():  # not if the clip was refused
+        tracked, _ = mask_refinement.stored_result(run, folder.load(run / runs.CAPTURE))
+        if tracked is not None:
+            row |= {"verdict": tracked.quality.rating, "verdict_sentence": tracked.quality.sentence}
     if reconstruction["exit"] != 0:
         row["said"] = reconstruction["said"].replace(str(run), "RUN")
     else:

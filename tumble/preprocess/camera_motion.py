@@ -18,8 +18,8 @@ MIN_GRADIENT = 16
 FLOW_PATCH = 8
 """Side of the patches that the optical flow compares [pixels]; those of usable pixels show nothing but background."""
 MIN_STATIC_FRACTION = 0.5
-"""Fraction of the image with a known background from which it is static, though too plain to measure its motion: before
-a plain wall 0.9 is known, for a camera on a head 0.3 to 0.4."""
+"""Fraction of the image with a known background from which that counts as static, even if too plain to measure its
+motion."""
 MIN_USABLE_FRACTION = 0.01
 """Minimum fraction of usable pixels of an image; with fewer, its shift is not estimated."""
 
@@ -47,9 +47,9 @@ def background_shift(
     """Displacement of the background per frame, as a fraction of the longer side; not a number if it is too plain.
 
     The median length of the optical flow over textured background. Pixels that the object covers in some frame count
-    only where the background is known, because elsewhere the reference may show the object itself, and away from such
-    places: before a plain wall their edges were most of the texture, and a still camera seemed to move. Only where
-    nothing else tells of a background that is not static do pixels beside them count.
+    only where the background is known, because elsewhere the reference may show the object itself. Nor do pixels beside
+    unknown or covered ones: before a plain wall these edges are most of the texture, and a still camera seems to move.
+    If they leave too few and the background is not static either, as with a camera on a head, those pixels count.
 
     Args:
         reference: The background from which the shift is measured.
