@@ -93,7 +93,8 @@ class Tracking:
     Default: graph; progressive with quality paper."""
     matcher: str = "mixed"
     """Finds corresponding pixels in two frames.
-    mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations.
+    mixed: SIFT keypoints and dense optical flow; sift, dis: either alone. aliked: a network, for wide rotations;
+    aliked_turned: the same, also for large ones in the image plane.
     xfeat, gmflow: networks that `tumble weights` downloads. roma, mast3r: packages that you install."""
 
 

@@ -17,6 +17,7 @@ from tumble.io import weights, write_tensors
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin
 from tumble.matching import _aliked, _gmflow, _lightglue, _window, aliked, match_pairs, xfeat
+from tumble.matching._lightglue import Keypoints
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.scene.match import Match, View
 
@@ -410,26 +411,29 @@ def test_lightglue_is_independent_of_order_and_origin() -> None:
     rng = torch.Generator().manual_seed(2)
     at_i, at_j = torch.rand(9, 2, generator=rng), torch.rand(7, 2, generator=rng)
     d_i, d_j = torch.randn(9, 8, generator=rng), torch.randn(7, 8, generator=rng)
-    p = glue_weights()
-    probability = _lightglue.assignment(at_i, at_j, d_i, d_j, p)
+    i, j, p = Keypoints(at_i, d_i), Keypoints(at_j, d_j), glue_weights()
+    probability = _lightglue.assignment(i, j, p)
     order = torch.randperm(9, generator=rng)
-    shuffled = _lightglue.assignment(at_i[order], at_j, d_i[order], d_j, p)
+    shuffled = _lightglue.assignment(Keypoints(at_i[order], d_i[order]), j, p)
     torch.testing.assert_close(shuffled, probability[order], atol=1e-6, rtol=1e-4)
-    torch.testing.assert_close(_lightglue.assignment(at_j, at_i, d_j, d_i, p), probability.T, atol=1e-6, rtol=1e-4)
-    torch.testing.assert_close(_lightglue.assignment(at_i + 0.7, at_j, d_i, d_j, p), probability, atol=1e-6, rtol=1e-3)
-    assert not torch.allclose(_lightglue.assignment(at_i * 2, at_j, d_i, d_j, p), probability, atol=1e-6)
+    torch.testing.assert_close(_lightglue.assignment(j, i, p), probability.T, atol=1e-6, rtol=1e-4)
+    shifted, larger = (_lightglue.assignment(Keypoints(at, d_i), j, p) for at in (at_i + 0.7, at_i * 2))
+    torch.testing.assert_close(shifted, probability, atol=1e-6, rtol=1e-3)
+    assert not torch.allclose(larger, probability, atol=1e-6)
 
 
 def test_lightglue_gives_up_pairs_that_an_earlier_output_calls_hopeless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Random features match about nowhere: the pair is given up. Without that limit the last output decides alone."""
     rng = torch.Generator().manual_seed(4)
     at, d = torch.rand(2, 9, 2, generator=rng), torch.randn(2, 9, 8, generator=rng)
+    pair = Keypoints(at[0], d[0]), Keypoints(at[1], d[1])
     both, last = glue_weights(outputs=(1, 0)), glue_weights(outputs=(1,))
-    expected = _lightglue.assignment(*at, *d, last)
+    expected = _lightglue.assignment(*pair, last)
     assert float(expected.max()) > 0
-    assert float(_lightglue.assignment(*at, *d, both).max()) == 0
+    assert float(_lightglue.assignment(*pair, both).max()) == 0
+    assert float(_lightglue.first_assignment(*pair, both).max()) > 0
     monkeypatch.setattr(_lightglue, "MIN_EXPECTED", 0.0)
-    assert torch.equal(_lightglue.assignment(*at, *d, both), expected)
+    assert torch.equal(_lightglue.assignment(*pair, both), expected)
 
 
 def test_xfeat_uses_the_published_names_and_shapes_of_weights() -> None:

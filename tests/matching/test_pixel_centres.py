@@ -60,17 +60,22 @@ def similarity(degrees: float) -> tuple[np.ndarray, np.ndarray]:
     return A, CENTRE - A @ CENTRE + SHIFT
 
 
-@pytest.mark.parametrize(("name", "degrees"), [("sift", 30), ("dis", 15), ("mixed", 15), ("gmflow", 15), ("aliked", 0)])
+@pytest.mark.parametrize(
+    ("name", "degrees"),
+    [("sift", 30), ("dis", 15), ("mixed", 15), ("gmflow", 15), ("aliked", 0)]
+    + [("aliked_turned", degrees) for degrees in (80, 190)],
+)
 def test_matches_of_a_known_similarity_are_unbiased(name: str, degrees: float) -> None:
-    """Half a pixel of the window would be 0.3 pixels or more in one frame, and 0.15 in both."""
+    """Half a pixel of the window would be 0.3 pixels or more in one frame, and 0.15 in both; a turn off by one 0.8."""
     skip_unless_usable(name)
     A, b = similarity(degrees)
     match = load_plugin("matching", name).load("cpu")(view(0, np.eye(2), np.zeros(2)), view(1, A, b))
     residual = match.uv_i.double().numpy() @ A.T + b - match.uv_j.double().numpy()
     inlier = np.linalg.norm(residual, axis=-1) < 2
     assert inlier.sum() > 300
-    # Seen: 0.04 for flow, whose means differ by so much from image to image, and 0.01 for the others.
-    assert np.abs(residual[inlier].mean(0)).max() < 0.1
+    # Seen: 0.04 for flow, whose means differ by so much from image to image, and 0.01 for the others. What `OFFSET`
+    # leaves of the network's offset on this texture adds up where a frame is turned over: 0.33.
+    assert np.abs(residual[inlier].mean(0)).max() < (0.4 if name == "aliked_turned" else 0.1)
 
 
 def test_gmflow_matches_what_its_flow_connects(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,6 +126,7 @@ def test_keypoints_of_sift_have_no_offset() -> None:
 def test_keypoints_of_a_symmetric_aliked_have_no_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the offsets of deformable convolutions."""
     monkeypatch.setattr(aliked, "MIN_SCORE", 0.0)
+    monkeypatch.setattr(aliked, "OFFSET", (0.0, 0.0))
     tensors = safetensors.torch.load_file(aliked.WEIGHTS)
     p = {name.removeprefix("aliked."): x.float() for name, x in tensors.items() if name.startswith("aliked.")}
     for name, x in p.items():
@@ -129,7 +135,7 @@ def test_keypoints_of_a_symmetric_aliked_have_no_offset(monkeypatch: pytest.Monk
         elif x.ndim == 4 and not name.startswith("desc_head"):
             p[name] = half_turn(x)
     # Only rounding is left; half a pixel of the window is 0.4 pixels.
-    assert offset(lambda seen: aliked._extract(seen, p)[0]).abs().max() < 1e-3
+    assert offset(lambda seen: aliked._extract(seen, p).uv).abs().max() < 1e-3
 
 
 def test_keypoints_of_a_symmetric_xfeat_have_no_offset(monkeypatch: pytest.MonkeyPatch) -> None:

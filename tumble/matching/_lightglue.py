@@ -4,6 +4,10 @@ Implemented from the paper. Instead of its early exit and pruning, pairs that sh
 four of nine layers.
 """
 
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,26 +23,41 @@ Parameters = dict[str, Tensor]
 """Published weights by name, with outputs (`log_assignment`) of the last layer and of any earlier ones."""
 
 
-def assignment(
-    at_i: Float[Tensor, "n 2"],
-    at_j: Float[Tensor, "m 2"],
-    descriptors_i: Float[Tensor, "n c"],
-    descriptors_j: Float[Tensor, "m c"],
-    p: Parameters,
-) -> Float[Tensor, "n m"]:
-    """Probability that two keypoints show the same point, for every pair (section 3.1 of the paper); 0 if given up.
+@dataclass(frozen=True)
+class Keypoints:
+    """Keypoints of a frame."""
 
-    Args:
-        at_i: Positions of the keypoints of frame i, in [-1, 1] along its longer side.
-        at_j: Positions of the keypoints of frame j.
-        descriptors_i: Descriptors of the keypoints of frame i.
-        descriptors_j: Descriptors of the keypoints of frame j.
-        p: Published weights.
-    """
-    x_i, x_j = (_linear(d, p, "input_proj") for d in (descriptors_i, descriptors_j))
-    rotary_i, rotary_j = (_rotary(at, p) for at in (at_i, at_j))
-    layer = 0
-    while True:
+    at: Float[Tensor, "n 2"]
+    """Positions (x, y) in the network's input, in [-1, 1] along its longer side."""
+    descriptors: Float[Tensor, "n c"]
+    """Unit descriptors."""
+
+
+def assignment(i: Keypoints, j: Keypoints, p: Parameters) -> Float[Tensor, "n m"]:
+    """Probability that two keypoints show the same point, for every pair (section 3.1 of the paper); 0 if given up."""
+    for probability, is_last in _outputs(i, j, p):
+        if is_last:
+            return probability
+        if expected_matches(probability) < MIN_EXPECTED:
+            return torch.zeros_like(probability)
+    raise AssertionError("the last layer has an output")
+
+
+def first_assignment(i: Keypoints, j: Keypoints, p: Parameters) -> Float[Tensor, "n m"]:
+    """The probabilities of the first layer that has an output."""
+    return next(_outputs(i, j, p))[0]
+
+
+def expected_matches(probability: Float[Tensor, "n m"]) -> float:
+    """Sum of the best probabilities of all keypoints."""
+    return float(probability.amax(1).sum())
+
+
+def _outputs(i: Keypoints, j: Keypoints, p: Parameters) -> Iterator[tuple[Float[Tensor, "n m"], bool]]:
+    """Probabilities after every layer that has an output, and whether it is the last layer."""
+    x_i, x_j = (_linear(each.descriptors, p, "input_proj") for each in (i, j))
+    rotary_i, rotary_j = (_rotary(each.at, p) for each in (i, j))
+    for layer in itertools.count():
         x_i, x_j = (
             _self_attention(x, rotary, p, f"transformers.{layer}.self_attn")
             for x, rotary in ((x_i, rotary_i), (x_j, rotary_j))
@@ -46,12 +65,9 @@ def assignment(
         x_i, x_j = _cross_attention(x_i, x_j, p, f"transformers.{layer}.cross_attn")
         is_last = f"transformers.{layer + 1}.self_attn.Wqkv.weight" not in p
         if is_last or f"log_assignment.{layer}.final_proj.weight" in p:
-            probability = _probability(x_i, x_j, p, f"log_assignment.{layer}")
-            if is_last:
-                return probability
-            if float(probability.amax(1).sum()) < MIN_EXPECTED:
-                return torch.zeros_like(probability)
-        layer += 1
+            yield _probability(x_i, x_j, p, f"log_assignment.{layer}"), is_last
+        if is_last:
+            return
 
 
 def _probability(x_i: Float[Tensor, "n c"], x_j: Float[Tensor, "m c"], p: Parameters, name: str) -> Tensor:

@@ -3,18 +3,23 @@
 The published weights, rounded to 16-bit floats, are part of the package (`docs/make_aliked.py`).
 """
 
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import safetensors.torch
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tumble.matching import _aliked, _lightglue
-from tumble.matching._window import MARGIN, crop_window, digest, extent
+from tumble.matching._lightglue import Keypoints
+from tumble.matching._window import MARGIN, Window, crop_window, digest, extent
 from tumble.scene import Match, View, empty_match
 
-VERSION = 4
+VERSION = 5
 WEIGHTS = Path(__file__).with_suffix(".safetensors")
 SIZE = 512
 """Height and width of the window around the object that is matched [pixels]."""
@@ -22,38 +27,80 @@ MAX_KEYPOINTS = 512
 """Largest number of keypoints per frame; with twice as many, a pair takes 2.4 times as long and has fewer matches."""
 MIN_SCORE = 0.05
 """Smallest score of a keypoint; the published 0.2 leaves few on weakly textured surfaces."""
+KEPT_FEATURES = 600
+"""Number of frames, of any turn, whose keypoints are kept; limits memory to 160 MB."""
 MIN_PROBABILITY = 0.1
 """Smallest probability of a correspondence (the published threshold)."""
+OFFSET = (0.41, -0.04)
+"""Mean position (x, y) of the network's keypoints beside what they mark [pixels of the window] (docs/method.md)."""
 
-Features = tuple[Tensor, Tensor, Tensor]
-"""Keypoints of a frame: positions in the frame [pixels], positions in the window in [-1, 1], unit descriptors."""
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of a frame, those of the highest score first."""
+
+    uv: Float[Tensor, "n 2"]
+    """Positions in the frame [pixels]."""
+    keypoints: Keypoints
+    """What the network matches, in the window around the object, which may be turned."""
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+class Network:
+    """Both networks on a device, with the keypoints of the last frames."""
+
+    def __init__(self, device: torch.device | str) -> None:
+        tensors = {name: value.float() for name, value in safetensors.torch.load_file(WEIGHTS, str(device)).items()}
+        self._extractor, self.glue = (
+            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+            for prefix in ("aliked.", "lightglue.")
+        )
+        self._kept: OrderedDict[tuple[str, int], Features] = OrderedDict()
+
+    def features(self, view: View, turns: int = 0) -> Features:
+        """Keypoints of a view, described and placed as they are seen after quarter turns to the left.
+
+        They are those of the view as it is, so that tracks go through matches of all turns.
+        """
+        key = digest(view), turns
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        if turns == 0:
+            found = _extract(view, self._extractor)
+        else:
+            found = _turned(view, self.features(view), turns, self._extractor)
+        self._kept[key] = found
+        if len(self._kept) > KEPT_FEATURES:
+            self._kept.popitem(last=False)
+        return found
+
+    @torch.no_grad()
+    def matched(self, of_i: Features, of_j: Features, i: int, j: int) -> Match:
+        """Keypoints of frames i and j that are each other's best match."""
+        if min(len(of_i), len(of_j)) == 0:
+            return empty_match(i, j)
+        probability = _lightglue.assignment(of_i.keypoints, of_j.keypoints, self.glue).cpu()
+        best, back = probability.argmax(1), probability.argmax(0)
+        k = torch.arange(len(best))
+        k = k[(back[best] == k) & (probability[k, best] > MIN_PROBABILITY)]
+        return Match(i, j, of_i.uv[k], of_j.uv[best[k]], probability[k, best[k]])
+
+
+@lru_cache(maxsize=1)
+def network(device: str) -> Network:
+    """Networks on a device: the same for all matchers that use them, so that they share the keypoints."""
+    return Network(device)
 
 
 def load(device: torch.device | str):
-    """Matcher on a device, which caches every frame's keypoints."""
-    tensors = {name: value.float() for name, value in safetensors.torch.load_file(WEIGHTS, str(device)).items()}
-    extractor, glue = (
-        {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        for prefix in ("aliked.", "lightglue.")
-    )
-    cached: dict[str, Features] = {}
+    """Matcher on a device, which keeps the keypoints of frames."""
+    both = network(str(device))
 
-    def features(view: View) -> Features:
-        name = digest(view)
-        if name not in cached:
-            cached[name] = _extract(view, extractor)
-        return cached[name]
-
-    @torch.no_grad()
     def match(view_i: View, view_j: View) -> Match:
-        (uv_i, at_i, unit_i), (uv_j, at_j, unit_j) = features(view_i), features(view_j)
-        if min(len(uv_i), len(uv_j)) == 0:
-            return empty_match(view_i.number, view_j.number)
-        probability = _lightglue.assignment(at_i, at_j, unit_i, unit_j, glue).cpu()
-        best, back = probability.argmax(1), probability.argmax(0)
-        i = torch.arange(len(best))
-        i = i[(back[best] == i) & (probability[i, best] > MIN_PROBABILITY)]
-        return Match(view_i.number, view_j.number, uv_i[i], uv_j[best[i]], probability[i, best[i]])
+        return both.matched(both.features(view_i), both.features(view_j), view_i.number, view_j.number)
 
     return match
 
@@ -62,18 +109,39 @@ def load(device: torch.device | str):
 def _extract(view: View, parameters: dict[str, Tensor]) -> Features:
     """Keypoints of a view, with descriptors."""
     device = parameters["conv1.weight"].device
-    none = torch.zeros(0, 2), torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device)
-    width = extent(view) * (1 + 2 * MARGIN)
-    if width == 0:
+    none = Features(torch.zeros(0, 2), Keypoints(torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device)))
+    if extent(view) == 0:
         return none
-    window = crop_window(view, width, SIZE)
-    image = torch.from_numpy(window.rgb).to(device).permute(2, 0, 1)[None] / 255
-    levels, score = _aliked.dense(image, parameters)
+    window = _window_of(view)
+    levels, score = _aliked.dense(_network_input(window, device), parameters)
     usable = torch.from_numpy(window.usable).to(device)
     at = _aliked.keypoints(score, usable, max_count=MAX_KEYPOINTS, min_score=MIN_SCORE)
     # Sub-pixel refinement may move a keypoint off the usable pixels.
     at = at[torch.from_numpy(window.contains(at.cpu().numpy() + 0.5)).to(device)]
     if not len(at):
         return none
-    unit = _aliked.descriptors(levels, at, parameters)
-    return window.in_frame(at.cpu().numpy().astype(np.float64) + 0.5), 2 * at / SIZE - 1, unit
+    uv = window.in_frame(at.cpu().numpy().astype(np.float64) - OFFSET + 0.5)
+    return Features(uv, Keypoints(2 * at / SIZE - 1, _aliked.descriptors(levels, at, parameters)))
+
+
+@torch.no_grad()
+def _turned(view: View, straight: Features, turns: int, parameters: dict[str, Tensor]) -> Features:
+    """The same keypoints, described and placed as they are seen after quarter turns to the left."""
+    if not len(straight):
+        return straight
+    offset = straight.keypoints.at.new_tensor(OFFSET)
+    at = (straight.keypoints.at + 1) * SIZE / 2 - offset
+    for _ in range(turns):
+        at = torch.stack([at[:, 1], SIZE - 1 - at[:, 0]], -1)
+    at = at + offset
+    image = _network_input(_window_of(view), at.device).rot90(turns, (2, 3))
+    descriptors = _aliked.descriptors(_aliked.dense(image, parameters)[0], at, parameters)
+    return Features(straight.uv, Keypoints(2 * at / SIZE - 1, descriptors))
+
+
+def _window_of(view: View) -> Window:
+    return crop_window(view, extent(view) * (1 + 2 * MARGIN), SIZE)
+
+
+def _network_input(window: Window, device: torch.device) -> Float[Tensor, "1 3 h w"]:
+    return torch.from_numpy(window.rgb).to(device).permute(2, 0, 1)[None] / 255

@@ -9,7 +9,7 @@ import torch
 
 from tests.lopsided import AXES, Tumble, first_hits, tumbling
 from tumble.maths import SO3
-from tumble.poses.sfm import registration, stage
+from tumble.poses.sfm import partial, registration, stage
 from tumble.poses.sfm.partial import Observed, Partial, colour_contradictions, contour_cost
 from tumble.poses.sfm.registration import Joint, best_joint, contour_joint, join, solutions
 from tumble.poses.sfm.tracks import NO_TRACKS, gather_keypoints
@@ -205,3 +205,23 @@ def test_parts_are_joined_by_contours_only_after_all_keypoints(
     known = {(best_joint, a, b): None, (contour_joint, a, b): by_contours}
     assert len(join(observed, [a, b], dict(known), certain=True)) == 2
     assert len(join(observed, [a, b], dict(known), certain=False)) == 1
+
+
+@pytest.mark.parametrize(
+    ("frames", "degrees", "kept"),
+    [
+        ((3, 4, 5, 6), (0, 12, 24, 90), (3, 4, 5)),  # at an end, after a jump
+        ((3, 4, 5, 6), (0, 80, 24, 36), (3, 5, 6)),  # without frame 4 the motion goes on
+        ((3, 4, 5, 6), (0, 12, 90, 102), (3, 4, 5, 6)),  # two pairs that go on: which is wrong is not known
+        ((3, 4, 8), (0, 10, 90), (3, 4, 8)),  # too far in time to tell
+        ((3, 8, 9, 10), (0, 60, 90, 100), (3, 9, 10)),
+        ((3, 4), (0, 30), (4,)),
+        ((3,), (0,), (3,)),
+    ],
+)
+def test_frames_to_which_the_motion_jumps_are_left_out(
+    frames: tuple[int, ...], degrees: tuple[int, ...], kept: tuple[int, ...]
+) -> None:
+    turn = torch.tensor([[0.0, math.radians(angle), 0.0] for angle in degrees], dtype=torch.float64)
+    part = Partial(frames, SO3.exp(turn).matrix(), torch.zeros(len(frames), 3).double())
+    assert partial.without_jumps(part).frames == kept

@@ -87,16 +87,16 @@ def test_the_network_is_asked_only_where_sift_leaves_frames_out(
 
     def matches(inputs: stage.Inputs, pairs: list[tuple[int, int]], matcher: str) -> list[Match]:
         asked.append(matcher)
-        if matcher == "aliked":
+        if matcher != "sift":
             assert all(max(pair) >= first for pair in pairs)  # one of both frames has no pose
         return matched(scene, inputs.capture, pairs[:40])
 
     def understood(
         cfg: object, given: stage.Inputs, wide: list[Match], R: torch.Tensor, rng: object, *, cautious: bool
     ) -> tuple[list[Partial], Tracks]:
-        assert cautious == (len(asked) == 1)
-        found = first if len(asked) == 1 else N
-        if len(asked) == 2:  # The network's matches are added to those of neighbouring frames and to SIFT's.
+        assert cautious == (asked == ["sift"])
+        found = first if cautious else N
+        if not cautious:  # The network's matches are added to those of neighbouring frames and to SIFT's.
             assert sum(map(len, given.all_matches)) > sum(map(len, inputs.all_matches))
             assert len(wide) == len({(match.i, match.j) for match in wide})
         return [Partial(tuple(range(found)), R[:found], R[:found, 0])], inputs.tracks
@@ -105,25 +105,29 @@ def test_the_network_is_asked_only_where_sift_leaves_frames_out(
     monkeypatch.setattr(segments, "_understood", understood)
     part, _ = segments.segmented_poses(QUICK, inputs, start(scene), torch.Generator().manual_seed(0))
     assert part is not None
-    assert (len(part), asked) == ((N - 1, ["sift"]) if first == N - 1 else (N, ["sift", "aliked"]))
+    assert (len(part), asked) == (
+        (N - 1, ["sift"]) if first == N - 1 else (N, ["sift", "aliked", *2 * ["aliked_turned"]])
+    )
 
 
 def test_the_network_matches_no_pair_of_frames_of_one_part(
     scene: Tumble, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    R, asked = start(scene), {}
+    R, asked = start(scene), {"sift": [], "aliked": [], "aliked_turned": []}
     halves = [Partial(tuple(frames), R[frames], R[frames, 0]) for frames in (range(15, N), range(14))]
 
     def matches(inputs: stage.Inputs, pairs: list[tuple[int, int]], matcher: str) -> list[Match]:
-        asked[matcher] = pairs
+        asked[matcher] += pairs
         return matched(scene, inputs.capture, pairs[:40])
 
     monkeypatch.setattr(segments, "_matched", matches)
     monkeypatch.setattr(segments, "_understood", lambda *_, **__: (halves, inputs.tracks))
     segments.segmented_poses(QUICK, inputs, R, torch.Generator().manual_seed(0))
-    assert all(i < 14 <= j or 14 in (i, j) for i, j in asked["aliked"])
-    assert (13, 15) in asked["aliked"]
-    assert any(i < 14 < j for i, j in asked["aliked"])
+    near, far = asked["aliked"], asked["aliked_turned"]
+    assert all(i < 14 <= j or 14 in (i, j) for i, j in near + far)
+    assert (13, 15) in near
+    assert any(i < 14 < j for i, j in far)
+    assert all(j - i > segments.NEAR for i, j in far)
 
 
 def test_frames_without_a_pose_are_lost_and_stay_out_of_the_adjustment(posed: tuple) -> None:
@@ -216,3 +220,25 @@ def test_poses_of_another_method_are_not_confirmed_by_matches(scene: Tumble, inp
     turned.T_cam_obj.wxyz[wrong] = (turn @ right.T_cam_obj.rotation[wrong]).wxyz
     assert not stage.assess(inputs, right).quality.lost[wrong]
     assert stage.assess(inputs, turned).quality.lost[wrong]
+
+
+def test_the_network_sees_the_pairs_beside_those_that_have_many_matches(
+    inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs of frames of one part are left out there, too."""
+    asked: list[list[tuple[int, int]]] = []
+    step, promising = segments.LEARNED_STRIDE, (3, 15)
+
+    def matches(inputs: stage.Inputs, pairs: list[tuple[int, int]], matcher: str) -> list[Match]:
+        asked.append(pairs)
+        counts = [segments.MIN_PROMISING - (pair != promising) for pair in pairs]
+        return [Match(*pair, *torch.zeros(2, n, 2), torch.ones(n)) for pair, n in zip(pairs, counts, strict=True)]
+
+    monkeypatch.setattr(segments, "_matched", matches)
+    monkeypatch.setattr(segments, "on_object", lambda match, _: match)
+    near, far = segments._learned(inputs, [{2, 4, 14}])
+    of_near, coarse, beside = asked
+    assert (len(near), len(far)) == (len(of_near), len(coarse) + len(beside))
+    assert promising in coarse
+    assert all(i % step == j % step == 0 for i, j in coarse)
+    assert beside == sorted({(i, j) for i in (2, 3, 4) for j in (14, 15, 16)} - {promising, (2, 14), (4, 14)})

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
+from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import bundle_adjustment, frontier_points
 from tumble.poses.sfm.adjustment import adjust_round
 from tumble.poses.sfm.bundle_adjustment import BundleState
@@ -35,6 +36,10 @@ MIN_OBSERVATIONS = 25
 """Number of observations that agree with the surface points below which a frame is left out."""
 MIN_MATCHES = 15
 """Number of matches that agree with the epipolar lines below which a frame is left out."""
+MAX_STEP = math.radians(20)
+"""Largest rotation between consecutive frames of a motion [radians]."""
+MAX_DISTANCE = 3
+"""Largest distance in time of frames that are compared by it [frames]."""
 GAP_SCALE = 3.0
 """Scale of the robust cost of tangency gaps [pixels]."""
 MAX_COLOUR_CONTRADICTION = 2.0
@@ -183,13 +188,26 @@ def _triangulated(observed: Observed, part: Partial, tracks: Tracks) -> tuple[Te
 
 
 def pruned(observed: Observed, part: Partial, tolerance: float) -> Partial:
-    """Without the frames that few matches and few observations of surface points confirm."""
+    """Without the frames that few matches or few observations of surface points confirm, or where the motion jumps."""
     tracks, _ = joined_tracks(observed, part, tolerance)
     _, agrees = _triangulated(observed, part, tracks)
     observations = torch.bincount(tracks.frame[agrees], minlength=len(part))
     matches, _ = consistent_matches(observed, part, 2.0)
     enough = (observations.numpy() >= MIN_OBSERVATIONS) & (matches >= MIN_MATCHES)
-    return part.select(np.nonzero(enough)[0].tolist())
+    return without_jumps(part.select(np.nonzero(enough)[0].tolist()))
+
+
+def without_jumps(part: Partial) -> Partial:
+    """Without the frames to and from which the motion jumps, first those with a jump on both sides."""
+    while len(part) > 1:
+        R, distance = SO3.from_matrix(part.R), np.diff(part.frames)
+        near = distance <= MAX_DISTANCE
+        goes_on = near & (angle_between(R[:-1], R[1:]).numpy() <= MAX_STEP * distance)
+        jumps, steps = (np.convolve(each, (1, 1)) for each in (near & ~goes_on, goes_on))
+        if not (wrong := np.where(steps == 0, jumps, 0)).any():
+            break
+        part = part.select(np.delete(np.arange(len(part)), wrong.argmax()).tolist())
+    return part
 
 
 def consistent_matches(

@@ -28,6 +28,8 @@ from tumble.poses.sfm.contour_joints import (
 )
 from tumble.poses.sfm.partial import (
     MAX_COLOUR_CONTRADICTION,
+    MAX_DISTANCE,
+    MAX_STEP,
     TOLERANCE,
     Observed,
     Partial,
@@ -86,11 +88,6 @@ MIN_FRAME_FRACTION = 0.35
 """Fraction of a frame's keypoints with correspondences that have to agree with its pose."""
 MIN_FRAME_GAPS = 15
 """Number of tangency gaps from which the contour of a frame counts."""
-MAX_STEP = math.radians(20)
-"""Largest rotation between consecutive frames with which a frame is added, and with which the motion is continuous
-[radians]."""
-MAX_DISTANCE = 3
-"""Largest distance in time from a frame with a pose at which a frame is added [frames]."""
 JOINING_SCALES = (3.0, 2.0, 1.5, 1.0, 0.7, 0.7)
 """Scales of the Cauchy loss in the rounds of adjustment after two parts were joined [pixels]."""
 ADDING_SCALES = (2.0, 1.5, 1.0, 0.7)
