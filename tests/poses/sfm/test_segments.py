@@ -222,23 +222,28 @@ def test_poses_of_another_method_are_not_confirmed_by_matches(scene: Tumble, inp
     assert stage.assess(inputs, turned).quality.lost[wrong]
 
 
+@pytest.mark.parametrize("enough", [False, True])
 def test_the_network_sees_the_pairs_beside_those_that_have_many_matches(
-    inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
+    enough: bool, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pairs of frames of one part are left out there, too."""
+    """Those beside the pair with the most matches come first; pairs of frames of one part are left out there, too."""
     asked: list[list[tuple[int, int]]] = []
-    step, promising = segments.LEARNED_STRIDE, (3, 15)
+    step, counts = segments.LEARNED_STRIDE, {(3, 15): segments.MIN_PROMISING + 5, (6, 24): segments.MIN_PROMISING}
 
     def matches(inputs: stage.Inputs, pairs: list[tuple[int, int]], matcher: str) -> list[Match]:
         asked.append(pairs)
-        counts = [segments.MIN_PROMISING - (pair != promising) for pair in pairs]
-        return [Match(*pair, *torch.zeros(2, n, 2), torch.ones(n)) for pair, n in zip(pairs, counts, strict=True)]
+        sizes = [(pair, counts.get(pair, segments.MIN_PROMISING - 1)) for pair in pairs]
+        return [Match(*pair, *torch.zeros(2, n, 2), torch.ones(n)) for pair, n in sizes]
 
     monkeypatch.setattr(segments, "_matched", matches)
     monkeypatch.setattr(segments, "on_object", lambda match, _: match)
+    if enough:
+        monkeypatch.setattr(segments, "MAX_BESIDE", 6)
     near, far = segments._learned(inputs, [{2, 4, 14}])
     of_near, coarse, beside = asked
     assert (len(near), len(far)) == (len(of_near), len(coarse) + len(beside))
-    assert promising in coarse
+    assert set(counts) <= set(coarse)
     assert all(i % step == j % step == 0 for i, j in coarse)
-    assert beside == sorted({(i, j) for i in (2, 3, 4) for j in (14, 15, 16)} - {promising, (2, 14), (4, 14)})
+    first = {(i, j) for i in (2, 3, 4) for j in (14, 15, 16)} - {(3, 15), (2, 14), (4, 14)}
+    second = {(i, j) for i in (5, 6, 7) for j in (23, 24, 25)} - {(6, 24)}
+    assert beside == sorted(first if enough else first | second)

@@ -89,6 +89,8 @@ LEARNED_STRIDE = 3
 MIN_PROMISING = 40
 """Number of matches of such a pair from which it sees the pairs beside it. Of 60 pairs of a bottle in a hand that show
 the same side, most matches were right in 19 of the 26 with as many, and in one of the other 34."""
+MAX_BESIDE = 300
+"""Number of these from which no more are added, those beside the pairs with the most matches first: some minutes."""
 FIRST_SCALE = 3
 """Index in `global_scales` of the Cauchy loss in the first round in which a segment is adjusted."""
 FINISHING_SCALES = (1.5, 1.0, 0.7)
@@ -154,18 +156,21 @@ def _learned(inputs: Inputs, known: Sequence[set[int]]) -> tuple[list[Match], li
     Of frames far apart it sees every `LEARNED_STRIDE`-th, and then those beside pairs that have many matches.
     """
 
-    def matched(pairs: set[tuple[int, int]], matcher: str) -> list[Match]:
-        return _matched(inputs, sorted(pair for pair in pairs if not any(map(set(pair).issubset, known))), matcher)
+    def apart(pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+        return {pair for pair in pairs if not any(map(set(pair).issubset, known))}
 
     n, step = len(inputs.capture), LEARNED_STRIDE
-    near = matched(set(neighbours(n)), LEARNED_MATCHER)
+    near = _matched(inputs, sorted(apart(set(neighbours(n)))), LEARNED_MATCHER)
     coarse = {(i, j) for j in range(0, n, step) for i in range(0, j - NEAR, step)}
-    far = matched(coarse, FAR_LEARNED_MATCHER)
-    promising = [match for match in far if len(on_object(match, inputs.capture.masks)) >= MIN_PROMISING]
-    around = range(-(step // 2), step // 2 + 1)
-    beside = {(match.i + a, match.j + b) for match in promising for a in around for b in around}
-    beside = {(i, j) for i, j in beside - coarse if 0 <= i < j - NEAR and j < n}
-    return near, far + matched(beside, FAR_LEARNED_MATCHER)
+    far = _matched(inputs, sorted(apart(coarse)), FAR_LEARNED_MATCHER)
+    count = {(match.i, match.j): len(on_object(match, inputs.capture.masks)) for match in far}
+    around, beside = range(-(step // 2), step // 2 + 1), set[tuple[int, int]]()
+    for i, j in sorted(count, key=lambda pair: -count[pair]):
+        if count[i, j] < MIN_PROMISING or len(beside) >= MAX_BESIDE:
+            break
+        new = {(i + a, j + b) for a in around for b in around if 0 <= i + a < j + b - NEAR and j + b < n}
+        beside |= apart(new - coarse)
+    return near, far + _matched(inputs, sorted(beside), FAR_LEARNED_MATCHER)
 
 
 def _matched(inputs: Inputs, pairs: Sequence[tuple[int, int]], matcher: str) -> list[Match]:
