@@ -17,7 +17,7 @@ from tumble.io import weights, write_tensors
 from tumble.io.files import BadFile
 from tumble.io.plugins import load_plugin
 from tumble.matching import _aliked, _gmflow, _lightglue, _window, aliked, match_pairs, xfeat
-from tumble.matching._lightglue import Keypoints
+from tumble.matching._lightglue import DescribedKeypoints
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 from tumble.scene.match import Match, View
 
@@ -411,13 +411,13 @@ def test_lightglue_is_independent_of_order_and_origin() -> None:
     rng = torch.Generator().manual_seed(2)
     at_i, at_j = torch.rand(9, 2, generator=rng), torch.rand(7, 2, generator=rng)
     d_i, d_j = torch.randn(9, 8, generator=rng), torch.randn(7, 8, generator=rng)
-    i, j, p = Keypoints(at_i, d_i), Keypoints(at_j, d_j), glue_weights()
+    i, j, p = DescribedKeypoints(at_i, d_i), DescribedKeypoints(at_j, d_j), glue_weights()
     probability = _lightglue.assignment(i, j, p)
     order = torch.randperm(9, generator=rng)
-    shuffled = _lightglue.assignment(Keypoints(at_i[order], d_i[order]), j, p)
+    shuffled = _lightglue.assignment(DescribedKeypoints(at_i[order], d_i[order]), j, p)
     torch.testing.assert_close(shuffled, probability[order], atol=1e-6, rtol=1e-4)
     torch.testing.assert_close(_lightglue.assignment(j, i, p), probability.T, atol=1e-6, rtol=1e-4)
-    shifted, larger = (_lightglue.assignment(Keypoints(at, d_i), j, p) for at in (at_i + 0.7, at_i * 2))
+    shifted, larger = (_lightglue.assignment(DescribedKeypoints(at, d_i), j, p) for at in (at_i + 0.7, at_i * 2))
     torch.testing.assert_close(shifted, probability, atol=1e-6, rtol=1e-3)
     assert not torch.allclose(larger, probability, atol=1e-6)
 
@@ -426,7 +426,7 @@ def test_lightglue_gives_up_pairs_that_an_earlier_output_calls_hopeless(monkeypa
     """Random features match about nowhere: the pair is given up. Without that limit the last output decides alone."""
     rng = torch.Generator().manual_seed(4)
     at, d = torch.rand(2, 9, 2, generator=rng), torch.randn(2, 9, 8, generator=rng)
-    pair = Keypoints(at[0], d[0]), Keypoints(at[1], d[1])
+    pair = DescribedKeypoints(at[0], d[0]), DescribedKeypoints(at[1], d[1])
     both, last = glue_weights(outputs=(1, 0)), glue_weights(outputs=(1,))
     expected = _lightglue.assignment(*pair, last)
     assert float(expected.max()) > 0

@@ -24,7 +24,7 @@ Parameters = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
-class Keypoints:
+class DescribedKeypoints:
     """Keypoints of a frame."""
 
     at: Float[Tensor, "n 2"]
@@ -33,7 +33,7 @@ class Keypoints:
     """Unit descriptors."""
 
 
-def assignment(i: Keypoints, j: Keypoints, p: Parameters) -> Float[Tensor, "n m"]:
+def assignment(i: DescribedKeypoints, j: DescribedKeypoints, p: Parameters) -> Float[Tensor, "n m"]:
     """Probability that two keypoints show the same point, for every pair (section 3.1 of the paper); 0 if given up."""
     for probability, is_last in _outputs(i, j, p):
         if is_last:
@@ -43,7 +43,7 @@ def assignment(i: Keypoints, j: Keypoints, p: Parameters) -> Float[Tensor, "n m"
     raise AssertionError("the last layer has an output")
 
 
-def first_assignment(i: Keypoints, j: Keypoints, p: Parameters) -> Float[Tensor, "n m"]:
+def first_assignment(i: DescribedKeypoints, j: DescribedKeypoints, p: Parameters) -> Float[Tensor, "n m"]:
     """The probabilities of the first layer that has an output."""
     return next(_outputs(i, j, p))[0]
 
@@ -53,7 +53,9 @@ def expected_matches(probability: Float[Tensor, "n m"]) -> float:
     return float(probability.amax(1).sum())
 
 
-def _outputs(i: Keypoints, j: Keypoints, p: Parameters) -> Iterator[tuple[Float[Tensor, "n m"], bool]]:
+def _outputs(
+    i: DescribedKeypoints, j: DescribedKeypoints, p: Parameters
+) -> Iterator[tuple[Float[Tensor, "n m"], bool]]:
     """Probabilities after every layer that has an output, and whether it is the last layer."""
     x_i, x_j = (_linear(each.descriptors, p, "input_proj") for each in (i, j))
     rotary_i, rotary_j = (_rotary(each.at, p) for each in (i, j))

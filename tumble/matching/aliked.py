@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tumble.matching import _aliked, _lightglue
-from tumble.matching._lightglue import Keypoints
+from tumble.matching._lightglue import DescribedKeypoints
 from tumble.matching._window import MARGIN, Window, crop_window, digest, extent
 from tumble.scene import Match, View, empty_match
 
@@ -41,14 +41,14 @@ class Features:
 
     uv: Float[Tensor, "n 2"]
     """Positions in the frame [pixels]."""
-    keypoints: Keypoints
+    keypoints: DescribedKeypoints
     """What the network matches, in the window around the object, which may be turned."""
 
     def __len__(self) -> int:
         return len(self.uv)
 
 
-class Network:
+class AlikedLightGlue:
     """Both networks on a device, with the keypoints of the last frames."""
 
     def __init__(self, device: torch.device | str) -> None:
@@ -90,9 +90,9 @@ class Network:
 
 
 @lru_cache(maxsize=1)
-def network(device: str) -> Network:
+def network(device: str) -> AlikedLightGlue:
     """Networks on a device: the same for all matchers that use them, so that they share the keypoints."""
-    return Network(device)
+    return AlikedLightGlue(device)
 
 
 def load(device: torch.device | str):
@@ -109,7 +109,9 @@ def load(device: torch.device | str):
 def _extract(view: View, parameters: dict[str, Tensor]) -> Features:
     """Keypoints of a view, with descriptors."""
     device = parameters["conv1.weight"].device
-    none = Features(torch.zeros(0, 2), Keypoints(torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device)))
+    none = Features(
+        torch.zeros(0, 2), DescribedKeypoints(torch.zeros(0, 2, device=device), torch.zeros(0, 128, device=device))
+    )
     if extent(view) == 0:
         return none
     window = _window_of(view)
@@ -121,7 +123,7 @@ def _extract(view: View, parameters: dict[str, Tensor]) -> Features:
     if not len(at):
         return none
     uv = window.in_frame(at.cpu().numpy().astype(np.float64) - OFFSET + 0.5)
-    return Features(uv, Keypoints(2 * at / SIZE - 1, _aliked.descriptors(levels, at, parameters)))
+    return Features(uv, DescribedKeypoints(2 * at / SIZE - 1, _aliked.descriptors(levels, at, parameters)))
 
 
 @torch.no_grad()
@@ -136,7 +138,7 @@ def _turned(view: View, straight: Features, turns: int, parameters: dict[str, Te
     at = at + offset
     image = _network_input(_window_of(view), at.device).rot90(turns, (2, 3))
     descriptors = _aliked.descriptors(_aliked.dense(image, parameters)[0], at, parameters)
-    return Features(straight.uv, Keypoints(2 * at / SIZE - 1, descriptors))
+    return Features(straight.uv, DescribedKeypoints(2 * at / SIZE - 1, descriptors))
 
 
 def _window_of(view: View) -> Window:

@@ -7,7 +7,7 @@ frame is therefore tried at four quarter turns, with few keypoints and the first
 import torch
 
 from tumble.matching import _lightglue, aliked
-from tumble.matching._lightglue import Keypoints
+from tumble.matching._lightglue import DescribedKeypoints
 from tumble.scene import Match, View, empty_match
 
 VERSION = 1
@@ -28,7 +28,7 @@ def load(device: torch.device | str):
     @torch.no_grad()
     def expected(of_i: aliked.Features, of_j: aliked.Features) -> float:
         i, j = (
-            Keypoints(each.keypoints.at[:TRIED_KEYPOINTS], each.keypoints.descriptors[:TRIED_KEYPOINTS])
+            DescribedKeypoints(each.keypoints.at[:TRIED_KEYPOINTS], each.keypoints.descriptors[:TRIED_KEYPOINTS])
             for each in (of_i, of_j)
         )
         return _lightglue.expected_matches(_lightglue.first_assignment(i, j, network.glue))
