@@ -156,20 +156,20 @@ def _learned(inputs: Inputs, known: Sequence[set[int]]) -> tuple[list[Match], li
     Of frames far apart it sees every `LEARNED_STRIDE`-th, and then those beside pairs that have many matches.
     """
 
-    def apart(pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    def unknown(pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
         return {pair for pair in pairs if not any(map(set(pair).issubset, known))}
 
     n, step = len(inputs.capture), LEARNED_STRIDE
-    near = _matched(inputs, sorted(apart(set(neighbours(n)))), LEARNED_MATCHER)
+    near = _matched(inputs, sorted(unknown(set(neighbours(n)))), LEARNED_MATCHER)
     coarse = {(i, j) for j in range(0, n, step) for i in range(0, j - NEAR, step)}
-    far = _matched(inputs, sorted(apart(coarse)), FAR_LEARNED_MATCHER)
+    far = _matched(inputs, sorted(unknown(coarse)), FAR_LEARNED_MATCHER)
     count = {(match.i, match.j): len(on_object(match, inputs.capture.masks)) for match in far}
     around, beside = range(-(step // 2), step // 2 + 1), set[tuple[int, int]]()
     for i, j in sorted(count, key=lambda pair: -count[pair]):
         if count[i, j] < MIN_PROMISING or len(beside) >= MAX_BESIDE:
             break
         new = {(i + a, j + b) for a in around for b in around if 0 <= i + a < j + b - NEAR and j + b < n}
-        beside |= apart(new - coarse)
+        beside |= unknown(new - coarse)
     return near, far + _matched(inputs, sorted(beside), FAR_LEARNED_MATCHER)
 
 
