@@ -20,10 +20,11 @@ MIN_COSINE = 0.25
 DEPTH_TOLERANCE = 0.03
 """Maximum difference between the depths of a vertex and of the Gaussians at which it is in front, besides the slope of
 its surface [object radius]."""
-MIN_FRAMES = 2
-"""Number of frames that must show a vertex; a mask may be wrong in one."""
-MIN_SHOWN = 0.25
-"""Of the frames in which a vertex is in front, the fraction that must show object there, as in background removal."""
+MIN_FRAMES = 3
+"""Number of frames that must show a vertex; a mask may be wrong in one or two."""
+MAX_WRONG = 0.05
+"""Fraction of the frames with something in front of a vertex whose masks may be wrong there, and do not count. So what
+a hand covers most of the time is seen, too (docs/method.md)."""
 AVERAGING_STEPS = 20
 """Number of times that "seen" is averaged over neighbours, so that wrong pixels of masks leave no spikes."""
 
@@ -61,7 +62,7 @@ def seen_vertices(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray
 
 
 def enough_show(n: int, labels: Iterable[Shaped[np.ndarray, " n"]]) -> Bool[np.ndarray, " n"]:
-    """Which of n points at least `MIN_FRAMES` frames show as object, and `MIN_SHOWN` of those in which it is in front.
+    """Which of n points at least `MIN_FRAMES` frames show as object, besides `MAX_WRONG` of those that hide it.
 
     Args:
         labels: What the mask of each frame says of each point; neither object nor unknown of those that it cannot show.
@@ -70,7 +71,7 @@ def enough_show(n: int, labels: Iterable[Shaped[np.ndarray, " n"]]) -> Bool[np.n
     for label in labels:
         shown += label == OBJECT
         hidden += label == UNKNOWN
-    return (shown >= MIN_FRAMES) & (shown >= MIN_SHOWN * (shown + hidden))
+    return shown >= MIN_FRAMES + MAX_WRONG * hidden
 
 
 def _labels(
