@@ -66,7 +66,7 @@ def test_what_a_hand_or_the_view_hides_was_not_seen(asset: Asset, capture: Captu
     assert seen[(x < 0.28) & (np.abs(y) < 0.6)].mean() > 0.99
 
 
-@pytest.mark.parametrize(("shown", "hidden", "seen"), [(3, 0, True), (2, 0, False), (5, 40, True), (4, 40, False)])
+@pytest.mark.parametrize(("shown", "hidden", "seen"), [(2, 0, True), (1, 0, False), (4, 40, True), (3, 40, False)])
 def test_a_few_masks_may_be_wrong_where_a_hand_is_most_of_the_time(shown: int, hidden: int, seen: bool) -> None:
     labels = [OBJECT] * shown + [UNKNOWN] * hidden + [BACKGROUND] * 5
     assert unseen.enough_show(1, (np.array([label]) for label in labels)).tolist() == [seen]

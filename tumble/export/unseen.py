@@ -20,8 +20,8 @@ MIN_COSINE = 0.25
 DEPTH_TOLERANCE = 0.03
 """Maximum difference between the depths of a vertex and of the Gaussians at which it is in front, besides the slope of
 its surface [object radius]."""
-MIN_FRAMES = 3
-"""Number of frames that must show a vertex; a mask may be wrong in one or two."""
+MIN_FRAMES = 2
+"""Number of frames that must show a vertex; a mask may be wrong in one."""
 MAX_WRONG = 0.05
 """Fraction of the frames with something in front of a vertex whose masks may be wrong there, and do not count. So what
 a hand covers most of the time is seen, too (docs/method.md)."""
