@@ -21,6 +21,7 @@ from tests.simulated_gpu import DEVICE, WITH_WARP, SimulatedGpu, simulated_gpu
 from tests.simulated_graph import SimulatedRecorder, simulated_graphs
 from tumble import actions, backends, pipeline, recipes
 from tumble.engine import graph, loop, optim
+from tumble.engine import run as runs
 from tumble.export import asset as export
 from tumble.export.asset import Preset
 from tumble.inverse_rendering import decompose, refine
@@ -374,6 +375,18 @@ def test_scores_are_those_of_the_cpu(
         for name in ("cpu", "cuda")
     )
     assert there == pytest.approx(here, rel=1e-4)
+
+
+def test_scores_of_a_run_with_estimated_poses_are_those_of_the_cpu(
+    finished: tuple[Path, Asset], capture: Path, tmp_path: Path, gpu: SimulatedGpu
+) -> None:
+    """Its object frame is aligned with that of the truth, and its report compares the poses."""
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    (run / runs.TRACK).mkdir()
+    here, there = (actions.evaluate_run(run, capture, tmp_path / name, device=name) for name in ("cpu", "cuda"))
+    assert "first the rotation" in there["notes"][0]
+    assert there["regions"]["shared"] == pytest.approx(here["regions"]["shared"], rel=1e-3)
+    assert page.write_report(run, capture=capture, device=DEVICE).is_file()
 
 
 def test_exported_files_are_those_of_the_cpu(finished: tuple[Path, Asset], tmp_path: Path, gpu: SimulatedGpu) -> None:

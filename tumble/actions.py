@@ -317,7 +317,8 @@ def _aligned(out: Path, asset: Asset, known: CaptureWithTruth) -> tuple[Any, str
     own_frame = (out / run.TRACK).is_dir() or (out / run.CAPTURE / PROVENANCE).is_file()
     given = known.capture.trajectory is not None and not own_frame
     lens = _focal_ratio(out, asset, known.capture)
-    training = asset.trajectory, names, known.capture, known.truth
+    # The capture and its truth are on the CPU, on whatever device the asset is.
+    training = tree.to(asset.trajectory, "cpu"), names, known.capture, known.truth
     return align_views(*training, known_poses=given, focal_ratio=lens)
 
 
