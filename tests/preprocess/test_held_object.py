@@ -5,6 +5,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from jaxtyping import Bool, UInt8
 
 from tests.films import Scene, scene
 from tumble.preprocess import held_object
@@ -16,6 +17,9 @@ from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
 PRINT = (196, 140, 112)
 """A print on the object in the colour of the hand [sRGB code values]."""
+
+SKIN = (205, 150, 120)
+"""A hand of another person [sRGB code values]."""
 
 
 def landmarks(i: int) -> Hand:
@@ -104,6 +108,42 @@ def test_a_side_that_comes_into_view_is_object_in_the_colours_of_the_sleeve_too(
     background = estimate_background(pictures, video.object | video.hand)
     masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
     assert (masks.labels[14:][side[14:]] == OBJECT).mean() > 0.8
+
+
+def with_label(video: Scene) -> tuple[UInt8[np.ndarray, "t h w 3"], Bool[np.ndarray, "t h w"]]:
+    """Pictures in which three quarters of the object take on the hand's colour in frame 8, and these pixels."""
+    pictures, label = video.pictures.copy(), np.zeros_like(video.object)
+    for i in range(8, len(pictures)):
+        columns = np.nonzero((video.object[i] & ~video.hand[i]).any(0))[0]
+        label[i] = video.object[i] & (np.arange(label.shape[2]) > columns[0] + 0.25 * np.ptp(columns))
+        pictures[i][label[i]] = PRINT
+    return pictures, label
+
+
+def test_a_label_in_the_colour_of_the_hand_is_object_beside_the_hand() -> None:
+    """It comes into view at once, as in a fast turn, so that optical flow does not follow it."""
+    video = scene(hand=True)
+    pictures, label = with_label(video)
+    hands = [[landmarks(i)] for i in range(len(pictures))]
+    background = estimate_background(pictures, video.object | video.hand)
+    masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
+    assert (masks.labels[label] == OBJECT).mean() > 0.8
+    assert (masks.labels[video.hand] == OBJECT).mean() < 0.01
+
+
+def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:
+    """A hand covers half of an object that has its colours too."""
+    video, missed = scene(hand=True), range(14, 19)
+    pictures, label = with_label(video)
+    hands = [[] if i in missed else [landmarks(i)] for i in range(len(pictures))]
+    cover = np.zeros_like(label)
+    for i in missed:
+        columns = np.nonzero(video.object[i].any(0))[0]
+        cover[i] = video.object[i] & (np.arange(label.shape[2]) > columns[0] + 0.5 * np.ptp(columns))
+        pictures[i][cover[i]] = SKIN
+    background = estimate_background(pictures, video.object | video.hand)
+    masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
+    assert (masks.labels[cover] == OBJECT).mean() < 0.1
 
 
 def test_landmarks_that_the_object_hides_do_not_make_it_a_hand() -> None:

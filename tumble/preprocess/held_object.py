@@ -106,7 +106,8 @@ class _State:
     probabilities: Float32[np.ndarray, "3 h w"]
     inside: Bool[np.ndarray, "h w"]
     doubtful: Bool[np.ndarray, "h w"]
-    """Pixels close to the landmarks whose colour is the hand's rather than the object's."""
+    """Pixels close to the landmarks or, without any, of what reaches the border, whose colour is the hand's rather than
+    the object's."""
 
 
 def segment(
@@ -250,7 +251,8 @@ def _islands(
 
     No hand covers them, none of their parts is skin by its colours, and they do not reach the border of the image, as
     arms do. They are near the predicted object, or they have its colours and are next to a hand; any place will do
-    if the object was not predicted anywhere.
+    if the object was not predicted anywhere. Near the predicted object they may have any colours if hands were detected
+    and even with the skin they do not reach the border: print may have the colours of a hand.
     """
     log_ratio = _object_over_hand(log_likelihood)
     radius = segmentation.search_radius(predicted)
@@ -270,7 +272,18 @@ def _islands(
     coloured = (mean > MIN_ISLAND_LOG_RATIO) & _touches(ids, count, place)
     chosen = (size >= segmentation.MIN_PIXELS) & ((near & (mean > 0)) | coloured) & ~_at_border(ids, count)
     chosen[0] = False
-    return chosen[ids]
+    if frame.surroundings is None:
+        return chosen[ids]
+    count, beside = segmentation.components(_possible_foreground(frame) & ~frame.surroundings)
+    free = np.bincount(beside.ravel(), minlength=count) >= segmentation.MIN_PIXELS
+    free &= _touches(beside, count, segmentation.dilated(predicted, 2 * radius)) & ~_at_border(beside, count)
+    free[0] = False
+    return chosen[ids] | (free[beside] & frame.foreground)
+
+
+def _possible_foreground(frame: _Frame) -> Bool[np.ndarray, "h w"]:
+    """The foreground and the unknown background, through which an arm may reach the border too."""
+    return segmentation.opened(frame.foreground | ~frame.known, 1)
 
 
 def _object_over_hand(log_likelihood: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "h w"]:
@@ -303,9 +316,12 @@ def _segment_frame(
         log_likelihood: Of the pixels' colours under object, hand and background.
     """
     log_ratio, radius = log_likelihood.copy(), segmentation.search_radius(predicted)
-    doubtful = np.zeros_like(predicted)
-    if frame.surroundings is not None:
-        doubtful = frame.surroundings & (_object_over_hand(log_ratio) < 0)
+    doubtful = _object_over_hand(log_ratio) < 0
+    if frame.surroundings is None:
+        count, ids = segmentation.components(_possible_foreground(frame))
+        doubtful &= _at_border(ids, count)[ids] & (ids > 0)
+    else:
+        doubtful &= frame.surroundings
         possible_arm = frame.skin & ~segmentation.eroded(expected, radius)
         far = expected & ~possible_arm & ~frame.surroundings
         log_ratio[HAND_CLASS, far] = np.minimum(log_ratio[HAND_CLASS, far], NO_HAND_LOG_LIKELIHOOD)

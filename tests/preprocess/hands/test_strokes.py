@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.preprocess.hands.picture import LITTLE_FINGER, THUMB_TIP, picture
-from tumble.preprocess.hands import Hand, detect_hands, hand_region, hand_strokes
+from tumble.preprocess.hands import Hand, detect_hands, hand_region, hand_strokes, hand_surroundings
 
 WRIST, KNUCKLES, TIPS = 150.5, 100.5, 60.5
 """Rows of a hand that points up."""
@@ -39,6 +39,18 @@ def test_the_region_contains_the_strokes_with_a_margin() -> None:
     columns = np.flatnonzero(region[80])
     assert abs(columns[0] - (80 - 22)) <= 1
     assert abs(columns[-1] - (120 + 22)) <= 1
+
+
+def test_the_surroundings_are_fingers_with_their_width_and_the_flesh_of_the_palm() -> None:
+    """Margins: 0.1 and 0.25 of the size, 5 and 13 pixels. Between thumb and index finger there is skin."""
+    hand = flat()
+    hand.landmarks[:, 0] += np.where(np.isin(np.arange(21), (2, 3, 4)), -30, 0)  # the thumb points away
+    around = hand_surroundings([hand], (200, 220))
+    assert not (hand_strokes([hand], (200, 220)) & ~around).any()
+    assert abs(np.flatnonzero(around[62])[-1] - (120 + 3 + 5)) <= 2
+    assert abs(np.flatnonzero(around[:, 100])[-1] - (150 + 13)) <= 2
+    assert around[93, 70], "skin"
+    assert not around[65, 70], "between the tips"
 
 
 def test_strokes_of_a_photograph_are_skin() -> None:

@@ -21,8 +21,12 @@ PALM_MARGIN = 0.05
 REGION_MARGIN = 0.4
 """Distance from the landmarks up to which a hand may reach, as a fraction of the size of the palm."""
 
-FINGER_MARGIN = 0.25
+FINGER_MARGIN = 0.1
 """Distance from the strokes up to which pixels may show fingers, as a fraction of the size of the palm."""
+FLESH = (PALM, (1, 2, 5))
+"""Landmarks around the palm, and around the skin between thumb and index finger."""
+FLESH_MARGIN = 0.25
+"""Distance from these areas up to which pixels may show a hand, as a fraction of the size of the palm."""
 ARM_WIDTH = 0.8
 """Width of an arm as a fraction of the size of the palm."""
 ARM_REACH = (0.3, 6.0)
@@ -64,7 +68,7 @@ def hand_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarra
 
 
 def hand_surroundings(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the hands and close to them: the strokes, widened to fingers.
+    """Pixels of the hands and close to them: the strokes, widened to fingers, and the palms, widened to their flesh.
 
     Args:
         hands: Hands of one image.
@@ -72,9 +76,10 @@ def hand_surroundings(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.
     """
     mask = np.zeros(shape, bool)
     for hand in hands:
-        radius = _thickness(FINGER_MARGIN * palm_size(hand))
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-        mask |= cv2.dilate(hand_strokes([hand], shape).astype(np.uint8), disc) > 0
+        points, size, flesh = np.floor(hand.landmarks).astype(np.int32), palm_size(hand), np.zeros(shape, np.uint8)
+        for area in FLESH:
+            cv2.fillPoly(flesh, [points[list(area)]], 1)
+        mask |= _widened(flesh > 0, FLESH_MARGIN * size) | _widened(hand_strokes([hand], shape), FINGER_MARGIN * size)
     return mask
 
 
@@ -99,6 +104,13 @@ def palm_size(hand: Hand) -> float:
     """Largest distance between landmarks of the palm, about the same from all sides [pixels]."""
     palm = hand.landmarks[list(PALM)]
     return float(np.linalg.norm(palm[:, None] - palm, axis=-1).max())
+
+
+def _widened(mask: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray, "h w"]:
+    """The mask with all pixels up to a distance from it [pixels]."""
+    radius = _thickness(distance)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.dilate(mask.astype(np.uint8), disc) > 0
 
 
 def _thickness(width: float) -> int:
