@@ -334,6 +334,9 @@ def _segment_frame(
     label = probabilities.argmax(0)
     inside = _connected(label == OBJECT_CLASS, predicted)
     inside = _with_print(inside, label == HAND_CLASS, frame.surroundings)
+    if frame.surroundings is None:  # what the object surrounds is its print
+        count, ids = segmentation.components(doubtful & inside)
+        doubtful &= (_touches(ids, count, ~segmentation.eroded(inside, 1)) & (np.arange(count) > 0))[ids]
     return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful)
 
 
