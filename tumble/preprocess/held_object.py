@@ -33,7 +33,7 @@ from tumble.preprocess.colour_model import (
     skin_coloured,
     trim_rim,
 )
-from tumble.preprocess.hands import Hand, arm_region, hand_strokes, hand_surroundings
+from tumble.preprocess.hands import Hand, arm_region, hand_strokes, hand_surroundings, wrist_region
 from tumble.preprocess.segmentation import Masks, Seed
 from tumble.scene import OBJECT, UNKNOWN
 
@@ -95,6 +95,7 @@ class _Frame:
     surroundings: Bool[np.ndarray, "h w"] | None
     """Pixels that may show the detected hands or their arms; None if no hand was detected."""
     arm: Bool[np.ndarray, "h w"]
+    wrists: Bool[np.ndarray, "h w"]
     skin: Bool[np.ndarray, "h w"]
     """Pixels in the colour range of skin."""
 
@@ -147,6 +148,7 @@ def segment(
             hand_strokes(found, shape),
             hand_surroundings(found, shape) | arm if found else None,
             arm,
+            wrist_region(found, shape),
             skin_coloured(images[i]),
         )
 
@@ -252,7 +254,7 @@ def _islands(
     No hand covers them, none of their parts is skin by its colours, and they do not reach the border of the image, as
     arms do. They are near the predicted object, or they have its colours and are next to a hand; any place will do
     if the object was not predicted anywhere. Near the predicted object they may have any colours if hands were detected
-    and even with the skin they do not reach the border: print may have the colours of a hand.
+    and even with the skin they reach neither the border nor a wrist: print may have the colours of a hand.
     """
     log_ratio = _object_over_hand(log_likelihood)
     radius = segmentation.search_radius(predicted)
@@ -276,7 +278,8 @@ def _islands(
         return chosen[ids]
     count, beside = segmentation.components(_possible_foreground(frame) & ~frame.surroundings)
     free = np.bincount(beside.ravel(), minlength=count) >= segmentation.MIN_PIXELS
-    free &= _touches(beside, count, segmentation.dilated(predicted, 2 * radius)) & ~_at_border(beside, count)
+    free &= _touches(beside, count, segmentation.dilated(predicted, 2 * radius))
+    free &= ~_at_border(beside, count) & ~_touches(beside, count, frame.wrists)
     free[0] = False
     return chosen[ids] | (free[beside] & frame.foreground)
 

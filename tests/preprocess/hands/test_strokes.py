@@ -1,9 +1,10 @@
 """Seeds of a segmentation from landmarks whose places are known."""
 
 import numpy as np
+import pytest
 
 from tests.preprocess.hands.picture import LITTLE_FINGER, THUMB_TIP, picture
-from tumble.preprocess.hands import Hand, detect_hands, hand_region, hand_strokes, hand_surroundings
+from tumble.preprocess.hands import Hand, detect_hands, hand_region, hand_strokes, hand_surroundings, wrist_region
 
 WRIST, KNUCKLES, TIPS = 150.5, 100.5, 60.5
 """Rows of a hand that points up."""
@@ -51,6 +52,13 @@ def test_the_surroundings_are_fingers_with_their_width_and_the_flesh_of_the_palm
     assert abs(np.flatnonzero(around[:, 100])[-1] - (150 + 13)) <= 2
     assert around[93, 70], "skin"
     assert not around[65, 70], "between the tips"
+
+
+def test_an_arm_begins_around_the_wrist() -> None:
+    """0.8 of the size: 43 pixels."""
+    rows, columns = np.nonzero(wrist_region([flat()], (220, 220)))
+    assert (rows.min(), rows.max()) == pytest.approx((WRIST - 43, WRIST + 43), abs=1)
+    assert (columns.min(), columns.max()) == pytest.approx((100 - 43, 100 + 43), abs=1)
 
 
 def test_strokes_of_a_photograph_are_skin() -> None:

@@ -100,6 +100,21 @@ def arm_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray
     return mask.astype(bool)
 
 
+def wrist_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels around the wrists: an arm begins there, wherever a bent wrist lets it go.
+
+    Args:
+        hands: Hands of one image.
+        shape: Height and width of the image [pixels].
+    """
+    mask = np.zeros(shape, np.uint8)
+    for hand in hands:
+        cv2.circle(
+            mask, np.floor(hand.landmarks[WRIST]).astype(int).tolist(), round(ARM_WIDTH * palm_size(hand)), 1, -1
+        )
+    return mask.astype(bool)
+
+
 def palm_size(hand: Hand) -> float:
     """Largest distance between landmarks of the palm, about the same from all sides [pixels]."""
     palm = hand.landmarks[list(PALM)]
