@@ -1,16 +1,17 @@
 """All measurements that need an NVIDIA GPU, in one command of at most nine minutes: tests, speed, scores and memory.
 
-`make gpu`, which is `python -m benchmarks.gpu [--capture CAPTURE...] [--quality NAME...] [--only PART...]`, writes
-`gpu.json`, images and the output of the tests into `$OUT`, or `build/gpu`. It needs no network, only the packages on
-Python's path: those of the package, its extra `cuda`, and pytest; `python -m benchmarks.requirements` names the missing
-ones. The parts run in this order:
+`make gpu`, which is `python -m benchmarks.gpu [--capture CAPTURE...] [--quality NAME...] [--scale FACTOR]
+[--only PART...]`, writes `gpu.json`, images and the output of the tests into `$OUT`, or `build/gpu`. It needs no
+network, only the packages on Python's path: those of the package, its extra `cuda`, and pytest;
+`python -m benchmarks.requirements` names the missing ones. The parts run in this order:
 
     tests     the tests that are marked `gpu`
     kernels   milliseconds of each kernel: on the GPU, in plain torch on the GPU, and on the CPU
     draft     DRAFT on the bundled clip with its true poses, on the GPU and on the CPU: seconds, scores, difference
     profile   kernel launches, synchronisations and copies in one step of stages 2 and 3
     standard  STANDARD on the bundled clip with 200 frames of 512 x 512: seconds, memory, scores; with `--capture`,
-              the recipes `--quality` (draft and standard) on each of those captures, in as many times its limit
+              the recipes `--quality` (draft and standard) on each of those captures, in as many times its limit, with
+              `--scale` at a fraction of their computation (`recipes.scaled`)
     graphs    milliseconds of a step of stages 2 and 3 with and without a CUDA graph
 
 Each part is a process of its own with a limit of time. A part that fails, or is stopped at its limit, is marked in
@@ -50,7 +51,7 @@ from tumble.evaluation import align_views, predict_views, read_with_truth, score
 from tumble.inverse_rendering import decompose, refine
 from tumble.io import files, tree
 from tumble.pipeline import reconstruct
-from tumble.recipes import DRAFT, QUALITIES, SMOKE, STANDARD, Recipe, known_poses
+from tumble.recipes import DRAFT, QUALITIES, SMOKE, STANDARD, Recipe, known_poses, scaled
 from tumble.scene import Asset, Capture, Truth
 
 SIZES = [(10_000, 128), (10_000, 256), (10_000, 512), (100_000, 256), (100_000, 512), (100_000, 1024)]
@@ -87,6 +88,8 @@ class Plan:
 
     qualities: tuple[str, ...] = ("draft", "standard")
     """Recipes for `captures`."""
+    scale: float = 1.0
+    """Fraction of the computation of `qualities`."""
 
     @property
     def device(self) -> torch.device:
@@ -98,6 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, nargs="+", default=(), help="captures to run, with known poses")
     parser.add_argument("--quality", nargs="+", choices=QUALITIES, default=Plan.qualities, help="recipes for them")
+    parser.add_argument("--scale", type=float, default=Plan.scale, help="fraction of these recipes' computation")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT") or "build/gpu"))
     parser.add_argument("--dry", action="store_true", help="on the CPU with tiny settings, to test the command")
@@ -105,7 +109,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.dry or torch.cuda.is_available()):
         sys.exit("torch finds no NVIDIA GPU on this machine; `tumble doctor` lists what it finds")
-    plan = Plan(arguments.out, tuple(arguments.capture), arguments.dry, tuple(arguments.quality))
+    plan = Plan(arguments.out, tuple(arguments.capture), arguments.dry, tuple(arguments.quality), arguments.scale)
     plan.out.mkdir(parents=True, exist_ok=True)
     if arguments.here:
         sys.exit(not run_part(plan, arguments.only[0]))
@@ -127,7 +131,7 @@ def result_of_process(plan: Plan, name: str, limit: float) -> Row:
     file, started = plan.out / f"{name}.json", time.perf_counter()
     file.unlink(missing_ok=True)
     command = [sys.executable, "-m", "benchmarks.gpu", "--here", "--only", name, "--out", str(plan.out)]
-    command += ["--dry"] * plan.dry + ["--quality", *plan.qualities]
+    command += ["--dry"] * plan.dry + ["--quality", *plan.qualities, "--scale", str(plan.scale)]
     command += ["--capture", *map(str, plan.captures)] if plan.captures else []
     # As `tumble` does: threads that spin while they wait delay those of the backward pass by milliseconds.
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
@@ -232,7 +236,7 @@ def standard(plan: Plan, row: Row) -> None:
     """Runs of the captures on the GPU, or STANDARD on the bundled clip."""
     for path in plan.captures:
         for name in plan.qualities:
-            rows, recipe = row.setdefault(path.name, {}), SMOKE if plan.dry else QUALITIES[name]
+            rows, recipe = row.setdefault(path.name, {}), SMOKE if plan.dry else scaled(QUALITIES[name], plan.scale)
             out = plan.out / f"{path.name}-{name}"
             measure_run(rows.setdefault(name, {}), folder.load(path), path, out, recipe, plan.device)
     if not plan.captures:
