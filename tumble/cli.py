@@ -201,7 +201,8 @@ def run(
             poses, where it reaches 23 to 35 dB of albedo. Nearly all figures in docs are of this quality.
             standard: 20,000 and 10,000 steps, for a GPU, 0.4 to 2 dB ahead of draft. On an H200 109 seconds for 100
             frames of 512 x 512 pixels with known poses, 31 with draft (benchmarks/gpu.md).
-            full: 60,000 and 30,000 steps, for a GPU. Not better than standard in the one run on a GPU (docs/method.md).
+            full: 60,000 and 30,000 steps, for a GPU. Not measured as it is; with a finer light the one run on a GPU was
+            worse than standard (docs/method.md).
             paper: the paper's stages and numbers instead of ours, for a GPU, apart from its stage 1 (--route), which
             takes days on the CPU unless poses are given. Run only at a fraction of its size (docs/method.md), where it
             is far behind draft.

@@ -19,7 +19,7 @@ PRINT = (196, 140, 112)
 """A print on the object in the colour of the hand [sRGB code values]."""
 
 SKIN = (205, 150, 120)
-"""A hand of another person [sRGB code values]."""
+"""A hand [sRGB code values]."""
 
 
 def landmarks(i: int) -> Hand:
@@ -167,7 +167,7 @@ def test_what_a_hand_had_hidden_is_object_again() -> None:
     pictures, truth, hands = video.pictures.copy(), video.object.copy(), [[] for _ in video.pictures]
     columns = np.nonzero(video.object[6].any(0))[0]
     edge = int(columns[0] + 0.25 * (columns[-1] - columns[0]))
-    pictures[covered, :, edge:] = (205, 150, 120)
+    pictures[covered, :, edge:] = SKIN
     truth[covered, :, edge:] = False
     palm = landmarks(0).landmarks * 1.4
     palm += (edge + 6, 20) - palm.min(0)

@@ -221,7 +221,9 @@ def _change(
 ) -> _Change:
     """The connected parts of the change that touch the evidence."""
     after = mean_field_probability(odds, image) > 0.5
-    return _Change(_touching(inside & ~after, wrong), _touching(after & ~inside, missing), colours)
+    return _Change(
+        segmentation.touching(inside & ~after, wrong), segmentation.touching(after & ~inside, missing), colours
+    )
 
 
 def _corrected(image: np.ndarray, labels: np.ndarray, change: _Change, background: Background) -> np.ndarray:
@@ -234,14 +236,6 @@ def _corrected(image: np.ndarray, labels: np.ndarray, change: _Change, backgroun
     new[change.added] = UNKNOWN
     new[segmentation.dilated(change.added, 2) & segmentation.eroded(grown, 1)] = OBJECT
     return new
-
-
-def _touching(mask: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Connected components of a mask that a region touches."""
-    count, ids = segmentation.components(mask)
-    keep = np.bincount(ids[where], minlength=count) > 0
-    keep[0] = False
-    return keep[ids]
 
 
 def _similar(lab: np.ndarray, pixel: tuple[int, int], barrier: np.ndarray) -> np.ndarray:

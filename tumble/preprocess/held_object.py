@@ -96,6 +96,7 @@ class _Frame:
     """Pixels that may show the detected hands or their arms; None if no hand was detected."""
     arm: Bool[np.ndarray, "h w"]
     wrists: Bool[np.ndarray, "h w"]
+    """Pixels where an arm may begin."""
     skin: Bool[np.ndarray, "h w"]
     """Pixels in the colour range of skin."""
 
@@ -267,21 +268,27 @@ def _islands(
     count, ids = segmentation.components(segmentation.opened(frame.foreground & ~hand, 1))
     size = np.bincount(ids.ravel(), minlength=count)
     mean = np.bincount(ids.ravel(), log_ratio.ravel(), minlength=count) / np.maximum(size, 1)
-    near = _touches(ids, count, segmentation.dilated(predicted, 2 * radius))
+    close = segmentation.dilated(predicted, 2 * radius)
+    near = _touches(ids, count, close)
     place = np.ones_like(predicted)
     if predicted.any():
         place = predicted if frame.surroundings is None else segmentation.dilated(frame.surroundings, radius)
     coloured = (mean > MIN_ISLAND_LOG_RATIO) & _touches(ids, count, place)
     chosen = (size >= segmentation.MIN_PIXELS) & ((near & (mean > 0)) | coloured) & ~_at_border(ids, count)
     chosen[0] = False
-    if frame.surroundings is None:
-        return chosen[ids]
-    count, beside = segmentation.components(_possible_foreground(frame) & ~frame.surroundings)
-    free = np.bincount(beside.ravel(), minlength=count) >= segmentation.MIN_PIXELS
-    free &= _touches(beside, count, segmentation.dilated(predicted, 2 * radius))
-    free &= ~_at_border(beside, count) & ~_touches(beside, count, frame.wrists)
+    islands = chosen[ids]
+    return islands if frame.surroundings is None else islands | _free_parts(frame, frame.surroundings, close)
+
+
+def _free_parts(
+    frame: _Frame, surroundings: Bool[np.ndarray, "h w"], close: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Parts of the foreground beside the detected hands that are near the object and reach no border and no wrist."""
+    count, ids = segmentation.components(_possible_foreground(frame) & ~surroundings)
+    free = np.bincount(ids.ravel(), minlength=count) >= segmentation.MIN_PIXELS
+    free &= _touches(ids, count, close) & ~_at_border(ids, count) & ~_touches(ids, count, frame.wrists)
     free[0] = False
-    return chosen[ids] | (free[beside] & frame.foreground)
+    return free[ids] & frame.foreground
 
 
 def _possible_foreground(frame: _Frame) -> Bool[np.ndarray, "h w"]:
@@ -321,8 +328,7 @@ def _segment_frame(
     log_ratio, radius = log_likelihood.copy(), segmentation.search_radius(predicted)
     doubtful = _object_over_hand(log_ratio) < 0
     if frame.surroundings is None:
-        count, ids = segmentation.components(_possible_foreground(frame))
-        doubtful &= _at_border(ids, count)[ids] & (ids > 0)
+        doubtful &= segmentation.touching(_possible_foreground(frame), _border(doubtful.shape))
     else:
         doubtful &= frame.surroundings
         possible_arm = frame.skin & ~segmentation.eroded(expected, radius)
@@ -338,8 +344,7 @@ def _segment_frame(
     inside = _connected(label == OBJECT_CLASS, predicted)
     inside = _with_print(inside, label == HAND_CLASS, frame.surroundings)
     if frame.surroundings is None:  # what the object surrounds is its print
-        count, ids = segmentation.components(doubtful & inside)
-        doubtful &= (_touches(ids, count, ~segmentation.eroded(inside, 1)) & (np.arange(count) > 0))[ids]
+        doubtful = segmentation.touching(doubtful & inside, ~segmentation.eroded(inside, 1))
     return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful)
 
 
@@ -363,9 +368,14 @@ def _touches(ids: np.ndarray, count: int, where: Bool[np.ndarray, "h w"]) -> Boo
 
 def _at_border(ids: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
     """Whether each labelled component touches the border of the image."""
-    border = np.ones(ids.shape, bool)
+    return _touches(ids, count, _border(ids.shape))
+
+
+def _border(shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+    """The outermost pixels of an image."""
+    border = np.ones(shape, bool)
     border[1:-1, 1:-1] = False
-    return _touches(ids, count, border)
+    return border
 
 
 def _without_object(probabilities: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]:

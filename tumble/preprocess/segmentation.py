@@ -454,6 +454,14 @@ def components(mask: np.ndarray) -> tuple[int, np.ndarray]:
     return count, np.asarray(ids, np.int32)
 
 
+def touching(mask: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Connected components of a mask that a region touches."""
+    count, ids = components(mask)
+    keep = np.bincount(ids[where], minlength=count) > 0
+    keep[0] = False
+    return keep[ids]
+
+
 def _empty_like(mask: np.ndarray) -> np.ndarray:
     return np.zeros(mask.shape, bool)
 

@@ -109,9 +109,8 @@ def wrist_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarr
     """
     mask = np.zeros(shape, np.uint8)
     for hand in hands:
-        cv2.circle(
-            mask, np.floor(hand.landmarks[WRIST]).astype(int).tolist(), round(ARM_WIDTH * palm_size(hand)), 1, -1
-        )
+        wrist, radius = np.floor(hand.landmarks[WRIST]).astype(int).tolist(), round(ARM_WIDTH * palm_size(hand))
+        cv2.circle(mask, wrist, radius, 1, -1)
     return mask.astype(bool)
 
 
