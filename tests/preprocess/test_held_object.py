@@ -1,5 +1,6 @@
 """Masks of an object in a hand whose landmarks are known, compared with the true masks of a synthetic video."""
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -12,7 +13,7 @@ from tumble.preprocess import held_object
 from tumble.preprocess.background import estimate_background
 from tumble.preprocess.colour_model import UNIFORM_DENSITY, hand_colours
 from tumble.preprocess.hands import Hand
-from tumble.preprocess.segmentation import Masks, Seed, opened, overlap
+from tumble.preprocess.segmentation import Masks, Seed, opened, overlap, search_radius
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
 PRINT = (196, 140, 112)
@@ -146,6 +147,17 @@ def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:
     assert (masks.labels[cover] == OBJECT).mean() < 0.1
 
 
+def test_what_is_near_something_that_reaches_the_border_is_not_alone() -> None:
+    wall, empty = np.zeros((60, 90, 3), np.uint8), np.zeros((60, 90), bool)
+    arm, thing = empty.copy(), empty.copy()
+    arm[:, 60:] = thing[20:40, 20:40] = True
+    frame = held_object._Frame(wall, wall, arm, None, arm | thing, ~empty, empty, None, empty, empty, empty)
+    assert held_object._is_alone(frame, thing)
+    assert not held_object._is_alone(frame, arm)
+    beside = np.roll(thing, 20 - search_radius(thing) // 2, 1)
+    assert not held_object._is_alone(replace(frame, foreground=arm | thing | beside), thing)
+
+
 def test_landmarks_that_the_object_hides_do_not_make_it_a_hand() -> None:
     """On the seed frame the hand is behind the object, and its landmarks are all over the box."""
     video = scene(hand=True)
@@ -161,12 +173,18 @@ def test_landmarks_that_the_object_hides_do_not_make_it_a_hand() -> None:
     assert (masks.labels[video.hand] == OBJECT).mean() < 0.01
 
 
-def test_what_a_hand_had_hidden_is_object_again() -> None:
-    """A second hand covers three quarters of the object for some frames."""
+@pytest.mark.parametrize("label", [False, True])
+def test_what_a_hand_had_hidden_is_object_again(label: bool) -> None:
+    """A second hand covers three quarters of the object for some frames, then none is there.
+
+    What it had hidden has the object's colours, or those of the hand.
+    """
     video, covered = scene(), slice(6, 11)
     pictures, truth, hands = video.pictures.copy(), video.object.copy(), [[] for _ in video.pictures]
     columns = np.nonzero(video.object[6].any(0))[0]
     edge = int(columns[0] + 0.25 * (columns[-1] - columns[0]))
+    if label:
+        pictures[covered.stop :, :, edge:][truth[covered.stop :, :, edge:]] = PRINT
     pictures[covered, :, edge:] = SKIN
     truth[covered, :, edge:] = False
     palm = landmarks(0).landmarks * 1.4

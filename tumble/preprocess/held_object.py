@@ -12,7 +12,7 @@ contradicts is removed when that is known (`tumble.poses.mask_refinement`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -93,7 +93,8 @@ class _Frame:
     """Pixels whose background is known, or sampled."""
     strokes: Bool[np.ndarray, "h w"]
     surroundings: Bool[np.ndarray, "h w"] | None
-    """Pixels that may show the detected hands or their arms; None if no hand was detected."""
+    """Pixels that may show the detected hands or their arms; none of them if the object is alone; None if no hand was
+    detected."""
     arm: Bool[np.ndarray, "h w"]
     wrists: Bool[np.ndarray, "h w"]
     """Pixels where an arm may begin."""
@@ -220,7 +221,10 @@ def _track(
         warped = segmentation.warped(dis, gray, previous, state.probabilities.transpose(1, 2, 0)).transpose(2, 0, 1)
         prior = _prior(warped)
         likelihood = log_likelihoods(frame.image, background, colours, frame.sampled)
-        islands = _islands(frame, warped[OBJECT_CLASS] > 0.5, likelihood)
+        predicted = warped[OBJECT_CLASS] > 0.5
+        if frame.surroundings is None and _is_alone(frame, predicted):
+            frame = replace(frame, surroundings=np.zeros_like(predicted), skin=np.zeros_like(predicted))
+        islands = _islands(frame, predicted, likelihood)
         prior = _raised(prior, islands & (prior[OBJECT_CLASS] < ISLAND_PROBABILITY))
         predicted = prior[OBJECT_CLASS] > 0.5
         state = _segment_frame(frame, prior, predicted, _filled(predicted), likelihood)
@@ -289,6 +293,15 @@ def _free_parts(
     free &= _touches(ids, count, close) & ~_at_border(ids, count) & ~_touches(ids, count, frame.wrists)
     free[0] = False
     return free[ids] & frame.foreground
+
+
+def _is_alone(frame: _Frame, predicted: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether nothing that reaches the border is near the object, as between two grips."""
+    # Parts of an arm, or of a hand that resembles the background, are one with what they belong to.
+    joined = segmentation.dilated(_possible_foreground(frame), segmentation.search_radius(predicted) // 2)
+    count, ids = segmentation.components(joined)
+    hit = np.bincount(ids[predicted], minlength=count)
+    return bool(((hit > 0.5 * predicted.sum()) & ~_at_border(ids, count))[1:].any())
 
 
 def _possible_foreground(frame: _Frame) -> Bool[np.ndarray, "h w"]:

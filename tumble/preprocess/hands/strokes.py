@@ -1,10 +1,11 @@
 """Regions of an image that belong to a hand for certain, or perhaps, from its landmarks: seeds of a segmentation."""
 
+import math
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from tumble.maths import filled_hull
 from tumble.preprocess.hands.detection import MIDDLE, RING, WRIST, Hand
@@ -92,16 +93,14 @@ def arm_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray
     """
     mask = np.zeros(shape, np.uint8)
     for hand in hands:
-        wrist, knuckles = hand.landmarks[WRIST], (hand.landmarks[MIDDLE] + hand.landmarks[RING]) / 2
-        size, direction = palm_size(hand), wrist - knuckles
-        direction /= max(float(np.linalg.norm(direction)), 1e-3)
+        wrist, size, direction = hand.landmarks[WRIST], palm_size(hand), _arm_direction(hand)
         near, far = (np.floor(wrist + reach * size * direction).astype(int).tolist() for reach in ARM_REACH)
         cv2.line(mask, near, far, 1, _thickness(ARM_WIDTH * size))
     return mask.astype(bool)
 
 
 def wrist_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Pixels around the wrists: an arm begins there, wherever a bent wrist lets it go.
+    """Pixels around the wrists, without the palms' sides: an arm begins there, wherever a bent wrist lets it go.
 
     Args:
         hands: Hands of one image.
@@ -110,7 +109,8 @@ def wrist_region(hands: Sequence[Hand], shape: tuple[int, int]) -> Bool[np.ndarr
     mask = np.zeros(shape, np.uint8)
     for hand in hands:
         wrist, radius = np.floor(hand.landmarks[WRIST]).astype(int).tolist(), round(ARM_WIDTH * palm_size(hand))
-        cv2.circle(mask, wrist, radius, 1, -1)
+        x, y = _arm_direction(hand)
+        cv2.ellipse(mask, wrist, (radius, radius), math.degrees(math.atan2(y, x)), -90, 90, 1, -1)
     return mask.astype(bool)
 
 
@@ -118,6 +118,12 @@ def palm_size(hand: Hand) -> float:
     """Largest distance between landmarks of the palm, about the same from all sides [pixels]."""
     palm = hand.landmarks[list(PALM)]
     return float(np.linalg.norm(palm[:, None] - palm, axis=-1).max())
+
+
+def _arm_direction(hand: Hand) -> Float[np.ndarray, "2"]:
+    """Direction from the knuckles to the wrist, of length 1: that of the arm, unless the wrist is bent."""
+    direction = hand.landmarks[WRIST] - (hand.landmarks[MIDDLE] + hand.landmarks[RING]) / 2
+    return direction / max(float(np.linalg.norm(direction)), 1e-3)
 
 
 def _widened(mask: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray, "h w"]:
