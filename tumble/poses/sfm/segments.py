@@ -43,10 +43,8 @@ from tumble.poses.sfm.tracks import Tracks, gather_keypoints
 from tumble.scene import Match
 
 FRONTIER_WEIGHT = 3.0
-"""Weight of an observation of a frontier point here; the contours of a hidden object are less certain than others."""
-FINAL_FRONTIER_WEIGHT = 0.3
-"""Weight in the last adjustment of all frames with a pose. Contours tell what is right from its mirror image and join
-parts that share no texture, but masks end a little beside the object where a hand begins, which bends long motions."""
+"""Weight of an observation of a frontier point. It is lower than elsewhere, because masks end a little beside the object
+where a hand begins; with a tenth of it chained matches, which follow highlights and shading, bend long motions."""
 WINDOW_SIZE = 8
 """Number of frames per window: enough for parallax, but few enough for a feature to be seen in most of them."""
 ROUGH_SIZE = 6
