@@ -43,8 +43,8 @@ from tumble.poses.sfm.tracks import Tracks, gather_keypoints
 from tumble.scene import Match
 
 FRONTIER_WEIGHT = 3.0
-"""Weight of an observation of a frontier point. It is lower than elsewhere, because masks end a little beside the object
-where a hand begins; with a tenth of it chained matches, which follow highlights and shading, bend long motions."""
+"""Weight of an observation of a frontier point: less than elsewhere, because masks end a little beside the object where
+a hand begins, but with a tenth of it chained matches, which follow highlights and shading, bend long motions."""
 WINDOW_SIZE = 8
 """Number of frames per window: enough for parallax, but few enough for a feature to be seen in most of them."""
 ROUGH_SIZE = 6
