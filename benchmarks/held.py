@@ -82,7 +82,7 @@ def report(rows: list[Row]) -> str:
         "# Objects in a hand\n\n"
         f"`{COMMAND}`; films of 120 frames of 512 x 384 pixels with motion blur, noise, compression and drifting "
         "exposure, rendered by `tumble synth MESH --env adams_place_bridge_1k.hdr --hand --film --views 120 "
-        "--resolution 256 --samples 32` (16 in all rows but that of code 75aac31) with `--skin light "
+        "--resolution 256 --samples 16` with `--skin light "
         "--background clutter --seed 0` (box), `dark torso 1` "
         "(bottle), `medium wall 2` (can) and `light desk 3` (knight). The object turns 5 to 12 degrees from frame to "
         "frame. Known to the program: the box of `film.json` on the first frame, and the focal length. Overlap "
