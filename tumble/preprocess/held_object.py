@@ -259,7 +259,8 @@ def _islands(
     No hand covers them, none of their parts is skin by its colours, and they do not reach the border of the image, as
     arms do. They are near the predicted object, or they have its colours and are next to a hand; any place will do
     if the object was not predicted anywhere. Near the predicted object they may have any colours if hands were detected
-    and even with the skin they reach neither the border nor a wrist: print may have the colours of a hand.
+    or the object is alone, and even with the skin they reach neither the border nor a wrist: print may have the colours
+    of a hand.
     """
     log_ratio = _object_over_hand(log_likelihood)
     radius = segmentation.search_radius(predicted)
@@ -287,7 +288,7 @@ def _islands(
 def _free_parts(
     frame: _Frame, surroundings: Bool[np.ndarray, "h w"], close: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Parts of the foreground beside the detected hands that are near the object and reach no border and no wrist."""
+    """Parts of the foreground beside any detected hands that are near the object and reach no border and no wrist."""
     count, ids = segmentation.components(_possible_foreground(frame) & ~surroundings)
     free = np.bincount(ids.ravel(), minlength=count) >= segmentation.MIN_PIXELS
     free &= _touches(ids, count, close) & ~_at_border(ids, count) & ~_touches(ids, count, frame.wrists)
