@@ -11,6 +11,7 @@ from tumble.maths.se3 import SE3, SO3
 from tumble.poses.sfm import frontier_points, relocalization
 from tumble.poses.sfm.frontier_points import Contours
 from tumble.preprocess.segmentation import make_trimap
+from tumble.scene.camera import Camera
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 
 RADIUS = 0.9
@@ -190,6 +191,38 @@ def test_pixels_occluded_by_a_hand_stay_unknown(scene: Tumble) -> None:
     # Except two pixels beside the band, where object, background and hand meet.
     assert (filled[hand] == UNKNOWN).mean() > 0.97
     assert (filled[~hand] == mask[~hand]).mean() > 0.99
+
+
+def test_contours_move_to_the_edges_of_the_photo() -> None:
+    """A bright ellipse before two walls, of which the right one has its colour; its mask is 2 pixels off.
+
+    So only vertices at the left wall are at edges, and lie on the ellipse.
+    """
+    centre, axes, scale = np.array([47.3, 60.6]), np.array([22.0, 37.0]), 8
+    row, column = np.mgrid[: 120 * scale, : 100 * scale]
+    xy = (np.stack([column, row], -1) + 0.5) / scale
+    inside = np.linalg.norm((xy - centre) / axes, axis=-1) < 1
+    large = np.where(inside | (xy[..., 0] > 47), 200, 90)
+    photo = large.reshape(120, scale, 100, scale).mean((1, 3)).astype(np.uint8)
+    mask = inside.reshape(120, scale, 100, scale).mean((1, 3)) > 0.5
+    mask = np.roll(mask, (1, -2), (0, 1))
+    photos = torch.from_numpy(photo)[None, :, :, None].repeat(1, 1, 1, 3)
+    camera = Camera(torch.tensor([100.0, 100.0, 50.0, 60.0]), 120, 100)
+    masks = torch.from_numpy(np.where(mask, OBJECT, BACKGROUND).astype(np.uint8))[None]
+    capture = Capture(photos, masks, camera, ("a",), "camera", full_images=photos)
+
+    def distance(contours: Contours, chosen: torch.Tensor) -> np.ndarray:
+        """Of the vertices from the ellipse, about [pixels]."""
+        offset = (contours.vertices[chosen].numpy() - centre) / axes
+        return np.abs(np.linalg.norm(offset, axis=1) - 1) * axes.min()
+
+    before = frontier_points.convex_contours(replace(capture, full_images=None))
+    after = frontier_points.convex_contours(capture)
+    left = before.vertices[..., 0] < 40
+    assert after.reliable[left].all()
+    assert not after.reliable[before.vertices[..., 0] > 52].any()
+    assert np.median(distance(before, left)) > 1
+    assert distance(after, left).max() < 0.5
 
 
 def test_an_empty_mask_has_no_reliable_vertex(scene: Tumble) -> None:

@@ -197,6 +197,27 @@ def test_of_two_segments_of_the_same_frames_the_one_that_matches_confirm_is_kept
     assert torch.equal(kept.R, true.R)
 
 
+def test_chained_tracks_are_used_where_matches_are_few(scene: Tumble, inputs: stage.Inputs) -> None:
+    """Frame 8 has no matches; chained tracks go through all frames."""
+    rng, n = torch.Generator().manual_seed(0), 10
+    near = [(i, j) for j in range(n) for i in range(j) if j - i <= 3 and 8 not in (i, j)]
+    matches = [on_object(scene.match(i, j, rng, noise=0), inputs.capture.masks) for i, j in near]
+    chained = inputs.tracks.select(inputs.tracks.frame < n)
+    chained = replace(chained, uv=chained.uv + 0.3)  # Else they have some positions in common.
+    observed = Observed(QUICK, inputs, gather_keypoints(matches, chained, inputs.capture.camera, N))
+    T = scene.T_cam_obj
+    part = Partial(tuple(range(n)), T.rotation.matrix()[:n].double(), T.xyz[:n].double())
+    tracks = segments.matched_tracks(observed, part)
+    is_chained = (tracks.uv[:, None] == chained.uv[None]).all(-1).any(1)
+    assert is_chained[tracks.frame == 8].all()
+    assert (tracks.frame == 8).any()
+    through_it = torch.isin(tracks.point, tracks.point[tracks.frame == 8])
+    assert not is_chained[~through_it].any()
+    assert (~through_it).any()
+    without_it = segments.matched_tracks(observed, part.select([k for k in range(n) if k != 8]))
+    assert not (without_it.uv[:, None] == chained.uv[None]).all(-1).any()
+
+
 def windows(losses: list[tuple[float, float]], turns: list[float]) -> Windows:
     """Windows of four frames, one every two; the rotations of each deviate increasingly by an angle [degrees]."""
     frames = 2 * torch.arange(len(losses))[:, None] + torch.arange(4)

@@ -38,6 +38,18 @@ MARGIN = 2
 be hidden may reach beyond a tangent [pixels]."""
 MAX_BAND = 3
 """Maximum width of a band of unknown pixels that follows a silhouette [pixels]; an occluding hand is wider."""
+MAX_SHIFT = 3.0
+"""Largest distance of a contour from the edge of the photo that it is moved to [pixels]."""
+SIDE = 3.0
+"""Length of the profile on either side of an edge, over which colours are averaged [pixels]."""
+PROFILE_STEP = 0.25
+"""Distance between the samples of a profile [pixels]."""
+BESIDE = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Parallel lines over which a profile is averaged [pixels]."""
+MIN_CONTRAST = 25.0
+"""Distance of the colours on both sides below which there is no edge [code values]: that of shading, or of noise."""
+NOISE_VARIANCE = 30.0
+"""Variance of colour by noise, the sum of three channels [squared code values]."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +122,10 @@ def fill_boundary_bands(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]
 
 
 def convex_contours(capture: Capture) -> Contours:
-    """Contours of all frames; no vertex is reliable in a frame without the object."""
+    """Contours of all frames; no vertex is reliable in a frame without the object.
+
+    With photos of what is around the object, they are moved to the edges in these (`at_edges`).
+    """
     height, width = capture.camera.height, capture.camera.width
     vertices, outer, reliable = [], [], []
     reach = _reach(capture.masks.numpy())
@@ -131,9 +146,63 @@ def convex_contours(capture: Capture) -> Contours:
         outer.append(vertices[-1] if possible is None else torch.from_numpy(possible + 0.5).float())
         reliable.append(torch.from_numpy(~occluded & ~cut_off))
     same = torch.equal(torch.stack(vertices), torch.stack(outer))
-    return Contours(
+    contours = Contours(
         torch.stack(vertices).double(), torch.stack(reliable), None if same else torch.stack(outer).double()
     )
+    return contours if capture.full_images is None else at_edges(contours, capture.full_images)
+
+
+def at_edges(contours: Contours, photos: UInt8[Tensor, "c h w 3"]) -> Contours:
+    """Contours moved to the nearest edges of the photos; vertices without one are not reliable.
+
+    Masks of a film err by one or two pixels alike along a whole side, in many frames: by a shadow beside the object, or
+    by a part of it that is as dark as what is behind it. That turns the poses of these frames by degrees.
+    """
+    moved, outer, found = [], [], []
+    for k, photo in enumerate(photos.numpy()):
+        vertices, is_edge = _at_edges(contours.vertices[k].numpy(), photo)
+        moved.append(torch.from_numpy(vertices))
+        found.append(torch.from_numpy(is_edge))
+        if contours.outer is not None:
+            outer.append(torch.from_numpy(_at_edges(contours.outer[k].numpy(), photo)[0]))
+    reliable = contours.reliable & torch.stack(found)
+    return Contours(torch.stack(moved), reliable, torch.stack(outer) if outer else None)
+
+
+def _at_edges(
+    polygon: Float[np.ndarray, "v 2"], photo: UInt8[np.ndarray, "h w 3"]
+) -> tuple[Float[np.ndarray, "v 2"], Bool[np.ndarray, " v"]]:
+    """Vertices of a convex polygon moved along its normals to the clearest edge, and which of them have one.
+
+    The edge is where the colours on both sides differ most, over their variance.
+    """
+    corner = (polygon != np.roll(polygon, 1, 0)).any(1)
+    corners = polygon[corner]
+    if len(corners) < 3:
+        return polygon, np.zeros(len(polygon), bool)
+    along = np.roll(corners, -1, 0) - corners
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    tangent = along + np.roll(along, 1, 0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True).clip(1e-9)
+    area = (corners * np.roll(corners, -1, 0)[:, ::-1] * (1, -1)).sum()
+    tangent = np.sign(area) * tangent[corner.cumsum() - 1]
+    normal = tangent[:, ::-1] * (1, -1)
+    steps = np.arange(-MAX_SHIFT - SIDE, MAX_SHIFT + SIDE, PROFILE_STEP) + PROFILE_STEP / 2
+    at = (polygon[:, None, None] + steps[:, None, None] * normal[:, None, None]) + (
+        np.array(BESIDE)[:, None] * tangent[:, None, None]
+    )
+    # Centres of pixels are at whole numbers for OpenCV.
+    x, y = np.moveaxis(at.reshape(len(polygon), -1, 2).astype(np.float32) - np.float32(0.5), -1, 0)
+    colours = cv2.remap(photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    profile = colours.reshape(len(polygon), len(steps), len(BESIDE), 3).mean(2)
+    windows = np.lib.stride_tricks.sliding_window_view(profile, round(SIDE / PROFILE_STEP), axis=1)
+    mean, variance = windows.mean(-1), windows.var(-1).sum(-1)
+    apart = round(SIDE / PROFILE_STEP)
+    contrast = np.linalg.norm(mean[:, apart:] - mean[:, :-apart], axis=-1)
+    best = (contrast**2 / (variance[:, apart:] + variance[:, :-apart] + NOISE_VARIANCE)).argmax(1)
+    found = contrast[np.arange(len(polygon)), best] >= MIN_CONTRAST
+    shift = np.where(found, best * PROFILE_STEP - MAX_SHIFT, 0.0)
+    return polygon + shift[:, None] * normal, found
 
 
 def _reach(masks: UInt8[np.ndarray, "t h w"]) -> float:

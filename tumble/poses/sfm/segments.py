@@ -27,6 +27,7 @@ from tumble.poses.frame_pairs import neighbours
 from tumble.poses.sfm.adjustment import Windows, adjust_windows, averaged_windows, deviation
 from tumble.poses.sfm.observations import Inputs, gather, on_object, shown, silhouette_centres, tracks_of
 from tumble.poses.sfm.partial import (
+    MIN_OBSERVATIONS,
     TOLERANCE,
     Observed,
     Partial,
@@ -39,7 +40,7 @@ from tumble.poses.sfm.partial import (
 )
 from tumble.poses.sfm.registration import Hypotheses, grow, join
 from tumble.poses.sfm.schedule import BaseConfig
-from tumble.poses.sfm.tracks import Tracks, gather_keypoints
+from tumble.poses.sfm.tracks import Tracks, concatenate, gather_keypoints
 from tumble.scene import Match
 
 FRONTIER_WEIGHT = 3.0
@@ -144,8 +145,23 @@ def _understood(
     parts = join(sure, _grown(sure, parts, cautious=cautious), known, certain=cautious)
     if not parts:
         return [], inputs.tracks
-    tracks = thinned(joined_tracks(sure, parts[0], TOLERANCE)[0])
+    tracks = matched_tracks(sure, parts[0])
     return parts, replace(tracks, frame=torch.tensor(parts[0].frames)[tracks.frame])
+
+
+def matched_tracks(observed: Observed, part: Partial) -> Tracks:
+    """The tracks to which all frames of a part are adjusted in the end, with frames numbered by their place in it.
+
+    They are joined from matches of pairs of frames. Chained tracks, which follow highlights and shading, are only used
+    through the frames that too few of these see.
+    """
+    none = replace(observed.keypoints, observations=observed.keypoints.observations[:0])
+    matched, _ = joined_tracks(replace(observed, keypoints=none), part, TOLERANCE)
+    every, _ = joined_tracks(observed, part, TOLERANCE)
+    few = torch.bincount(matched.frame, minlength=len(part)) < MIN_OBSERVATIONS
+    there = torch.zeros(every.n, dtype=torch.bool)
+    there[every.point[few[every.frame]]] = True
+    return concatenate(thinned(matched), thinned(every.select(there[every.point])))
 
 
 def _learned(inputs: Inputs, known: Sequence[set[int]]) -> tuple[list[Match], list[Match]]:
