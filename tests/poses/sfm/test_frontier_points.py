@@ -225,6 +225,17 @@ def test_contours_move_to_the_edges_of_the_photo() -> None:
     assert distance(after, left).max() < 0.5
 
 
+def test_small_parts_away_from_the_object_are_unknown() -> None:
+    """The second part, a sixth of the first, stays; the scrap is not; an empty mask stays empty."""
+    masks = torch.zeros(2, 40, 60, dtype=torch.uint8)
+    masks[0, 5:25, 5:35], masks[0, 5:15, 40:50], masks[0, 35:38, 50:55] = OBJECT, OBJECT, OBJECT
+    found = frontier_points.without_scraps(masks)
+    expected = masks.clone()
+    expected[0, 35:38, 50:55] = UNKNOWN
+    assert torch.equal(found, expected)
+    assert (masks != UNKNOWN).all()
+
+
 def test_an_empty_mask_has_no_reliable_vertex(scene: Tumble) -> None:
     empty = Capture(
         scene.capture.images[:1],

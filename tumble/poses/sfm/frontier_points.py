@@ -38,6 +38,8 @@ MARGIN = 2
 be hidden may reach beyond a tangent [pixels]."""
 MAX_BAND = 3
 """Maximum width of a band of unknown pixels that follows a silhouette [pixels]; an occluding hand is wider."""
+MIN_PART = 0.15
+"""Area of a part of the object below which it may be something else [largest part], as in the masks of films."""
 MAX_SHIFT = 3.0
 """Largest distance of a contour from the edge of the photo that it is moved to [pixels]."""
 SIDE = 3.0
@@ -119,6 +121,21 @@ def fill_boundary_bands(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]
         nearer = np.where(object_distance <= background_distance, np.uint8(OBJECT), np.uint8(BACKGROUND))
         filled.append(torch.from_numpy(np.where(band, nearer, mask)))
     return torch.stack(filled)
+
+
+def without_scraps(masks: UInt8[Tensor, "t h w"]) -> UInt8[Tensor, "t h w"]:
+    """Masks in which small parts of the object, away from the rest, are unknown.
+
+    A few pixels of a sleeve beside the object would stretch its convex hull to them.
+    """
+    masks = masks.clone()
+    for mask in masks.numpy():
+        _, ids, stats, _ = cv2.connectedComponentsWithStats((mask == OBJECT).astype(np.uint8))
+        area = stats[:, cv2.CC_STAT_AREA]
+        small = area < MIN_PART * area[1:].max(initial=0)
+        small[0] = False
+        mask[small[ids]] = UNKNOWN
+    return masks
 
 
 def convex_contours(capture: Capture) -> Contours:

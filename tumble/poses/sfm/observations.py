@@ -74,6 +74,8 @@ def gather(capture: Capture, matches: Sequence[Match], *, hidden: bool = False) 
         ValueError: No frame shows the object.
     """
     capture = replace(capture, masks=frontier_points.fill_boundary_bands(capture.masks))
+    if hidden:
+        capture = replace(capture, masks=frontier_points.without_scraps(capture.masks))
     silhouettes = relative_pose.silhouettes(capture)
     if not bool(silhouettes.visible.any()):
         raise ValueError("no mask has an object pixel: poses need masks that show the object")
