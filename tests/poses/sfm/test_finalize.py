@@ -10,10 +10,10 @@ from tests.lopsided import DISTANCE, KNOBS, tumbling
 from tumble.maths.directions import random_rotation
 from tumble.maths.se3 import SE3, SO3
 from tumble.poses.result import Observability, PoseResult
-from tumble.poses.sfm import finalize, frontier_points
+from tumble.poses.sfm import bundle_adjustment, finalize, frontier_points
 from tumble.poses.sfm.finalize import Solution
 from tumble.poses.sfm.symmetry import mirror_symmetry
-from tumble.poses.sfm.tracks import Tracks, chain_matches
+from tumble.poses.sfm.tracks import Tracks, chain_matches, concatenate
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN, Capture
 from tumble.synthetic import trajectories
 
@@ -231,6 +231,32 @@ def test_lost_frames_say_nothing_about_what_is_observable() -> None:
         for each in (R, wrong)
     ]
     assert torch.allclose(*sigma, rtol=1e-4)
+
+
+def test_outliers_say_nothing_about_what_is_observable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their points lie behind the cameras, where small changes of a pose would move them far."""
+    scene, rng = tumbling(24), torch.Generator().manual_seed(0)
+    matches = [scene.match(t - k, t, rng, noise=0.0, wrong=0.0) for k in (1, 2) for t in range(k, 24)]
+    tracks = chain_matches(matches, torch.full((24,), 5.0))
+    R, t = scene.T_cam_obj.rotation.matrix(), scene.T_cam_obj.xyz / DISTANCE
+    wrong = Tracks(torch.arange(24), torch.arange(24) // 2, 20 + 80 * torch.rand(24, 2, generator=rng).double())
+    triangulate = bundle_adjustment.triangulate
+
+    def with_wrong_ones(tracks: Tracks, *others: object) -> torch.Tensor:
+        X = triangulate(tracks, *others)
+        behind = torch.tensor([3.0, 2.0, -3.0], dtype=torch.float64)
+        if len(X) == n + 12:
+            X[n:] = torch.einsum("fji,fj->fi", R, behind - t)[::2]
+        return X
+
+    def sigma(tracks: Tracks) -> torch.Tensor:
+        contours, symmetry = frontier_points.convex_contours(scene.capture), mirror_symmetry(scene.capture.masks)
+        solution = Solution(R, t, 0.9 / DISTANCE, torch.zeros(24))
+        return finalize.pose_result(scene.capture, tracks, contours, symmetry, solution).quality.observability.sigma
+
+    n = tracks.n
+    monkeypatch.setattr(bundle_adjustment, "triangulate", with_wrong_ones)
+    torch.testing.assert_close(sigma(concatenate(tracks, wrong)), sigma(tracks), rtol=1e-3, atol=0)
 
 
 def test_no_rotation_of_an_untextured_sphere_is_observable() -> None:
