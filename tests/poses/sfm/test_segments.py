@@ -110,6 +110,25 @@ def test_the_network_is_asked_only_where_sift_leaves_frames_out(
     )
 
 
+@pytest.mark.parametrize(("sizes", "kept"), [([9, 24, 30], 24), ([9, 12, 10, 11], 12), ([5, 4, 6, 4, 30], 8)])
+def test_parts_are_joined_again_until_enough_frames_have_a_pose(
+    sizes: list[int], kept: int, scene: Tumble, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three quarters of 30 are 23; the largest result counts, also that of before the network."""
+    R, calls = start(scene), iter(sizes)
+
+    def understood(*_: object, cautious: bool) -> tuple[list[Partial], Tracks]:
+        n = 8 if cautious else next(calls)
+        return [Partial(tuple(range(n)), R[:n], R[:n, 0])], inputs.tracks
+
+    monkeypatch.setattr(segments, "_matched", lambda *_: [])
+    monkeypatch.setattr(segments, "_understood", understood)
+    part, _ = segments.segmented_poses(QUICK, inputs, R, torch.Generator().manual_seed(0))
+    assert part is not None
+    assert len(part) == kept
+    assert len(list(calls)) == len(sizes) - (2 if kept == 24 else segments.ATTEMPTS)
+
+
 def test_the_network_matches_no_pair_of_frames_of_one_part(
     scene: Tumble, inputs: stage.Inputs, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,8 +44,11 @@ from tumble.poses.sfm.tracks import Tracks, concatenate, gather_keypoints
 from tumble.scene import Match
 
 FRONTIER_WEIGHT = 3.0
-"""Weight of an observation of a frontier point: less than elsewhere, because masks end a little beside the object where
-a hand begins, but with a tenth of it chained matches, which follow highlights and shading, bend long motions."""
+"""Weight of an observation of a frontier point here: contours tell what is right from its mirror image and join parts
+that share no texture. It is lower than elsewhere, as masks end a little beside the object where a hand begins."""
+FINAL_FRONTIER_WEIGHT = 1.0
+"""Weight in the last adjustment of all frames with a pose: that of a match, as walls beside the object in many masks
+bend long motions."""
 WINDOW_SIZE = 8
 """Number of frames per window: enough for parallax, but few enough for a feature to be seen in most of them."""
 ROUGH_SIZE = 6
@@ -81,6 +84,11 @@ LEARNED_MATCHER = "aliked"
 """Second matcher, where the first leaves frames out; it finds what rotates by up to about 70 degrees."""
 FAR_LEARNED_MATCHER = "aliked_turned"
 """The same for frames farther apart than `NEAR`, between which the object may have turned far in the image plane."""
+ATTEMPTS = 4
+"""Number of times that parts are sought and joined with all matches, while too few frames have a pose: at the limits of
+what is joined, chance decides."""
+MAX_UNPOSED = 0.25
+"""Fraction of the frames without a pose up to which one attempt is enough."""
 MAX_MISSING = 0.05
 """Fraction of the frames without a pose up to which the second matcher is not needed."""
 LEARNED_STRIDE = 3
@@ -115,9 +123,13 @@ def segmented_poses(
     if part is None or n - len(part) > MAX_MISSING * n:
         of_near, of_far = _learned(inputs, [set(each.frames) for each in parts])
         inputs = gather(inputs.capture, _merged(inputs.all_matches, of_near), hidden=True)
-        others, other_tracks = _understood(cfg, inputs, _merged(wide, of_near, of_far), R, rng, cautious=False)
-        if others and (part is None or len(others[0]) >= len(part)):
-            part, tracks = others[0], other_tracks
+        every = _merged(wide, of_near, of_far)
+        for _ in range(ATTEMPTS):
+            others, other_tracks = _understood(cfg, inputs, every, R, rng, cautious=False)
+            if others and (part is None or len(others[0]) >= len(part)):
+                part, tracks = others[0], other_tracks
+            if part is not None and n - len(part) <= MAX_UNPOSED * n:
+                break
     return part, tracks
 
 

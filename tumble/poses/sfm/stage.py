@@ -88,7 +88,7 @@ from tumble.poses.sfm.schedule import (
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 45
+VERSION = 46
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
@@ -180,7 +180,7 @@ def step(cfg: Config, inputs: Inputs, state: State) -> dict[str, Tensor | float]
 
 def _weighted(cfg: Config, inputs: Inputs) -> Config:
     """The settings with the weight of contours for an object that is hidden in part, if it is."""
-    return replace(cfg, frontier_weight=segments.FRONTIER_WEIGHT) if inputs.hidden else cfg
+    return replace(cfg, frontier_weight=segments.FINAL_FRONTIER_WEIGHT) if inputs.hidden else cfg
 
 
 def _run_phase(now: Step, cfg: Config, inputs: Inputs, state: State) -> "PhaseResult":
@@ -245,6 +245,7 @@ def _adjust_windows(cfg: Config, inputs: Inputs, state: State, phase: AdjustWind
 
 def _join_segments(cfg: Config, inputs: Inputs, state: State) -> PhaseResult:
     """Pose the frames that can be understood, and keep their tracks."""
+    cfg = replace(cfg, frontier_weight=segments.FRONTIER_WEIGHT)
     part, tracks = segments.segmented_poses(cfg, inputs, state.params.R, state.rng)
     if part is None:
         return state.params, {"posed": 0.0}
