@@ -207,7 +207,8 @@ def _write(
             continue
         files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), shown))
         files.write_png(out / "masks" / name, mask[..., None])
-        # Masks of a held object may contain background; stage 1 recognises it by what is around the object.
+        # Masks of a held object may contain background; what is around the object shows its contour in stage 1, and
+        # after it which parts of the masks are background.
         if held:
             files.write_png(out / "full_images" / name, image)
         entries.append(training_frame(name, None, full=held))

@@ -371,7 +371,7 @@ def _observability(
         torch.linalg.inv(texture + 1e-9 * torch.eye(2, dtype=torch.float64))
         + bundle_adjustment.NOISE**2 * torch.eye(2, dtype=torch.float64)
     )
-    # Outliers tell nothing: of a point close to a camera even a precision of 1e-9 would count more than all others.
+    # Outliers tell nothing: of a point behind a camera even a precision of 1e-9 would outweigh all others.
     information = bundle_adjustment.information(problem, scene, precision * inlier[:, None, None])
     kept = torch.nonzero(~lost)[:, 0] if int((~lost).sum()) > 1 else torch.arange(n)
     frames, references = (kept[:: max(1, len(kept) // m)] for m in (ASSESSED_FRAMES, REFERENCE_FRAMES))

@@ -170,7 +170,7 @@ def convex_contours(capture: Capture) -> Contours:
 
 
 def at_edges(contours: Contours, photos: UInt8[Tensor, "c h w 3"]) -> Contours:
-    """Contours moved to the nearest edges of the photos; vertices without one are not reliable.
+    """Contours moved to the clearest edges of the photos beside them; vertices without one are not reliable.
 
     Masks of a film err by one or two pixels alike along a whole side, in many frames: by a shadow beside the object, or
     by a part of it that is as dark as what is behind it. That turns the poses of these frames by degrees.
@@ -212,11 +212,11 @@ def _at_edges(
     x, y = np.moveaxis(at.reshape(len(polygon), -1, 2).astype(np.float32) - np.float32(0.5), -1, 0)
     colours = cv2.remap(photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     profile = colours.reshape(len(polygon), len(steps), len(BESIDE), 3).mean(2)
-    windows = np.lib.stride_tricks.sliding_window_view(profile, round(SIDE / PROFILE_STEP), axis=1)
+    side = round(SIDE / PROFILE_STEP)
+    windows = np.lib.stride_tricks.sliding_window_view(profile, side, axis=1)
     mean, variance = windows.mean(-1), windows.var(-1).sum(-1)
-    apart = round(SIDE / PROFILE_STEP)
-    contrast = np.linalg.norm(mean[:, apart:] - mean[:, :-apart], axis=-1)
-    best = (contrast**2 / (variance[:, apart:] + variance[:, :-apart] + NOISE_VARIANCE)).argmax(1)
+    contrast = np.linalg.norm(mean[:, side:] - mean[:, :-side], axis=-1)
+    best = (contrast**2 / (variance[:, side:] + variance[:, :-side] + NOISE_VARIANCE)).argmax(1)
     found = contrast[np.arange(len(polygon)), best] >= MIN_CONTRAST
     shift = np.where(found, best * PROFILE_STEP - MAX_SHIFT, 0.0)
     return polygon + shift[:, None] * normal, found
