@@ -120,8 +120,10 @@ def test_parts_far_apart_in_time_are_not_compared(observed: Observed) -> None:
     assert contour_joint(observed, half(range(18, 28)), half(range(10))) is None
 
 
-def test_short_parts_are_not_compared(observed: Observed) -> None:
-    assert contour_joint(observed, half(range(12, 18)), half(range(12))) is None
+def test_short_parts_are_not_joined_by_contours_alone(observed: Observed) -> None:
+    joint = contour_joint(observed, half(range(12, 18)), half(range(12)))
+    assert joint is not None
+    assert not replace(joint, gaps=200, gap_cost=0.01, second=math.inf).accepted
 
 
 def test_parts_of_which_little_is_seen_are_not_joined(observed: Observed) -> None:
@@ -146,7 +148,7 @@ def test_parts_of_which_little_is_seen_are_not_joined(observed: Observed) -> Non
     ],
 )
 def test_a_joint_is_accepted_if_it_is_certain(second: float, gaps: int, gap_cost: float, accepted: bool) -> None:
-    assert ContourJoint(half(range(12)), 0.05, second, gaps, gap_cost).accepted == accepted
+    assert ContourJoint(half(range(12)), 0.05, second, gaps, gap_cost, 12).accepted == accepted
 
 
 def test_contours_correct_a_joint_that_few_keypoints_suggest(observed: Observed) -> None:

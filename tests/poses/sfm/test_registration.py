@@ -200,11 +200,35 @@ def test_parts_are_joined_by_contours_only_after_all_keypoints(
     observed: Observed, parts: tuple[Partial, Partial, Partial]
 ) -> None:
     _, a, b = parts
-    by_contours = registration.ContourJoint(b, 0.05, math.inf, 100, 0.05)
+    by_contours = registration.ContourJoint(b, 0.05, math.inf, 100, 0.05, 10)
     assert by_contours.accepted
     known = {(best_joint, a, b): None, (contour_joint, a, b): by_contours}
     assert len(join(observed, [a, b], dict(known), certain=True)) == 2
     assert len(join(observed, [a, b], dict(known), certain=False)) == 1
+
+
+@pytest.mark.parametrize(
+    ("degrees", "cost", "gaps", "joined"),
+    [
+        (5, 0.3, 80, True),
+        (30, 0.3, 80, False),  # contours and keypoints name different motions
+        (5, 1.5, 80, False),  # contours contradict what the keypoints are fitted to
+        (5, 0.3, 20, False),  # contours say next to nothing
+    ],
+)
+def test_parts_are_joined_where_keypoints_and_contours_agree(
+    observed: Observed, parts: tuple[Partial, Partial, Partial], degrees: float, cost: float, gaps: int, joined: bool
+) -> None:
+    """Twelve keypoints are too few, and the contours of a bottle agree nearly as well with other turns."""
+    _, a, b = parts
+    joint = Joint(b, 12, 0.1, 1, cost, gaps, True)
+    turn = SO3.exp(torch.tensor([0, math.radians(degrees), 0], dtype=torch.float64)).matrix()
+    contours = registration.ContourJoint(b.moved(turn, 1.0, torch.zeros(3).double()), 0.1, 0.15, 60, 0.1, 10)
+    assert not joint.accepted
+    assert not contours.accepted
+    known = {(best_joint, a, b): joint, (contour_joint, a, b): contours}
+    assert len(join(observed, [a, b], dict(known), certain=True)) == 2
+    assert len(join(observed, [a, b], dict(known), certain=False)) == (1 if joined else 2)
 
 
 @pytest.mark.parametrize(

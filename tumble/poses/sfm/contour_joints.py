@@ -33,7 +33,7 @@ MAX_DEPTH_RATIO = 1.15
 TURNS = tuple(math.radians(sign * angle) for angle in (10, 20, 30, 40, 50, 60) for sign in (-1, 1))
 """Angles of the hypotheses for the rotation from one part to the other [radians]."""
 MIN_FRAMES = 10
-"""Number of frames below which the contours of a part are too few."""
+"""Number of frames of a part below which its contours alone do not join it."""
 USED_FRAMES = 20
 """Number of frames of each part whose contours are compared."""
 REFINED = 16
@@ -69,6 +69,8 @@ class ContourJoint:
     """Number of tangency gaps that are valid, as the contours on both sides are seen there."""
     gap_cost: float
     """Mean robust cost of these alone."""
+    frames: int
+    """Number of frames of the shorter part."""
 
     @property
     def strength(self) -> float:
@@ -83,13 +85,12 @@ class ContourJoint:
     @property
     def accepted(self) -> bool:
         """Whether contours confirm that the two parts belong together in this way, and in no other."""
-        return self.gaps >= MIN_GAPS and self.gap_cost <= MAX_COST and self.second >= MIN_RATIO * self.cost
+        enough = self.gaps >= MIN_GAPS and self.frames >= MIN_FRAMES
+        return enough and self.gap_cost <= MAX_COST and self.second >= MIN_RATIO * self.cost
 
 
 def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJoint | None:
-    """The joint of two parts whose contours agree best; None unless they are long and one follows the other."""
-    if min(len(part), len(other)) < MIN_FRAMES:
-        return None
+    """The joint of two parts whose contours agree best; None unless one follows the other."""
     distance, p, q = part.nearest(other)
     if not 0 < distance <= MAX_GAP:
         return None
@@ -113,7 +114,7 @@ def contour_joint(observed: Observed, part: Partial, other: Partial) -> ContourJ
     second = float(torch.where(differs, cost, torch.inf).min())
     gaps = pairs.valid_gaps((R_new_obj[k : k + 1], rest[k : k + 1]))
     gap_cost = float(robust_cost(gaps[None], GAP_SCALE)[0])
-    return ContourJoint(moved[k], float(cost[k]), second, len(gaps), gap_cost)
+    return ContourJoint(moved[k], float(cost[k]), second, len(gaps), gap_cost, min(len(part), len(other)))
 
 
 def moved_part(part: Partial, motion: Similarity, k: int) -> Partial:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tumble.maths import SO3, angle_between
 from tumble.poses.sfm import bundle_adjustment
+from tumble.poses.sfm.contour_joints import MAX_COST as MAX_AGREEING_COST
 from tumble.poses.sfm.contour_joints import MIN_GAPS as MIN_CONFIRMING_GAPS
 from tumble.poses.sfm.contour_joints import (
     ContourJoint,
@@ -157,6 +158,17 @@ class Joint:
         right but one of a can, about whose axis contours say nothing, which is 26 degrees off.
         """
         return self.gaps >= MIN_CONFIRMING_GAPS and self.cost <= MAX_CONFIRMING_COST
+
+    def agrees_with(self, contours: ContourJoint) -> bool:
+        """Whether contours alone suggest the same rotation, so that each confirms the other.
+
+        Both are searched for on their own, the motion's continuation within 60 degrees, where a random rotation is that
+        near to another one time of a hundred.
+        """
+        angle = angle_between(SO3.from_matrix(self.part.R[0]), SO3.from_matrix(contours.part.R[0]))
+        same = float(angle) < SAME_ROTATION and contours.cost <= MAX_AGREEING_COST
+        not_contradicted = self.measurable and self.cost <= MAX_CONTOUR_COST and self.possible and self.continuous
+        return same and not_contradicted and self.keypoints >= MIN_CORRESPONDENCES
 
     @property
     def order(self) -> tuple[bool, bool, float]:
@@ -363,7 +375,8 @@ def join(observed: Observed, parts: Sequence[Partial], known: Hypotheses, *, cer
         pairs = [(a, b) for k, a in enumerate(parts) for b in parts[k + 1 :]]
         found = _best(observed, pairs, known, best_joint, certain=certain)
         if found is None and not certain:
-            found = _best(observed, pairs, known, contour_joint)  # contours join what shares no texture
+            by_contours = _best(observed, pairs, known, contour_joint)  # contours join what shares no texture
+            found = _agreed(pairs, known) or by_contours
         if found is None:
             return parts
         (a, b), joint = found
@@ -386,6 +399,18 @@ def _best(
     joints = [((a, b), joint) for a, b in pairs if (joint := known[propose, a, b]) is not None and joint.accepted]
     joints = [each for each in joints if each[1].certain or not certain]
     return max(joints, key=lambda each: each[1].strength, default=None)
+
+
+def _agreed(
+    pairs: Sequence[tuple[Partial, Partial]], known: Hypotheses
+) -> tuple[tuple[Partial, Partial], Joint] | None:
+    """Of the pairs for which keypoints and contours suggest the same joint, that with most keypoints, and the joint."""
+    found = []
+    for a, b in pairs:
+        joint, contours = known[best_joint, a, b], known[contour_joint, a, b]
+        if isinstance(joint, Joint) and isinstance(contours, ContourJoint) and joint.agrees_with(contours):
+            found.append(((a, b), joint))
+    return max(found, key=lambda each: each[1].strength, default=None)
 
 
 def grow(observed: Observed, part: Partial, *, without: Collection[int] = ()) -> Partial:
