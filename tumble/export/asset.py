@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from tumble import __version__
-from tumble.export import atlas, bake, confidence, gltf, mesh, photo_texture, ply, unseen
+from tumble.export import atlas, bake, completion, confidence, gltf, mesh, photo_texture, ply, unseen
 from tumble.export.depth_fusion import HALF_SIDE, signed_distances
 from tumble.export.mesh import Mesh
 from tumble.export.poses import write_poses
@@ -154,7 +155,20 @@ def extract_mesh(asset: Asset, preset: Preset, capture: Capture | None = None) -
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
     with progress.task("extracting the mesh"):
         whole = mesh.smooth(mesh.surface(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells))
-        return mesh.simplify(unseen.spanned(whole, asset, capture) if capture else whole, preset.triangles)
+        return mesh.simplify(_without_gaps(whole, values, asset, capture) if capture else whole, preset.triangles)
+
+
+def _without_gaps(whole: Mesh, values: Float[np.ndarray, "g g g"], asset: Asset, capture: Capture) -> Mesh:
+    """The mesh with what a hand covers completed, and what is left that no frame shows spanned by a smooth surface."""
+    fixed = unseen.seen_regions(whole, asset, capture)
+    found = completion.completed(values, whole.vertices[fixed], asset, capture)
+    if found.changed.any():
+        cell = 2 * HALF_SIDE / (len(values) - 1)
+        whole = mesh.smooth(mesh.surface(found.values, -HALF_SIDE, cell))
+        at = ((whole.vertices + HALF_SIDE) / cell).round().astype(np.int64)
+        changed, seen = found.changed[tuple(at.T)], unseen.seen_regions(whole, asset, capture)
+        whole, fixed = unseen.smoothed(whole, changed & ~seen), changed | seen
+    return unseen.spanned(whole, fixed)
 
 
 def _lit_frames(asset: Asset, capture: Capture | None) -> list[lit_frames.LitFrame]:

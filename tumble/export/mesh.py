@@ -210,10 +210,14 @@ def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
 
 def diameter(vertices: Float[np.ndarray, "v 3"]) -> float:
     """Largest distance between two vertices, among those that are extreme in one of 4096 directions."""
-    directions = fibonacci_sphere(4096, dtype=torch.float64).numpy()
-    extreme = np.unique(np.concatenate([(vertices @ rows.T).argmax(0) for rows in np.split(directions, 16)]))
-    corners = torch.from_numpy(np.ascontiguousarray(vertices[extreme], np.float64))
+    corners = torch.from_numpy(np.ascontiguousarray(extreme_points(vertices, 4096), np.float64))
     return float(torch.cdist(corners, corners).max())
+
+
+def extreme_points(vertices: Float[np.ndarray, "v 3"], directions: int) -> Float[np.ndarray, "e 3"]:
+    """Vertices that are the farthest in one of a number of directions, a multiple of 16."""
+    towards = fibonacci_sphere(directions, dtype=torch.float64).numpy()
+    return vertices[np.unique(np.concatenate([(vertices @ rows.T).argmax(0) for rows in np.split(towards, 16)]))]
 
 
 def unit_rows(x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -27,23 +27,19 @@ MAX_WRONG = 0.05
 a hand covers most of the time is seen, too (docs/method.md)."""
 AVERAGING_STEPS = 20
 """Number of times that "seen" is averaged over neighbours, so that wrong pixels of masks leave no spikes."""
+SMOOTHING_STEPS = 10
+"""Number of times that vertices move to the means of their neighbours: steps of the grid vanish, edges hardly."""
 
 
-def spanned(mesh: Mesh, asset: Asset, capture: Capture) -> Mesh:
-    """The mesh with every vertex that was not seen at the mean of its neighbours: a discrete minimal surface.
+def spanned(mesh: Mesh, fixed: Bool[np.ndarray, " v"]) -> Mesh:
+    """The mesh with every vertex that is not fixed at the mean of its neighbours: a discrete minimal surface.
 
-    Components of which nothing was seen stay as they are.
-
-    Args:
-        capture: The frames of the asset's trajectory.
+    Components of which nothing is fixed stay as they are.
     """
     from scipy.sparse import identity
     from scipy.sparse.linalg import splu
 
-    mean, seen = neighbour_means(mesh), seen_vertices(mesh, asset, capture).astype(np.float64)
-    for _ in range(AVERAGING_STEPS):
-        seen = mean @ seen
-    fixed = seen >= 0.5
+    mean = neighbour_means(mesh)
     component = components(len(fixed), mesh.faces)
     free = ~fixed & (np.bincount(component, fixed) > 0)[component]
     vertices, rows = mesh.vertices.copy(), mean[free]
@@ -51,6 +47,26 @@ def spanned(mesh: Mesh, asset: Asset, capture: Capture) -> Mesh:
         inner = identity(int(free.sum()), format="csc") - rows[:, free].tocsc()
         vertices[free] = splu(inner).solve(rows[:, ~free] @ vertices[~free])
     return Mesh(vertices, mesh.faces)
+
+
+def smoothed(mesh: Mesh, free: Bool[np.ndarray, " v"]) -> Mesh:
+    """The mesh with its free vertices moved to the means of their neighbours a few times."""
+    rows, vertices = neighbour_means(mesh)[free], mesh.vertices.copy()
+    for _ in range(SMOOTHING_STEPS):
+        vertices[free] = rows @ vertices
+    return Mesh(vertices, mesh.faces)
+
+
+def seen_regions(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray, " v"]:
+    """Vertices around which most are seen (`seen_vertices`).
+
+    Args:
+        capture: The frames of the asset's trajectory.
+    """
+    mean, seen = neighbour_means(mesh), seen_vertices(mesh, asset, capture).astype(np.float64)
+    for _ in range(AVERAGING_STEPS):
+        seen = mean @ seen
+    return seen >= 0.5
 
 
 @torch.no_grad()
