@@ -64,11 +64,12 @@ def test_what_frames_show_to_be_empty_is_not_filled(asset: Asset, capture: Captu
     assert at(found.values, 0.6, 0, 0) > 0
 
 
-@pytest.mark.parametrize("n_seen", [len(SEEN) + 1, 50])
-def test_without_a_hand_or_without_a_surface_nothing_changes(asset: Asset, capture: Capture, n_seen: int) -> None:
-    masks = torch.where(capture.masks == UNKNOWN, OBJECT, capture.masks) if n_seen > 50 else capture.masks
+@pytest.mark.parametrize("case", ["no hand", "few points", "flat"])
+def test_without_a_hand_or_a_hull_nothing_changes(asset: Asset, capture: Capture, case: str) -> None:
+    masks = torch.where(capture.masks == UNKNOWN, OBJECT, capture.masks) if case == "no hand" else capture.masks
     given = Capture(capture.images, masks, capture.camera, capture.names, "camera")
+    seen = {"no hand": np.concatenate([SEEN, TIP]), "few points": SEEN[::300], "flat": SEEN * (1, 1, 0)}[case]
     old = values(distances(flat=0.42))
-    found = completed(old, np.concatenate([TIP, SEEN])[:n_seen], asset, given)
+    found = completed(old, seen, asset, given)
     assert (found.values == old).all()
     assert not found.changed.any()

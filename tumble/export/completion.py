@@ -58,9 +58,10 @@ def completed(
     from scipy import ndimage
 
     n = len(values)
-    if len(seen) < MIN_SEEN or not bool((capture.masks == UNKNOWN).any()):
+    hull = _hull_distances(seen, n) if bool((capture.masks == UNKNOWN).any()) else None
+    if hull is None:
         return Completed(values, np.zeros(values.shape, bool))
-    cell, hull = 2 * HALF_SIDE / (n - 1), _hull_distances(seen, n)
+    cell = 2 * HALF_SIDE / (n - 1)
     # All that can change lies in this box.
     box = ndimage.find_objects(((hull < TRUNCATION) | (values < TRUNCATION)).astype(np.uint8))[0]
     old, hull, first = values[box], hull[box], np.array([each.start for each in box])
@@ -92,11 +93,16 @@ def _distances_to(there: Bool[np.ndarray, "a b c"]) -> Float[np.ndarray, "a b c"
     return np.asarray(ndimage.distance_transform_edt(~there), np.float32)
 
 
-def _hull_distances(seen: Float[np.ndarray, "v 3"], n: int) -> Float[np.ndarray, "{n} {n} {n}"]:
-    """Distance of each of n^3 corners outside the convex hull of points, negative inside [cells]."""
-    from scipy.spatial import ConvexHull
+def _hull_distances(seen: Float[np.ndarray, "v 3"], n: int) -> Float[np.ndarray, "{n} {n} {n}"] | None:
+    """Distance of each of n^3 corners outside the convex hull of points, negative inside [cells]; None without one."""
+    from scipy.spatial import ConvexHull, QhullError
 
-    planes = torch.from_numpy(ConvexHull(extreme_points(seen, HULL_DIRECTIONS)).equations).float()
+    if len(seen) < MIN_SEEN:
+        return None
+    try:
+        planes = torch.from_numpy(ConvexHull(extreme_points(seen, HULL_DIRECTIONS)).equations).float()
+    except QhullError:  # all in a plane
+        return None
     cell = 2 * HALF_SIDE / (n - 1)
     axis = torch.arange(0, n, COARSE) * cell - HALF_SIDE
     chunks = torch.cartesian_prod(axis, axis, axis).split(4096)
