@@ -154,21 +154,28 @@ def extract_mesh(asset: Asset, preset: Preset, capture: Capture | None = None) -
     if values.min() >= 0:
         raise ValueError("the Gaussians have no surface, so there is no mesh to export; use --preset splat")
     with progress.task("extracting the mesh"):
-        whole = mesh.smooth(mesh.surface(values, -HALF_SIDE, 2 * HALF_SIDE / preset.cells))
+        whole = _surface(values)
         return mesh.simplify(_without_gaps(whole, values, asset, capture) if capture else whole, preset.triangles)
 
 
+def _surface(values: Float[np.ndarray, "g g g"]) -> Mesh:
+    """The smooth surface of signed distances (`depth_fusion.signed_distances`)."""
+    return mesh.smooth(mesh.surface(values, -HALF_SIDE, 2 * HALF_SIDE / (len(values) - 1)))
+
+
 def _without_gaps(whole: Mesh, values: Float[np.ndarray, "g g g"], asset: Asset, capture: Capture) -> Mesh:
-    """The mesh with what a hand covers completed, and what is left that no frame shows spanned by a smooth surface."""
-    fixed = unseen.seen_regions(whole, asset, capture)
-    found = completion.completed(values, whole.vertices[fixed], asset, capture)
-    if found.changed.any():
-        cell = 2 * HALF_SIDE / (len(values) - 1)
-        whole = mesh.smooth(mesh.surface(found.values, -HALF_SIDE, cell))
-        at = ((whole.vertices + HALF_SIDE) / cell).round().astype(np.int64)
-        changed, seen = found.changed[tuple(at.T)], unseen.seen_regions(whole, asset, capture)
-        whole, fixed = unseen.smoothed(whole, changed & ~seen), changed | seen
-    return unseen.spanned(whole, fixed)
+    """The mesh with what a hand covers completed, and what is left that no frame shows spanned by a smooth surface.
+
+    Args:
+        whole: The surface of the values.
+    """
+    seen = unseen.seen_regions(whole, asset, capture)
+    found = completion.completed(values, whole.vertices[seen], asset, capture)
+    if not found.changed.any():
+        return unseen.spanned(whole, seen)
+    whole = _surface(found.values)
+    changed, seen = found.changed_at(whole.vertices), unseen.seen_regions(whole, asset, capture)
+    return unseen.spanned(unseen.smoothed(whole, changed & ~seen), changed | seen)
 
 
 def _lit_frames(asset: Asset, capture: Capture | None) -> list[lit_frames.LitFrame]:

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from tumble.export.depth_fusion import HALF_SIDE, TRUNCATION
 from tumble.export.mesh import extreme_points
-from tumble.export.unseen import MAX_WRONG, MIN_FRAMES
-from tumble.rendering import lit_frames, render_gbuffer
+from tumble.export.unseen import MIN_FRAMES, at_pixels, enough, used_masks
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Asset, Capture
 
 MARGIN = 2.0
@@ -27,7 +26,6 @@ NEAR = 1.6
 """Distance from the seen surface up to which values stay [cells]."""
 COARSE = 4
 """Spacing of the corners at which distances to the convex hull are computed [cells]; they are linear but at edges."""
-
 HULL_DIRECTIONS = 1024
 """Number of directions in which the points of the hull are extreme: a sphere's hull is a fifth of a cell too small."""
 
@@ -40,6 +38,20 @@ class Completed:
     """Values [cells]."""
     changed: Bool[np.ndarray, "g g g"]
     """Corners beside which they differ from those that were given."""
+
+    def changed_at(self, x_obj: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, " v"]:
+        """Whether the corner next to each point is one of these."""
+        return self.changed[_corners(x_obj, len(self.values))]
+
+
+def _corners(x_obj: Float[np.ndarray, "v 3"], n: int) -> tuple[Int[np.ndarray, " v"], ...]:
+    """Index of the corner next to each point in a grid of n^3."""
+    return tuple(((x_obj + HALF_SIDE) / _cell(n)).round().astype(np.int64).T)
+
+
+def _cell(n: int) -> float:
+    """Side of a cell of a grid of n^3 corners [object radius]."""
+    return 2 * HALF_SIDE / (n - 1)
 
 
 @torch.no_grad()
@@ -61,16 +73,15 @@ def completed(
     hull = _hull_distances(seen, n) if bool((capture.masks == UNKNOWN).any()) else None
     if hull is None:
         return Completed(values, np.zeros(values.shape, bool))
-    cell = 2 * HALF_SIDE / (n - 1)
     # All that can change lies in this box.
     box = ndimage.find_objects(((hull < TRUNCATION) | (values < TRUNCATION)).astype(np.uint8))[0]
     old, hull, first = values[box], hull[box], np.array([each.start for each in box])
     corners = np.argwhere((hull < 1) & (old > 0) | (hull > -1) & (old < TRUNCATION))
     hidden, empty = np.zeros((2, *old.shape), bool)
     at = tuple(corners.T)
-    hidden[at], empty[at] = _shown((corners + first) * cell - HALF_SIDE, asset, capture, MARGIN * cell)
+    hidden[at], empty[at] = _shown((corners + first) * _cell(n) - HALF_SIDE, asset, capture, MARGIN * _cell(n))
     at_seen = np.zeros(values.shape, bool)
-    at_seen[tuple(((seen + HALF_SIDE) / cell).round().astype(np.int64).T)] = True
+    at_seen[_corners(seen, n)] = True
     hidden &= _distances_to(at_seen[box]) > NEAR
     fill = hidden & ~empty & (hull < 0) & (old > 0)
     # What is nowhere three cells thick is noise of the surface.
@@ -103,10 +114,9 @@ def _hull_distances(seen: Float[np.ndarray, "v 3"], n: int) -> Float[np.ndarray,
         planes = torch.from_numpy(ConvexHull(extreme_points(seen, HULL_DIRECTIONS)).equations).float()
     except QhullError:  # all in a plane
         return None
-    cell = 2 * HALF_SIDE / (n - 1)
-    axis = torch.arange(0, n, COARSE) * cell - HALF_SIDE
+    axis = torch.arange(0, n, COARSE) * _cell(n) - HALF_SIDE
     chunks = torch.cartesian_prod(axis, axis, axis).split(4096)
-    coarse = torch.cat([torch.addmm(planes[:, 3], x, planes[:, :3].T).amax(1) for x in chunks]) / cell
+    coarse = torch.cat([torch.addmm(planes[:, 3], x, planes[:, :3].T).amax(1) for x in chunks]) / _cell(n)
     coarse = coarse.view((1, 1) + (len(axis),) * 3)
     return torch.nn.functional.interpolate(coarse, (n, n, n), mode="trilinear", align_corners=True)[0, 0].numpy()
 
@@ -114,23 +124,17 @@ def _hull_distances(seen: Float[np.ndarray, "v 3"], n: int) -> Float[np.ndarray,
 def _shown(
     x_obj: Float[np.ndarray, "c 3"], asset: Asset, capture: Capture, margin: float
 ) -> tuple[Bool[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
-    """Which points something hides from enough frames, and which enough show to be empty (`unseen.enough_show`).
+    """Which points something hides from enough frames, and which enough show to be empty (`unseen.enough`).
 
     Args:
         margin: Depth behind the Gaussians up to which a point is shown to be empty [object radius].
     """
-    x, camera = torch.from_numpy(x_obj).to(asset.gaussians.means), asset.camera
+    x = torch.from_numpy(x_obj).to(asset.gaussians.means)
     empty, hidden = torch.zeros(2, len(x), dtype=torch.int32, device=x.device)
-    size = torch.tensor([camera.width, camera.height], device=x.device)
-    for frame in lit_frames.frame_numbers(capture):
-        T_cam_obj, mask = asset.trajectory.T_cam_obj[frame], capture.masks[frame].to(x.device)
-        x_cam = T_cam_obj @ x
-        column_row = camera.project(x_cam).floor().long()
-        inside = ((column_row >= 0) & (column_row < size)).all(-1)
-        column, row = torch.minimum(column_row.clamp_min(0), size - 1).T
-        depth, label = render_gbuffer(asset, T_cam_obj, camera).depth[row, column], mask[row, column]
-        before = (label == OBJECT) & (depth > 0) & (x_cam[:, 2] < depth + margin)
-        empty += inside & ((label == BACKGROUND) | before)
-        hidden += inside & (label == UNKNOWN)
-    shown = empty >= MIN_FRAMES + MAX_WRONG * hidden
-    return (hidden >= MIN_FRAMES).cpu().numpy(), shown.cpu().numpy()
+    for frame, mask in used_masks(capture, x.device):
+        at = at_pixels(asset, frame, mask, x)
+        before = (at.label == OBJECT) & (at.depth > 0) & (at.z < at.depth + margin)
+        empty += at.inside & ((at.label == BACKGROUND) | before)
+        hidden += at.inside & (at.label == UNKNOWN)
+    n_hidden = hidden.cpu().numpy()
+    return n_hidden >= MIN_FRAMES, enough(empty.cpu().numpy(), n_hidden)

@@ -4,11 +4,12 @@ Nothing is known of such a part, and the surface of the Gaussians has lumps, hol
 The smallest surface between what was seen takes its place; the confidence marks it as it marks all that was not seen.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from tumble.export.mesh import Mesh, components, neighbour_means, vertex_normals
@@ -73,8 +74,13 @@ def seen_regions(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray,
 def seen_vertices(mesh: Mesh, asset: Asset, capture: Capture) -> Bool[np.ndarray, " v"]:
     """Vertices that enough frames show as object: in front, and not too obliquely."""
     x_obj, normals = (torch.from_numpy(x).to(asset.gaussians.means) for x in (mesh.vertices, vertex_normals(mesh)))
-    masks = ((i, capture.masks[i].to(x_obj.device)) for i in lit_frames.frame_numbers(capture))
-    return enough_show(len(x_obj), (_labels(asset, i, mask, x_obj, normals).cpu().numpy() for i, mask in masks))
+    labels = (_labels(asset, i, mask, x_obj, normals).cpu().numpy() for i, mask in used_masks(capture, x_obj.device))
+    return enough_show(len(x_obj), labels)
+
+
+def used_masks(capture: Capture, device: torch.device) -> Iterator[tuple[int, UInt8[Tensor, "h w"]]]:
+    """Numbers of the frames that are asked what they show, and their masks."""
+    return ((i, capture.masks[i].to(device)) for i in lit_frames.frame_numbers(capture))
 
 
 def enough_show(n: int, labels: Iterable[Shaped[np.ndarray, " n"]]) -> Bool[np.ndarray, " n"]:
@@ -87,6 +93,11 @@ def enough_show(n: int, labels: Iterable[Shaped[np.ndarray, " n"]]) -> Bool[np.n
     for label in labels:
         shown += label == OBJECT
         hidden += label == UNKNOWN
+    return enough(shown, hidden)
+
+
+def enough(shown: Int[np.ndarray, " n"], hidden: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Whether enough frames show something of each point, by the numbers of frames that show it and that hide it."""
     return shown >= MIN_FRAMES + MAX_WRONG * hidden
 
 
@@ -94,13 +105,34 @@ def _labels(
     asset: Asset, frame: int, mask: Tensor, x_obj: Float[Tensor, "v 3"], normals: Float[Tensor, "v 3"]
 ) -> Float[Tensor, " v"]:
     """What the mask of a frame says of each vertex; not a number of those that the frame cannot show."""
+    at = at_pixels(asset, frame, mask, x_obj)
+    to_camera = asset.trajectory.T_cam_obj[frame].inverse().xyz - x_obj
+    cosine = (to_camera * normals).sum(-1) / to_camera.norm(dim=-1)
+    slope = 2 / asset.camera.fx_fy_cx_cy[0] * at.z * (cosine.clamp(MIN_COSINE, 1) ** -2 - 1).sqrt()
+    visible = at.inside & (cosine > MIN_COSINE) & ((at.z - at.depth).abs() < DEPTH_TOLERANCE + slope)
+    return torch.where(visible, at.label.to(at.z), torch.nan)
+
+
+@dataclass(frozen=True)
+class AtPixels:
+    """What a frame has at the pixels of points."""
+
+    inside: Bool[Tensor, " n"]
+    """Whether the pixel is in the image; what follows is that of another pixel otherwise."""
+    z: Float[Tensor, " n"]
+    """Depths of the points [object radius]."""
+    depth: Float[Tensor, " n"]
+    """Depths of the Gaussians [object radius]; 0 where there are none."""
+    label: UInt8[Tensor, " n"]
+    """Values of the mask."""
+
+
+def at_pixels(asset: Asset, frame: int, mask: UInt8[Tensor, "h w"], x_obj: Float[Tensor, "n 3"]) -> AtPixels:
+    """What a frame of the asset's trajectory has at the pixels of points."""
     camera, T_cam_obj = asset.camera, asset.trajectory.T_cam_obj[frame]
-    to_camera, x_cam = T_cam_obj.inverse().xyz - x_obj, T_cam_obj @ x_obj
-    cosine, z = (to_camera * normals).sum(-1) / to_camera.norm(dim=-1), x_cam[:, 2]
+    x_cam = T_cam_obj @ x_obj
     column_row, size = camera.project(x_cam).floor().long(), torch.tensor(mask.T.shape, device=mask.device)
     inside = ((column_row >= 0) & (column_row < size)).all(-1)
     column, row = torch.minimum(column_row.clamp_min(0), size - 1).T
-    slope = 2 / camera.fx_fy_cx_cy[0] * z * (cosine.clamp(MIN_COSINE, 1) ** -2 - 1).sqrt()
-    depth = render_gbuffer(asset, T_cam_obj, camera).depth[row, column]
-    visible = inside & (cosine > MIN_COSINE) & ((z - depth).abs() < DEPTH_TOLERANCE + slope)
-    return torch.where(visible, mask[row, column].to(z), torch.nan)
+    depth = render_gbuffer(asset, T_cam_obj, camera).depth
+    return AtPixels(inside, x_cam[:, 2], depth[row, column], mask[row, column])

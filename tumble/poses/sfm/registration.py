@@ -162,8 +162,8 @@ class Joint:
     def agrees_with(self, contours: ContourJoint) -> bool:
         """Whether contours alone suggest the same rotation, so that each confirms the other.
 
-        Both are searched for on their own, the motion's continuation within 60 degrees, where a random rotation is that
-        near to another one time of a hundred.
+        Each is searched for without the other; only then keypoints are fitted to contours as well. Among the rotations
+        within 60 degrees of the motion's continuation a random one is that near to another one time of a hundred.
         """
         angle = angle_between(SO3.from_matrix(self.part.R[0]), SO3.from_matrix(contours.part.R[0]))
         same = float(angle) < SAME_ROTATION and contours.cost <= MAX_AGREEING_COST

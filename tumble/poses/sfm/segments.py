@@ -10,8 +10,8 @@ that nothing confirms get no pose.
 
 At first two parts are only joined where most matches between them agree, or some in many frames. Where this leaves
 frames out or apart, a network matches these with their neighbours and with frames far apart as well, and all is done
-again; fewer matches, or contours alone, then join parts, too. At the limits of what is joined chance decides, so this
-search is repeated where it leaves many frames out.
+again; fewer matches, contours alone, or both where they agree, then join parts, too. At the limits of what is joined
+chance decides, so this search is repeated where it leaves many frames out.
 """
 
 import math
