@@ -11,7 +11,7 @@ from jaxtyping import Bool, UInt8
 from tests.films import Scene, scene
 from tumble.preprocess import held_object
 from tumble.preprocess.background import estimate_background
-from tumble.preprocess.colour_model import UNIFORM_DENSITY, hand_colours
+from tumble.preprocess.colour_model import BACKGROUND_CLASS, UNIFORM_DENSITY, hand_colours
 from tumble.preprocess.hands import Hand
 from tumble.preprocess.segmentation import Masks, Seed, opened, overlap, search_radius
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
@@ -130,6 +130,26 @@ def test_a_label_in_the_colour_of_the_hand_is_object_beside_the_hand() -> None:
     masks = held_object.segment(pictures, background, Seed(0, video.box()), hands)
     assert (masks.labels[label] == OBJECT).mean() > 0.8
     assert (masks.labels[video.hand] == OBJECT).mean() < 0.01
+
+
+def test_background_that_may_as_well_be_the_object_beside_it_is_unknown() -> None:
+    """A side in the colours of the wall behind it: neighbours err alike, so that all of them are called background."""
+    wall, inside, side, far = np.zeros((60, 90, 3), np.uint8), *np.zeros((3, 60, 90), bool)
+    inside[10:40, 20:50], side[15:35, 50:60], far[15:35, 78:88] = True, True, True
+    likelihood = np.zeros((3, 60, 90), np.float32)
+    likelihood[BACKGROUND_CLASS] = np.where(inside, -5, np.where(side | far, 2, 6))
+    alike = held_object._alike(likelihood, ~inside)
+    assert alike[side].mean() > 0.7
+    assert not alike[:, :48].any()
+    background = estimate_background(np.repeat(wall[None], 3, 0), np.zeros((3, 60, 90), bool))
+    empty = np.zeros_like(inside)
+    frame = held_object._Frame(wall, wall, empty, None, empty, ~empty, empty, None, empty, empty, empty)
+    probabilities = np.stack([inside, empty, ~inside]).astype(np.float32)
+    labels = held_object._labels(frame, held_object._State(probabilities, inside, empty, alike), background)
+    assert (labels[15:35, 52:55] == UNKNOWN).all()
+    assert (labels[alike & far] == BACKGROUND).all()
+    certain = held_object._State(probabilities, inside, empty, empty)
+    assert (held_object._labels(frame, certain, background)[15:35, 52:55] == BACKGROUND).all()
 
 
 def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:

@@ -60,6 +60,11 @@ MIN_ISLAND_LOG_RATIO = 1.0
 belongs to an island where no hand was detected."""
 MAX_AVERAGED_LOG_RATIO = 4.0
 """Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
+MIN_BACKGROUND_LOG_RATIO = 3.0
+"""Mean log likelihood ratio of background to object among neighbouring pixels, below which background beside the object
+is unknown: where the object has the colours of what is behind it, they err alike and do not confirm each other."""
+BACKGROUND_WINDOW = 5
+"""Side of the square of pixels over which this ratio is averaged."""
 MAX_HOLE_FRACTION = 0.3
 """Maximum area of a hole in the object that may be its print, as a fraction of the object's."""
 MIN_SKIN_FRACTION = 0.1
@@ -111,6 +116,8 @@ class _State:
     doubtful: Bool[np.ndarray, "h w"]
     """Pixels close to the landmarks or, without any, of what reaches the border, whose colour is the hand's rather than
     the object's."""
+    alike: Bool[np.ndarray, "h w"]
+    """Pixels that are rather background, but whose colours the object may have, too."""
 
 
 def segment(
@@ -185,7 +192,7 @@ def _segment_seed(
         trimap[segmentation.disc_around(seed.click, box)] = cv2.GC_FGD
     empty = np.zeros(frame.differs.shape, bool)
     if not (trimap & 1).any() or (trimap & 1).all():
-        return _State(np.zeros((3, *empty.shape), np.float32), empty, empty), ColourModel(hand, hand, hand)
+        return _State(np.zeros((3, *empty.shape), np.float32), empty, empty, empty), ColourModel(hand, hand, hand)
     rough = segmentation.main_components(segmentation.grabcut(frame.image, trimap, 5), box)
     unlearnt = np.zeros_like(hand)
     colours = ColourModel(unlearnt, hand, unlearnt).updated(
@@ -200,7 +207,7 @@ def _segment_seed(
     prior[:] = np.array(SEED_PRIOR["rest"], np.float32)[:, None, None]
     for name, region in reversed(list(zip(SEED_PRIOR, regions, strict=False))):
         prior[:, region] = np.array(SEED_PRIOR[name], np.float32)[:, None]
-    state = _State(prior, rough, empty)
+    state = _State(prior, rough, empty, empty)
     for _ in range(SEED_ITERATIONS):
         likelihood = log_likelihoods(frame.image, background, colours, frame.sampled)
         state = _segment_frame(frame, prior, state.inside | (box & ~static), box, likelihood)
@@ -231,7 +238,7 @@ def _track(
         agreement, new_area = segmentation.overlap(predicted, state.inside), int(state.inside.sum())
         if segmentation.is_lost(agreement, new_area):
             nothing = np.zeros_like(predicted)
-            state, agreement = _State(_without_object(state.probabilities), nothing, nothing), 0.0
+            state, agreement = _State(_without_object(state.probabilities), nothing, nothing, nothing), 0.0
         else:
             colours = _updated(colours, frame, state, predicted)
         uncertain = lost or segmentation.is_uncertain(agreement, area, new_area)
@@ -359,7 +366,19 @@ def _segment_frame(
     inside = _with_print(inside, label == HAND_CLASS, frame.surroundings)
     if frame.surroundings is None:  # what the object surrounds is its print
         doubtful = segmentation.touching(doubtful & inside, ~segmentation.eroded(inside, 1))
-    return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful)
+    alike = _alike(log_likelihood, label == BACKGROUND_CLASS)
+    return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful, alike)
+
+
+def _alike(
+    log_likelihood: Float32[np.ndarray, "3 h w"], background: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the background at which the object is hardly less likely, by the mean over those of a window."""
+    log_ratio = (log_likelihood[BACKGROUND_CLASS] - log_likelihood[OBJECT_CLASS]).clip(-MAX_LOG_RATIO, MAX_LOG_RATIO)
+    window = (BACKGROUND_WINDOW,) * 2
+    count = cv2.blur(background.astype(np.float32), window)
+    mean = cv2.blur(np.where(background, log_ratio, np.float32(0)), window) / np.maximum(count, 1e-3)
+    return background & (mean < MIN_BACKGROUND_LOG_RATIO)
 
 
 def _connected(mask: Bool[np.ndarray, "h w"], predicted: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -432,9 +451,9 @@ def _updated(colours: ColourModel, frame: _Frame, state: _State, predicted: Bool
 
 
 def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
-    """Three-valued mask. What moves is unknown, and so are doubtful pixels and unknown background near the object."""
+    """Three-valued mask. What moves is unknown, and so are doubtful pixels and uncertain background near the object."""
     near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
-    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & ~frame.known)
+    unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | (near & (state.alike | ~frame.known))
     labels = segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
     labels[state.doubtful & (labels == OBJECT)] = UNKNOWN
     return labels
