@@ -143,13 +143,15 @@ def test_background_that_may_as_well_be_the_object_beside_it_is_unknown() -> Non
     assert not alike[:, :48].any()
     background = estimate_background(np.repeat(wall[None], 3, 0), np.zeros((3, 60, 90), bool))
     empty = np.zeros_like(inside)
-    frame = held_object._Frame(wall, wall, empty, None, empty, ~empty, empty, None, empty, empty, empty)
+    sampled = np.zeros(inside.shape, np.float32)
+    frame = held_object._Frame(wall, wall, empty, sampled, empty, ~empty, empty, None, empty, empty, empty)
     probabilities = np.stack([inside, empty, ~inside]).astype(np.float32)
     labels = held_object._labels(frame, held_object._State(probabilities, inside, empty, alike), background)
     assert (labels[18:32, 52:57] == UNKNOWN).all()
     assert (labels[alike & far] == BACKGROUND).all()
-    certain = held_object._State(probabilities, inside, empty, empty)
-    assert (held_object._labels(frame, certain, background)[18:32, 52:57] == BACKGROUND).all()
+    first = held_object._State(probabilities, inside, empty, alike)
+    labels = held_object._labels(replace(frame, sampled=None), first, background)
+    assert (labels[18:32, 52:57] == BACKGROUND).all()
 
 
 def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:

@@ -453,7 +453,9 @@ def _updated(colours: ColourModel, frame: _Frame, state: _State, predicted: Bool
 def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
     """Three-valued mask. What moves is unknown, and so are doubtful pixels and uncertain background near the object."""
     near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
-    uncertain = segmentation.touching(state.alike, near) | (near & ~frame.known)
+    uncertain = near & ~frame.known
+    if frame.sampled is not None:  # a first segmentation finds the background, which such regions must not leave unknown
+        uncertain |= segmentation.touching(state.alike, near)
     unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | uncertain
     labels = segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
     labels[state.doubtful & (labels == OBJECT)] = UNKNOWN
