@@ -454,7 +454,7 @@ def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.nd
     """Three-valued mask. What moves is unknown, and so are doubtful pixels and uncertain background near the object."""
     near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
     uncertain = near & ~frame.known
-    if frame.sampled is not None:  # a first segmentation finds the background, which such regions must not leave unknown
+    if frame.sampled is not None:  # the first segmentation is for the background, which must not become unknown there
         uncertain |= segmentation.touching(state.alike, near)
     unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | uncertain
     labels = segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
