@@ -213,6 +213,16 @@ def test_a_run_is_scored_in_the_true_frame_when_its_capture_has_no_poses(
         assert free["regions"][region][key] == pytest.approx(scores[key], abs=0.5)
 
 
+def test_a_run_from_poses_of_stage_1_is_aligned_before_it_is_scored(capture: Path, tmp_path: Path) -> None:
+    """It has an object frame of its own, though no stage of it estimated poses."""
+    known = folder.load(capture)
+    found = result(known.camera, known.trajectory.T_cam_obj)
+    pipeline.reconstruct(capture, tmp_path / "run", RECIPE, poses=found)
+    assert "first the rotation" in actions.evaluate_run(tmp_path / "run", capture)["notes"][0]
+    pipeline.reconstruct(capture, tmp_path / "given", RECIPE, poses=known.trajectory)
+    assert "poses were given" in actions.evaluate_run(tmp_path / "given", capture)["notes"][0]
+
+
 def test_a_run_goes_on_with_the_focal_length_that_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A capture whose focal length is a guess, a fifth too short, and its twin with the true one, to score against."""
     scene = tumbling(16, size=96, points=150)

@@ -314,7 +314,7 @@ def evaluate_glb(
 def _aligned(out: Path, asset: Asset, known: CaptureWithTruth) -> tuple[Any, str]:
     """Result of `align_views` for a run's asset: a run with its own object frame is aligned."""
     names = source_names(out, known.capture)
-    own_frame = (out / run.TRACK).is_dir() or (out / run.CAPTURE / PROVENANCE).is_file()
+    own_frame = not run.has_given_poses(out) or (out / run.CAPTURE / PROVENANCE).is_file()
     given = known.capture.trajectory is not None and not own_frame
     lens = _focal_ratio(out, asset, known.capture)
     # The capture and its truth are on the CPU, on whatever device the asset is.

@@ -59,10 +59,11 @@ def intersection(origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 def result(camera: Camera, T_cam_obj: SE3, lost: tuple[int, ...] = (), uncertainty: float = 0.01) -> PoseResult:
     """Poses with quality as stage 1 would state it."""
-    flags = torch.zeros(N, dtype=torch.bool)
+    n = len(T_cam_obj.xyz)
+    flags = torch.zeros(n, dtype=torch.bool)
     flags[list(lost)] = True
     observability = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.full((3,), 0.01))
-    ones = torch.ones(N)
+    ones = torch.ones(n)
     overlap, step = 0.95 * ones, torch.tensor(3.0)
     quality = PoseQuality(ones, 50 * ones, ones, overlap, uncertainty * ones, flags, step, observability)
     trajectory = Trajectory(SE3(T_cam_obj.wxyz.float(), T_cam_obj.xyz.float()), "camera")

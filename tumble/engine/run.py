@@ -265,6 +265,16 @@ def frames_key(path: Path) -> str:
     return _document(path)["capture"].get("frames", "")
 
 
+def has_given_poses(path: Path) -> bool:
+    """Whether a run used poses as they were given, so that its asset has their object frame.
+
+    Raises:
+        BadFile: The folder holds no run, or a run of an older format.
+    """
+    capture = _document(path)["capture"]
+    return capture.get("content") != frames_key(path) and not (path / TRACK).is_dir()
+
+
 def recipe(path: Path) -> dict[str, Any]:
     """Settings of a run as a JSON document.
 
