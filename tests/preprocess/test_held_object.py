@@ -147,11 +147,11 @@ def test_background_that_may_as_well_be_the_object_beside_it_is_unknown() -> Non
     frame = held_object._Frame(wall, wall, empty, sampled, empty, ~empty, empty, None, empty, empty, empty)
     probabilities = np.stack([inside, empty, ~inside]).astype(np.float32)
     labels = held_object._labels(frame, held_object._State(probabilities, inside, empty, alike), background)
-    assert (labels[18:32, 52:57] == UNKNOWN).all()
+    assert (labels[18:32, 52:54] == UNKNOWN).all()
     assert (labels[alike & far] == BACKGROUND).all()
     first = held_object._State(probabilities, inside, empty, alike)
     labels = held_object._labels(replace(frame, sampled=None), first, background)
-    assert (labels[18:32, 52:57] == BACKGROUND).all()
+    assert (labels[18:32, 52:54] == BACKGROUND).all()
 
 
 def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:

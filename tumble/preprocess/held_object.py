@@ -61,8 +61,8 @@ belongs to an island where no hand was detected."""
 MAX_AVERAGED_LOG_RATIO = 4.0
 """Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
 MIN_BACKGROUND_LOG_RATIO = 3.0
-"""Mean log likelihood ratio of background to object among neighbouring pixels, below which a region of background that
-reaches the object is unknown: where the object has the colours of what is behind it, they all err alike."""
+"""Mean log likelihood ratio of background to object among neighbouring pixels, below which background close to the
+object is unknown: where the object has the colours of what is behind it, all pixels err alike."""
 BACKGROUND_WINDOW = 5
 """Side of the square of pixels over which this ratio is averaged."""
 MAX_HOLE_FRACTION = 0.3
@@ -452,10 +452,10 @@ def _updated(colours: ColourModel, frame: _Frame, state: _State, predicted: Bool
 
 def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.ndarray, "h w"]:
     """Three-valued mask. What moves is unknown, and so are doubtful pixels and uncertain background near the object."""
-    near = segmentation.dilated(state.inside, segmentation.search_radius(state.inside))
-    uncertain = near & ~frame.known
+    radius = segmentation.search_radius(state.inside)
+    uncertain = segmentation.dilated(state.inside, radius) & ~frame.known
     if frame.sampled is not None:  # the first segmentation is for the background, which must not become unknown there
-        uncertain |= segmentation.touching(state.alike, near)
+        uncertain |= segmentation.dilated(state.inside, 2 * radius) & state.alike
     unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | uncertain
     labels = segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
     labels[state.doubtful & (labels == OBJECT)] = UNKNOWN
