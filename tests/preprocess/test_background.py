@@ -165,3 +165,13 @@ def test_samples_know_a_wall_that_appears_late_and_colours_that_alternate() -> N
     strange = samples.log_likelihood(np.roll(images[4], 1, -1), 4)[:, :7]
     assert np.mean([np.median(each) for each in likely]) > np.median(strange) + 5
     assert np.isnan(samples.log_likelihood(images[4], 4)[:, 12:]).all()
+
+
+def test_a_local_mean_leaves_out_what_does_not_count() -> None:
+    values, where = np.zeros((5, 7), np.float32), np.zeros((5, 7), bool)
+    values[2, 2:5] = 2, 50, 4
+    where[2, 2], where[2, 4] = True, True
+    mean = module.local_mean(values, where, 3)
+    assert mean[2, 1:6].tolist() == pytest.approx([2, 2, 3, 4, 4])
+    assert not mean[0].any()
+    assert module.local_mean(np.stack([values, 2 * values], -1), where, 3)[2, 3].tolist() == pytest.approx([3, 6])

@@ -146,12 +146,12 @@ def test_background_that_may_as_well_be_the_object_beside_it_is_unknown() -> Non
     sampled = np.zeros(inside.shape, np.float32)
     frame = held_object._Frame(wall, wall, empty, sampled, empty, ~empty, empty, None, empty, empty, empty)
     probabilities = np.stack([inside, empty, ~inside]).astype(np.float32)
-    labels = held_object._labels(frame, held_object._State(probabilities, inside, empty, alike), background)
+    state = held_object._State(probabilities, inside, empty, alike)
+    labels = held_object._labels(frame, state, background)
     assert (labels[18:32, 52:54] == UNKNOWN).all()
     assert (labels[alike & far] == BACKGROUND).all()
-    first = held_object._State(probabilities, inside, empty, alike)
-    labels = held_object._labels(replace(frame, sampled=None), first, background)
-    assert (labels[18:32, 52:54] == BACKGROUND).all()
+    labels = held_object._labels(replace(frame, sampled=None), state, background)
+    assert (labels[18:32, 52:54] == BACKGROUND).all(), "the first segmentation"
 
 
 def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:

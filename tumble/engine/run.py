@@ -272,7 +272,7 @@ def has_given_poses(path: Path) -> bool:
         BadFile: The folder holds no run, or a run of an older format.
     """
     capture = _document(path)["capture"]
-    return capture.get("content") != frames_key(path) and not (path / TRACK).is_dir()
+    return capture.get("content") != capture.get("frames", "") and not (path / TRACK).is_dir()
 
 
 def recipe(path: Path) -> dict[str, Any]:

@@ -297,6 +297,16 @@ def channel_max(values: Shaped[np.ndarray, "*b 3"]) -> Shaped[np.ndarray, "*b"]:
     return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
 
 
+def local_mean(
+    values: Float32[np.ndarray, "h w *c"], where: Bool[np.ndarray, "h w"], side: int
+) -> Float32[np.ndarray, "h w *c"]:
+    """Mean over those pixels of the square around each pixel that count; 0 where none does."""
+    weight = where.astype(np.float32)
+    count, channels = cv2.blur(weight, (side, side)).clip(1e-6), (1,) * (values.ndim - 2)
+    total = cv2.blur(values * weight.reshape(*weight.shape, *channels), (side, side))
+    return total / count.reshape(*count.shape, *channels)
+
+
 def _gains_relative_to(
     images: np.ndarray, reference: np.ndarray, covered: np.ndarray | None
 ) -> Float32[np.ndarray, "t 3"]:
@@ -336,13 +346,9 @@ def _inside(
     image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]:
     """Mean and standard deviation of the colours of the pixels inside around each pixel, in linear light."""
-    weight, linear = inside.astype(np.float32), _linear_from_code()[image]
-
-    def mean(values: np.ndarray, side: int) -> np.ndarray:
-        return cv2.blur(values * weight[..., None], (side, side)) / cv2.blur(weight, (side, side)).clip(1e-6)[..., None]
-
-    wide = mean(linear, BORDER_SIDE)
-    return mean(linear, 3), np.sqrt((mean(np.square(linear), BORDER_SIDE) - np.square(wide)).clip(0))
+    linear = _linear_from_code()[image]
+    wide, squared = (local_mean(each, inside, BORDER_SIDE) for each in (linear, np.square(linear)))
+    return local_mean(linear, inside, 3), np.sqrt((squared - np.square(wide)).clip(0))
 
 
 def _code(linear: Float32[np.ndarray, "*b 3"]) -> UInt8[np.ndarray, "*b 3"]:

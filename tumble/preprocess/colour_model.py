@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
-from tumble.preprocess.background import Background, channel_max
+from tumble.preprocess.background import Background, channel_max, local_mean
 from tumble.preprocess.hands import Hand, arm_region, hand_region, hand_strokes, hand_surroundings
 
 OBJECT_CLASS, HAND_CLASS, BACKGROUND_CLASS = 0, 1, 2
@@ -258,12 +258,13 @@ def trim_rim(
 
     A pixel of which a tenth is object differs from a static background already, so untrimmed silhouettes are too wide.
     """
-    core = cv2.erode(inside.astype(np.float32), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_WIDTH + 1,) * 2))
-    colour, weight = image.astype(np.float32), cv2.blur(core, (NEIGHBOURHOOD, NEIGHBOURHOOD))
-    nearby = cv2.blur(colour * core[..., None], (NEIGHBOURHOOD, NEIGHBOURHOOD)) / np.maximum(weight, 1e-6)[..., None]
+    rim = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * RIM_WIDTH + 1,) * 2)
+    core, colour = cv2.erode(inside.astype(np.uint8), rim), image.astype(np.float32)
+    nearby = local_mean(colour, core > 0, NEIGHBOURHOOD)
+    near = cv2.dilate(core, np.ones((NEIGHBOURHOOD,) * 2, np.uint8)) > 0
     to_object, to_background = colour - nearby, colour - background.image
     closer = _dot(to_background, to_background) < _dot(to_object, to_object)
-    return inside & ~((core == 0) & (weight > 0) & background.known & closer)
+    return inside & ~((core == 0) & near & background.known & closer)
 
 
 def skin_coloured(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:

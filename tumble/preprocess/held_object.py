@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from tumble.preprocess import segmentation
-from tumble.preprocess.background import NO_SAMPLE_LOG_LIKELIHOOD, Background, BackgroundSamples
+from tumble.preprocess.background import NO_SAMPLE_LOG_LIKELIHOOD, Background, BackgroundSamples, local_mean
 from tumble.preprocess.colour_model import (
     BACKGROUND_CLASS,
     HAND_CLASS,
@@ -375,10 +375,7 @@ def _alike(
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels of the background at which the object is hardly less likely, by the mean over those of a window."""
     log_ratio = (log_likelihood[BACKGROUND_CLASS] - log_likelihood[OBJECT_CLASS]).clip(-MAX_LOG_RATIO, MAX_LOG_RATIO)
-    window = (BACKGROUND_WINDOW,) * 2
-    count = cv2.blur(background.astype(np.float32), window)
-    mean = cv2.blur(np.where(background, log_ratio, np.float32(0)), window) / np.maximum(count, 1e-3)
-    return background & (mean < MIN_BACKGROUND_LOG_RATIO)
+    return background & (local_mean(log_ratio, background, BACKGROUND_WINDOW) < MIN_BACKGROUND_LOG_RATIO)
 
 
 def _connected(mask: Bool[np.ndarray, "h w"], predicted: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
