@@ -58,7 +58,8 @@ Size = Annotated[
     arg(
         metavar="PIXELS",
         help_behavior_hint="",
-        help="Longer side of its images, which are never larger than in the video [pixels]. "
+        help="Longer side of a window around the object in its images [pixels]. Where the object moves about, the "
+        "images are up to twice as large, but never larger than in the video. "
         "Default: draft 256, standard 512, full and paper 800.",
     ),
 ]

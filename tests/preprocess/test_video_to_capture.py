@@ -88,7 +88,10 @@ def test_the_window_contains_the_whole_path_of_the_object(made: tuple[Path, Path
 
 
 def test_a_larger_video_is_downsampled_and_its_camera_with_it(tmp_path: Path) -> None:
-    """With the masks of a video four times as large: the focal length is scaled, and mixed mask pixels are unknown."""
+    """With the masks of a video four times as large: the focal length is scaled, and mixed mask pixels are unknown.
+
+    96 pixels are the size of a window around the object; its path is longer.
+    """
     synthetic = scene()
     large = [cv2.resize(p, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC) for p in synthetic.pictures]
     written(np.stack(large), tmp_path / "x.mp4")
@@ -99,8 +102,12 @@ def test_a_larger_video_is_downsampled_and_its_camera_with_it(tmp_path: Path) ->
     out = video_to_capture.capture_from_video(tmp_path / "x.mp4", tmp_path / "out", options)
     capture, provenance = folder.load(out), files.read_json(out / video_to_capture.PROVENANCE)
     top, left, height, width = provenance["window_top_left_height_width"]
-    shrink = 96 / max(height, width)
-    assert max(capture.camera.height, capture.camera.width) == 96
+    sides = [4 * max(np.ptp(np.nonzero(mask), axis=1) + 1) for mask in synthetic.object]
+    shrink = 96 / ((1 + 2 * video_to_capture.MARGIN) * np.quantile(sides, video_to_capture.USUAL_EXTENT))
+    longer = max(capture.camera.height, capture.camera.width)
+    assert longer == pytest.approx(shrink * max(height, width), rel=0.02)
+    assert 96 < longer < video_to_capture.MAX_LARGER * 96
+    shrink = longer / max(height, width)
     focal_x, focal_y, cx, cy = capture.camera.fx_fy_cx_cy.tolist()
     # Height and width are rounded to whole pixels: half a pixel of 96.
     assert [focal_x, focal_y] == pytest.approx([1200 * shrink] * 2, rel=0.01)

@@ -270,7 +270,7 @@ def _rotation(survey: Survey, kept: list[int]) -> list[Finding]:
 
 def _sharpness(survey: Survey, kept: list[int], options: FootageOptions) -> Finding:
     window = video_to_capture.crop_window(survey, kept)
-    shrink = min(options.size / max(window[2:]), 1.0)
+    shrink = video_to_capture.image_scale(survey, kept, window, options.size)
     width = float(np.median(survey.blurs[kept]))
     blur = math.sqrt(max(width**2 - keyframes.PROBE_BLUR**2, 0.0)) * shrink if math.isfinite(width) else math.inf
     state = f"edges are blurred by {blur:.1f} pixels in the capture's images"

@@ -27,7 +27,7 @@ FRAMES_AND_SIZE: dict[Quality, tuple[int, int]] = {
     "full": (400, 800),
     "paper": (400, 800),
 }
-"""Per quality, the maximum number of frames of a capture made from footage, and the longer side of its images [pixels].
+"""Per quality, the maximum number of frames of a capture made from footage, and the `size` of its images [pixels].
 The paper's captures have 400 frames (its appendix B); it prints no size, and 800 pixels are TensoIR's."""
 
 Clicks = Annotated[
@@ -78,7 +78,8 @@ class FootageOptions:
     frames: Suppress[int] = 144
     """Maximum number of frames in the capture. The default is that of the quality "draft", see `at_quality`."""
     size: Suppress[int] = 256
-    """Longer side of the capture's images [pixels]; they are never larger than in the video. Default: as for frames."""
+    """Longer side of a window around the object in the capture's images [pixels]. Where the object moves about, the
+    images are up to twice as large, but never larger than in the video. Default: as for frames."""
 
     @property
     def first(self) -> int:
@@ -113,7 +114,7 @@ def at_quality(options: FootageOptions, quality: Quality, *, frames: int | None,
 
     Args:
         frames: Maximum number of frames instead of the quality's; None for the quality's.
-        size: Longer side of the images instead of the quality's [pixels]; None for the quality's.
+        size: Size of the images instead of the quality's [pixels]; None for the quality's.
 
     Raises:
         ValueError: A number is out of range.

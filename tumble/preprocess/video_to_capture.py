@@ -22,7 +22,7 @@ from jaxtyping import Bool, UInt8
 
 from tumble.datasets import capture_document, training_frame
 from tumble.io import BadFile, files, video
-from tumble.maths import linear_from_srgb, to_srgb8
+from tumble.maths import crop_box, linear_from_srgb, to_srgb8
 from tumble.preprocess import keyframes, segmentation
 from tumble.preprocess.background import channel_max, compensate, settle_border
 from tumble.preprocess.camera_motion import MAX_CAMERA_MOTION
@@ -35,6 +35,11 @@ MIN_ROTATION = math.radians(40)
 """Minimum total rotation of the object; a smaller one cannot be reconstructed and may be noise [radians]."""
 MARGIN = 0.08
 """Margin of the crop window around the object's path, as a fraction of the path's longer side."""
+USUAL_EXTENT = 0.9
+"""Quantile over the frames of the longer side of the object's bounding box that counts as its extent: hands hide parts
+of it in many frames, and some masks contain more than the object."""
+MAX_LARGER = 2.0
+"""Largest factor between the longer sides of the capture's images and of a window around the object."""
 MAX_TEXTURE = 24
 """Largest difference between neighbouring pixels of the survey's background where it tells the border of the object
 [code values]; in front of finer texture the background of a pixel of another size is not known well enough."""
@@ -158,6 +163,20 @@ def crop_window(survey: Survey, kept: list[int]) -> tuple[int, int, int, int]:
     return top, left, math.ceil(bottom) - top, math.ceil(right) - left
 
 
+def image_scale(survey: Survey, kept: list[int], window: tuple[int, int, int, int], size: int) -> float:
+    """Scale of the capture's images [pixels of an image per pixel of the footage], at most 1.
+
+    `size` is the longer side of a window around the object of a single frame, and that of the images if the object
+    stays in its place. A hand moves it about, and in images of that size it would be small: they are up to
+    `MAX_LARGER` times as large.
+    """
+    boxes = [crop_box(torch.from_numpy(inside), 0) for inside in survey.inside[kept]]
+    extent = float(np.quantile([max(box[2:]) for box in boxes], USUAL_EXTENT)) / survey.scale
+    path = max(window[2:])
+    larger = path / ((1 + 2 * MARGIN) * extent)
+    return min(size / path * min(max(larger, 1.0), MAX_LARGER), 1.0)
+
+
 def write_preview(survey: Survey, path: Path, kept: list[int]) -> None:
     """Write a video of the masks; selected frames have a green border, frames with an uncertain mask a red one."""
     edges = [
@@ -186,7 +205,7 @@ def _write(
     survey: Survey, kept: list[int], window: tuple[int, int, int, int], out: Path, options: FootageOptions
 ) -> None:
     top, left, height, width = window
-    shrink = min(options.size / max(height, width), 1.0)
+    shrink = image_scale(survey, kept, window, options.size)
     size = max(round(height * shrink), 1), max(round(width * shrink), 1)
     camera = survey.lens.camera.cropped(*window).resized(*size)
     indices = {int(survey.numbers[i]): i for i in kept}
