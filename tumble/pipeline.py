@@ -19,7 +19,7 @@ from tumble.engine import Progress, Stage, run
 from tumble.evaluation import PREDICTION
 from tumble.inverse_rendering import absolute_colour, albedo_solve, decompose, refine
 from tumble.io import BadFile, files, outputs, progress, tree
-from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours
+from tumble.poses import PoseResult, background_removal, mask_refinement, neighbours, working_size
 from tumble.poses.progressive import stage as progressive
 from tumble.poses.sfm import stage as sfm
 from tumble.preprocess import (
@@ -269,17 +269,19 @@ def stage_of(cfg: Any) -> Any:
 
 
 def _poses_of(
-    opened: run.Run, capture: Capture, where: Path, content: str, device: torch.device | str
+    opened: run.Run, whole: Capture, where: Path, content: str, device: torch.device | str
 ) -> tuple[PoseResult, Capture, str]:
     """Stage 1, repeated with trimmed masks while that explains more: poses, capture with the final masks, and its key.
 
-    The key is empty if background was removed from the masks after the last round.
+    The key is empty if stage 1 has not seen that capture: images of its size, and its final masks.
     """
-    if len(capture) < MIN_FRAMES:
-        rule = f"has {len(capture)} frames, too few to estimate the motion"
+    if len(whole) < MIN_FRAMES:
+        rule = f"has {len(whole)} frames, too few to estimate the motion"
         raise BadFile(where, rule, f"record at least {MIN_FRAMES} frames, better 40 to 100")
     if stage_of(opened.recipe.track) is progressive and torch.device(device).type != "cpu":
         warnings.warn("the progressive route of stage 1 runs on the CPU: only later stages use the GPU", stacklevel=2)
+    small = capture = working_size.reduced(whole)
+    content = content if small is whole else content_key(small)
     tracked, key = _track(opened, capture, where, content, 1, device)
     for number in range(2, mask_refinement.ROUNDS + 1):
         trimmed = mask_refinement.trimmed_further(capture, tracked)
@@ -289,9 +291,11 @@ def _poses_of(
         if not mask_refinement.explains_more(new, tracked):
             break
         tracked, capture, key = new, trimmed, new_key
-    _check_quality(opened, capture, where, tracked)
+    found = working_size.enlarged(tracked, whole)
+    _check_quality(opened, whole, where, found)
     cut = background_removal.remove_background(capture, tracked)
-    return tracked, cut, key if torch.equal(cut.masks, capture.masks) else ""
+    seen = small is whole and torch.equal(cut.masks, capture.masks)
+    return found, working_size.with_masks(whole, small, cut), key if seen else ""
 
 
 def _track(

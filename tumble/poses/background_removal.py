@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from torch import Tensor
 
-from tumble.poses import mask_refinement
+from tumble.poses import mask_refinement, working_size
 from tumble.poses.mask_refinement import EXTENT, RESOLUTION, beyond, hull_by_vote, silhouette_of
 from tumble.poses.result import PoseResult
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
@@ -96,8 +96,12 @@ def remove_background(capture: Capture, result: PoseResult) -> Capture:
 
 def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Capture]:
     """The poses of a run, None if there are none, and its capture with the masks that stages 2 and 3 have seen."""
-    tracked, trimmed = mask_refinement.stored_result(out, capture)
-    return tracked, remove_background(trimmed, tracked) if tracked else trimmed
+    small = working_size.reduced(capture)
+    tracked, trimmed = mask_refinement.stored_rounds(out, small)
+    if tracked is None:
+        return None, capture
+    cut = remove_background(trimmed, tracked)
+    return working_size.enlarged(tracked, capture), working_size.with_masks(capture, small, cut)
 
 
 def _own_cells(

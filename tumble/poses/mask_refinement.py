@@ -16,6 +16,7 @@ from torch import Tensor
 
 from tumble.engine import run
 from tumble.maths import SE3
+from tumble.poses import working_size
 from tumble.poses.result import PoseResult
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
 
@@ -45,6 +46,13 @@ def folder(round: int) -> str:
 
 def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Capture]:
     """The poses of a run, None if there are none, and its capture with the masks from which they were estimated."""
+    small = working_size.reduced(capture)
+    best, trimmed = stored_rounds(out, small)
+    return best and working_size.enlarged(best, capture), working_size.with_masks(capture, small, trimmed)
+
+
+def stored_rounds(out: Path, capture: Capture) -> tuple[PoseResult | None, Capture]:
+    """The same for the capture that was reduced to the size at which poses are estimated."""
     best = run.output(out, folder(1), PoseResult)
     for number in range(2, ROUNDS + 1):
         new = run.output(out, folder(number), PoseResult)

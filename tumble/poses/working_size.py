@@ -1,0 +1,83 @@
+"""The images from which poses of an object that is hidden in part are estimated: smaller ones, if its capture is large.
+
+Segments and their joints have limits in pixels, and contours of such films err by a pixel or two of the images on which
+these were chosen. Stages 2 and 3 see the capture itself.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from tumble.maths import linear_from_srgb, resize_area, to_srgb8
+from tumble.poses.result import PoseResult
+from tumble.poses.sfm import is_hidden
+from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture
+
+SIDE = 256
+"""Longer side of these images [pixels]."""
+
+
+def reduced(capture: Capture) -> Capture:
+    """The capture from which poses are estimated: with smaller images if something hides a part of the object."""
+    scale = SIDE / max(capture.camera.height, capture.camera.width)
+    if scale >= 1:
+        return capture
+    h, w = (max(round(side * scale), 1) for side in (capture.camera.height, capture.camera.width))
+    masks = torch.stack([_majority(mask, h, w) for mask in capture.masks])
+    small = replace(
+        capture,
+        images=_resized(capture.images, h, w),
+        masks=masks,
+        camera=capture.camera.resized(h, w),
+        full_images=None if capture.full_images is None else _resized(capture.full_images, h, w),
+    )
+    if small.full_images is not None:
+        # At the border of an object the mean of its own colours and black is darker than the photo.
+        small = replace(small, images=_blackened(small.full_images, masks))
+    return small if is_hidden(small) else capture
+
+
+def enlarged(result: PoseResult, whole: Capture) -> PoseResult:
+    """The result for a capture, of which it may have seen smaller images: with a camera of the capture's size."""
+    return replace(result, camera=result.camera.resized(whole.camera.height, whole.camera.width))
+
+
+def with_masks(whole: Capture, small: Capture, masked: Capture) -> Capture:
+    """A capture with the masks that smaller images of it have got.
+
+    Args:
+        small: What `reduced` has made of the capture.
+        masked: The same with other masks; what these leave as it was stays as it is in the capture.
+    """
+    if small is whole:
+        return masked
+    height, width = whole.camera.height, whole.camera.width
+    changed, new = (_at_nearest(x, height, width) for x in (masked.masks != small.masks, masked.masks))
+    masks = torch.where(changed, new, whole.masks)
+    full_images = None if masked.full_images is None else whole.full_images
+    return replace(whole, masks=masks, images=_blackened(whole.images, masks), full_images=full_images)
+
+
+def _resized(images: Tensor, h: int, w: int) -> Tensor:
+    """Images resampled by area averaging in linear light."""
+    curve = linear_from_srgb(torch.arange(256) / 255)
+    return torch.stack([to_srgb8(resize_area(curve[image.long()], h, w)) for image in images])
+
+
+def _majority(mask: Tensor, h: int, w: int) -> Tensor:
+    """The mask with the value of most of what a pixel covers."""
+    values = torch.tensor([BACKGROUND, OBJECT, UNKNOWN], dtype=mask.dtype)
+    shares = resize_area((mask[..., None] == values).float(), h, w)
+    return values[shares.argmax(-1)]
+
+
+def _at_nearest(x: Tensor, height: int, width: int) -> Tensor:
+    """Every value at all pixels that lie in its own."""
+    return functional.interpolate(x[:, None].float(), (height, width), mode="nearest-exact")[:, 0].to(x.dtype)
+
+
+def _blackened(images: Tensor, masks: Tensor) -> Tensor:
+    """Images that are black where the masks have background, as those of a capture are."""
+    return torch.where((masks != BACKGROUND)[..., None], images, torch.zeros_like(images))
