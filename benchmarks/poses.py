@@ -120,7 +120,7 @@ def measure(case: Case, root: Path, route: str, *, refined: bool) -> Row:
         assert truth is not None, "a capture with true poses"
         return about | colmap_scores(capture, truth)
     started = time.perf_counter()
-    hidden = sfm.is_hidden(capture)
+    hidden = sfm.is_hidden(capture.masks)
     views = matching.views_of(sfm.shown(capture) if hidden else capture)
     matches = matching.match_pairs(views, neighbours(len(capture)), DRAFT.matcher)
     matched = time.perf_counter()

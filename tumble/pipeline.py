@@ -305,7 +305,7 @@ def _track(
     recipe = opened.recipe
     cache = opened.path / run.TRACK / "matches" if opened.path else None
     near = neighbours(len(capture))
-    hidden = sfm.is_hidden(capture)
+    hidden = sfm.is_hidden(capture.masks)
     views = matching.views_of(sfm.shown(capture) if hidden else capture)
     matches = matching.match_pairs(views, near, recipe.matcher, device=device, cache=cache)
     route = stage_of(recipe.track)

@@ -26,17 +26,12 @@ def reduced(capture: Capture) -> Capture:
         return capture
     h, w = (max(round(side * scale), 1) for side in (capture.camera.height, capture.camera.width))
     masks = torch.stack([_majority(mask, h, w) for mask in capture.masks])
-    small = replace(
-        capture,
-        images=_resized(capture.images, h, w),
-        masks=masks,
-        camera=capture.camera.resized(h, w),
-        full_images=None if capture.full_images is None else _resized(capture.full_images, h, w),
-    )
-    if small.full_images is not None:
-        # At the border of an object the mean of its own colours and black is darker than the photo.
-        small = replace(small, images=_blackened(small.full_images, masks))
-    return small if is_hidden(small) else capture
+    if not is_hidden(masks):
+        return capture
+    full_images = None if capture.full_images is None else _resized(capture.full_images, h, w)
+    # At the border of the object the mean of its own colours and black is darker than the photo.
+    images = _blackened(_resized(capture.images, h, w) if full_images is None else full_images, masks)
+    return replace(capture, images=images, masks=masks, camera=capture.camera.resized(h, w), full_images=full_images)
 
 
 def enlarged(result: PoseResult, whole: Capture) -> PoseResult:

@@ -96,13 +96,13 @@ def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Captu
     return chain_matches(matches, (area / TRACKS_PER_FRAME).sqrt().clamp_min(2.0))
 
 
-def is_hidden(capture: Capture) -> bool:
+def is_hidden(masks: UInt8[Tensor, "t h w"]) -> bool:
     """Whether something hides a part of the object in most frames: a wide unknown region adjoins it.
 
     Masks of films without a hand have narrow unknown bands along the silhouette, which do not count.
     """
     fractions = []
-    for mask in frontier_points.fill_boundary_bands(capture.masks).numpy():
+    for mask in frontier_points.fill_boundary_bands(masks).numpy():
         inside = (mask == OBJECT).astype(np.uint8)
         rim = np.asarray(cv2.dilate(inside, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8))) > inside
         if rim.any():
