@@ -291,7 +291,7 @@ def _poses_of(
         if not mask_refinement.explains_more(new, tracked):
             break
         tracked, capture, key = new, trimmed, new_key
-    found = working_size.enlarged(tracked, whole)
+    found = working_size.enlarged(tracked, whole, small)
     _check_quality(opened, whole, where, found)
     cut = background_removal.remove_background(capture, tracked)
     seen = small is whole and torch.equal(cut.masks, capture.masks)

@@ -105,7 +105,10 @@ def test_stage_1_sees_the_smaller_images_and_later_stages_the_capture(
     opened = runs.Run(None, recipes.SMOKE, None)
     tracked, cut, key = pipeline._poses_of(opened, large, Path("film"), "content", "cpu")
     assert set(seen) == {(working_size.SIDE, working_size.SIDE)}
-    assert torch.allclose(tracked.camera.fx_fy_cx_cy, large.camera.fx_fy_cx_cy)
+    assert torch.equal(tracked.camera.fx_fy_cx_cy, large.camera.fx_fy_cx_cy), "a focal length that nobody estimated"
     assert (cut.camera.height, cut.camera.width) == (large.camera.height, large.camera.width)
+    zoomed = replace(tracked, camera=working_size.reduced(large).camera.zoomed(1.25))
+    focal = working_size.enlarged(zoomed, large, working_size.reduced(large)).camera.fx_fy_cx_cy[0]
+    assert float(focal) == pytest.approx(1.25 * float(large.camera.fx_fy_cx_cy[0])), "an estimated one"
     assert key == "", "stage 1 has not seen these images"
     assert (cut.masks != large.masks).any(), "a piece of the wall that counted as object is gone"

@@ -101,7 +101,7 @@ def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Captu
     if tracked is None:
         return None, capture
     cut = remove_background(trimmed, tracked)
-    return working_size.enlarged(tracked, capture), working_size.with_masks(capture, small, cut)
+    return working_size.enlarged(tracked, capture, small), working_size.with_masks(capture, small, cut)
 
 
 def _own_cells(

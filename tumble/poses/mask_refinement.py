@@ -48,7 +48,7 @@ def stored_result(out: Path, capture: Capture) -> tuple[PoseResult | None, Captu
     """The poses of a run, None if there are none, and its capture with the masks from which they were estimated."""
     small = working_size.reduced(capture)
     best, trimmed = stored_rounds(out, small)
-    return best and working_size.enlarged(best, capture), working_size.with_masks(capture, small, trimmed)
+    return best and working_size.enlarged(best, capture, small), working_size.with_masks(capture, small, trimmed)
 
 
 def stored_rounds(out: Path, capture: Capture) -> tuple[PoseResult | None, Capture]:

@@ -34,9 +34,13 @@ def reduced(capture: Capture) -> Capture:
     return replace(capture, images=images, masks=masks, camera=capture.camera.resized(h, w), full_images=full_images)
 
 
-def enlarged(result: PoseResult, whole: Capture) -> PoseResult:
-    """The result for a capture, of which it may have seen smaller images: with a camera of the capture's size."""
-    return replace(result, camera=result.camera.resized(whole.camera.height, whole.camera.width))
+def enlarged(result: PoseResult, whole: Capture, small: Capture) -> PoseResult:
+    """The result for a capture of which it has seen what `reduced` has made of it: with a camera of the capture's size.
+
+    A focal length that was not estimated stays the same to the bit.
+    """
+    factor = float(result.camera.fx_fy_cx_cy[0] / small.camera.fx_fy_cx_cy[0])
+    return replace(result, camera=whole.camera.zoomed(factor))
 
 
 def with_masks(whole: Capture, small: Capture, masked: Capture) -> Capture:
