@@ -138,6 +138,12 @@ def resize_area(x: Float[Tensor, "h w c"], height: int, width: int) -> Float[Ten
     return torch.einsum("ih,hwc,jw->ijc", rows, x, columns)
 
 
+def resize_srgb8(images: UInt8[Tensor, "t h w 3"], height: int, width: int) -> UInt8[Tensor, "t {height} {width} 3"]:
+    """Images of sRGB code values resampled by area averaging in linear light."""
+    curve = linear_from_srgb(torch.arange(256, device=images.device) / 255)
+    return torch.stack([to_srgb8(resize_area(curve[image.long()], height, width)) for image in images])
+
+
 def crop_box(mask: Shaped[Tensor, "h w"], margin: int) -> Box:
     """Bounding box of the pixels above zero, widened by `margin` [pixels] and clipped to the image.
 

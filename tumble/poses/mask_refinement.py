@@ -97,8 +97,7 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
         trimmed = np.where(outside, np.uint8(BACKGROUND), labels)
         trimmed[(labels == OBJECT) & ~outside & ~silhouette] = UNKNOWN
         masks[k] = torch.from_numpy(trimmed)
-    shown = (masks != BACKGROUND)[..., None]
-    return replace(capture, masks=masks, images=torch.where(shown, capture.images, torch.zeros_like(capture.images)))
+    return capture.with_masks(masks)
 
 
 def explains_more(new: PoseResult, old: PoseResult) -> bool:

@@ -7,10 +7,11 @@ these were chosen. Stages 2 and 3 see the capture itself.
 from dataclasses import replace
 
 import torch
+from jaxtyping import Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from tumble.maths import linear_from_srgb, resize_area, to_srgb8
+from tumble.maths import resize_area, resize_srgb8
 from tumble.poses.result import PoseResult
 from tumble.poses.sfm import is_hidden
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture
@@ -28,10 +29,11 @@ def reduced(capture: Capture) -> Capture:
     masks = torch.stack([_majority(mask, h, w) for mask in capture.masks])
     if not is_hidden(masks):
         return capture
-    full_images = None if capture.full_images is None else _resized(capture.full_images, h, w)
+    full_images = None if capture.full_images is None else resize_srgb8(capture.full_images, h, w)
     # At the border of the object the mean of its own colours and black is darker than the photo.
-    images = _blackened(_resized(capture.images, h, w) if full_images is None else full_images, masks)
-    return replace(capture, images=images, masks=masks, camera=capture.camera.resized(h, w), full_images=full_images)
+    images = resize_srgb8(capture.images, h, w) if full_images is None else full_images
+    camera = capture.camera.resized(h, w)
+    return replace(capture, images=images, masks=masks, camera=camera, full_images=full_images).with_masks(masks)
 
 
 def enlarged(result: PoseResult, whole: Capture, small: Capture) -> PoseResult:
@@ -54,29 +56,17 @@ def with_masks(whole: Capture, small: Capture, masked: Capture) -> Capture:
         return masked
     height, width = whole.camera.height, whole.camera.width
     changed, new = (_at_nearest(x, height, width) for x in (masked.masks != small.masks, masked.masks))
-    masks = torch.where(changed, new, whole.masks)
     full_images = None if masked.full_images is None else whole.full_images
-    return replace(whole, masks=masks, images=_blackened(whole.images, masks), full_images=full_images)
+    return replace(whole, full_images=full_images).with_masks(torch.where(changed, new, whole.masks))
 
 
-def _resized(images: Tensor, h: int, w: int) -> Tensor:
-    """Images resampled by area averaging in linear light."""
-    curve = linear_from_srgb(torch.arange(256) / 255)
-    return torch.stack([to_srgb8(resize_area(curve[image.long()], h, w)) for image in images])
-
-
-def _majority(mask: Tensor, h: int, w: int) -> Tensor:
+def _majority(mask: UInt8[Tensor, "i j"], h: int, w: int) -> UInt8[Tensor, "{h} {w}"]:
     """The mask with the value of most of what a pixel covers."""
     values = torch.tensor([BACKGROUND, OBJECT, UNKNOWN], dtype=mask.dtype)
     shares = resize_area((mask[..., None] == values).float(), h, w)
     return values[shares.argmax(-1)]
 
 
-def _at_nearest(x: Tensor, height: int, width: int) -> Tensor:
+def _at_nearest(x: Shaped[Tensor, "t h w"], height: int, width: int) -> Shaped[Tensor, "t {height} {width}"]:
     """Every value at all pixels that lie in its own."""
     return functional.interpolate(x[:, None].float(), (height, width), mode="nearest-exact")[:, 0].to(x.dtype)
-
-
-def _blackened(images: Tensor, masks: Tensor) -> Tensor:
-    """Images that are black where the masks have background, as those of a capture are."""
-    return torch.where((masks != BACKGROUND)[..., None], images, torch.zeros_like(images))

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from tumble.io import tree
-from tumble.maths import SE3, linear_from_srgb, resize_area, to_srgb8
+from tumble.maths import SE3, resize_srgb8
 from tumble.scene.camera import Camera
 from tumble.scene.environment import Environment
 from tumble.scene.trajectory import Light, Trajectory
@@ -91,15 +91,19 @@ class Capture:
         full_images = None if self.full_images is None else self.full_images[frames]
         return replace(self, images=images, masks=masks, names=names, trajectory=trajectory, full_images=full_images)
 
+    def with_masks(self, masks: UInt8[Tensor, "t h w"]) -> "Capture":
+        """The capture with other masks, and its images black where these have background."""
+        shown = (masks != BACKGROUND)[..., None]
+        return replace(self, masks=masks, images=torch.where(shown, self.images, torch.zeros_like(self.images)))
+
     def halved(self) -> "Capture":
         """The capture at half the resolution, without `full_images`: 2 x 2 pixels become their mean in linear light.
 
         Their mask is UNKNOWN unless they agree. An odd last row or column is left out.
         """
         h, w = self.camera.height // 2, self.camera.width // 2
-        curve = linear_from_srgb(torch.arange(256, device=self.images.device) / 255)
         images, masks = self.images[:, : 2 * h, : 2 * w], self.masks[:, : 2 * h, : 2 * w]
-        mean = torch.stack([to_srgb8(resize_area(curve[image.long()], h, w)) for image in images])
+        mean = resize_srgb8(images, h, w)
         masks = masks.unflatten(2, (w, 2)).unflatten(1, (h, 2))
         least, most = masks.amin((2, 4)), masks.amax((2, 4))
         mask = torch.where(least == most, least, torch.full_like(least, UNKNOWN))
