@@ -72,6 +72,23 @@ def test_other_captures_stay_as_they_are(scene: tuple[Capture, Capture, SE3]) ->
     assert working_size.reduced(alone) is alone, "nothing hides the object"
 
 
+@pytest.mark.parametrize("size", [0, 1])
+def test_doubted_background_is_background_for_poses_only(scene: tuple[Capture, Capture, SE3], size: int) -> None:
+    """It is unknown, and black in images of a photo that is not."""
+    whole = scene[size]
+    above = torch.zeros_like(whole.masks, dtype=torch.bool)
+    above[:, : whole.camera.height // 8] = True
+    doubted = replace(whole, masks=whole.masks.masked_fill(above & (whole.masks == BACKGROUND), UNKNOWN))
+    small, same = working_size.reduced(doubted), working_size.reduced(whole)
+    assert torch.equal(small.masks, same.masks)
+    assert torch.equal(small.images, same.images)
+    back = working_size.with_masks(doubted, small, small)
+    assert torch.equal(back.masks, doubted.masks), "stages 2 and 3 do not know what it is"
+    unnamed = replace(doubted, full_images=None)
+    if size == 0:
+        assert working_size.reduced(unnamed) is unnamed, "masks of the user's own"
+
+
 def test_only_changes_of_the_masks_come_back(scene: tuple[Capture, Capture, SE3]) -> None:
     _, large, _ = scene
     large = replace(large, masks=large.masks.clone())

@@ -79,6 +79,15 @@ def test_only_frames_of_a_held_object_are_kept_with_their_background(made: tuple
     background = capture.masks == BACKGROUND
     assert torch.equal(capture.full_images[~background], capture.images[~background])
     assert capture.full_images[background].float().mean() > 20
+    doubted = np.zeros_like(held.masks.labels, dtype=bool)
+    doubted[:, :, : doubted.shape[2] // 2] = True
+    held = replace(held, masks=replace(held.masks, doubted=doubted))
+    video_to_capture._write(held, kept, video_to_capture.crop_window(held, kept), tmp_path / "doubted", options)
+    other = folder.load(tmp_path / "doubted")
+    assert torch.equal(other.images, capture.images), "doubted background is black"
+    now_unknown = background & (other.masks == UNKNOWN)
+    assert torch.equal(other.masks[~now_unknown], capture.masks[~now_unknown])
+    assert 0.2 < now_unknown.sum() / background.sum() < 0.8
 
 
 def test_the_window_contains_the_whole_path_of_the_object(made: tuple[Path, Path]) -> None:

@@ -1,7 +1,10 @@
-"""The images from which poses of an object that is hidden in part are estimated: smaller ones, if its capture is large.
+"""The capture from which poses of an object that is hidden in part are estimated: with smaller images, if it is large,
+and with doubted background as background.
 
 Segments and their joints have limits in pixels, and contours of such films err by a pixel or two of the images on which
-these were chosen. Stages 2 and 3 see the capture itself.
+these were chosen. Where the object has the colours of what is behind it, its contour is doubted: a single wrong one
+carves its shape. But poses need contours, and follow from so many that a wrong one does no harm. Stages 2 and 3 see the
+capture itself.
 """
 
 from dataclasses import replace
@@ -22,6 +25,7 @@ SIDE = 256
 
 def reduced(capture: Capture) -> Capture:
     """The capture from which poses are estimated: with smaller images if something hides a part of the object."""
+    capture = _without_doubt(capture)
     scale = SIDE / max(capture.camera.height, capture.camera.width)
     if scale >= 1:
         return capture
@@ -34,6 +38,17 @@ def reduced(capture: Capture) -> Capture:
     images = resize_srgb8(capture.images, h, w) if full_images is None else full_images
     camera = capture.camera.resized(h, w)
     return replace(capture, images=images, masks=masks, camera=camera, full_images=full_images).with_masks(masks)
+
+
+def _without_doubt(capture: Capture) -> Capture:
+    """The capture with doubted background as background: what is unknown, but black in images of a photo that is not."""
+    if capture.full_images is None:
+        return capture
+    black = (capture.images == 0).all(-1) & (capture.full_images > 0).any(-1)
+    doubted = black & (capture.masks == UNKNOWN)
+    if not bool(doubted.any()):
+        return capture
+    return capture.with_masks(capture.masks.masked_fill(doubted, BACKGROUND))
 
 
 def enlarged(result: PoseResult, whole: Capture, small: Capture) -> PoseResult:

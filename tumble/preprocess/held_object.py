@@ -62,7 +62,7 @@ MAX_AVERAGED_LOG_RATIO = 4.0
 """Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
 MIN_BACKGROUND_LOG_RATIO = 3.0
 """Mean log likelihood ratio of background to object among neighbouring pixels, below which background close to the
-object is unknown: where the object has the colours of what is behind it, all pixels err alike."""
+object is doubted: where the object has the colours of what is behind it, all pixels err alike."""
 BACKGROUND_WINDOW = 5
 """Side of the square of pixels over which this ratio is averaged."""
 MAX_HOLE_FRACTION = 0.3
@@ -165,14 +165,14 @@ def segment(
     first, colours = _segment_seed(start, background, seed, hand_colours(images, hands, background))
     if first.inside.sum() < segmentation.MIN_PIXELS:
         raise ValueError(f"shows no object in the box, or at the click, on frame {seed.index}")
-    labels = np.zeros(images.shape[:3], np.uint8)
+    labels, doubted = np.zeros(images.shape[:3], np.uint8), np.zeros(images.shape[:3], bool)
     confidence, uncertain = np.ones(len(images), np.float32), np.zeros(len(images), bool)
-    labels[seed.index] = _labels(start, first, background)
+    labels[seed.index], doubted[seed.index] = _labels(start, first, background), _doubted(first)
     for order in (range(seed.index + 1, len(images)), range(seed.index - 1, -1, -1)):
         tracked = _track(start, map(frame, order), first, background, colours)
         for i, each in zip(order, tracked, strict=True):
-            labels[i], confidence[i], uncertain[i] = each
-    return Masks(labels, confidence, uncertain)
+            labels[i], doubted[i], confidence[i], uncertain[i] = each
+    return Masks(labels, confidence, uncertain, doubted)
 
 
 def _segment_seed(
@@ -218,8 +218,8 @@ def _segment_seed(
 
 def _track(
     start: _Frame, frames: Iterable[_Frame], first: _State, background: Background, colours: ColourModel
-) -> Iterator[tuple[UInt8[np.ndarray, "h w"], float, bool]]:
-    """Mask of consecutive frames, its overlap with the prediction, and whether it is uncertain."""
+) -> Iterator[tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float, bool]]:
+    """Mask of consecutive frames, its doubted background, its overlap with the prediction, and whether it is uncertain."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     state, area, gray = first, int(first.inside.sum()), cv2.cvtColor(start.image, cv2.COLOR_RGB2GRAY)
     for frame in frames:
@@ -243,7 +243,7 @@ def _track(
             colours = _updated(colours, frame, state, predicted)
         uncertain = lost or segmentation.is_uncertain(agreement, area, new_area)
         area = new_area
-        yield _labels(frame, state, background), agreement, uncertain
+        yield _labels(frame, state, background), _doubted(state), agreement, uncertain
 
 
 def _prior(warped: Float32[np.ndarray, "3 h w"]) -> Float32[np.ndarray, "3 h w"]:
@@ -451,9 +451,12 @@ def _labels(frame: _Frame, state: _State, background: Background) -> UInt8[np.nd
     """Three-valued mask. What moves is unknown, and so are doubtful pixels and uncertain background near the object."""
     radius = segmentation.search_radius(state.inside)
     uncertain = segmentation.dilated(state.inside, radius) & ~frame.known
-    if frame.sampled is not None:  # the first segmentation is for the background, which must not become unknown there
-        uncertain |= segmentation.dilated(state.inside, 2 * radius) & state.alike
     unknown = (state.probabilities[BACKGROUND_CLASS] < 0.5) | frame.differs | uncertain
     labels = segmentation.make_trimap(trim_rim(state.inside, frame.image, background), unknown & ~state.inside, 1)
     labels[state.doubtful & (labels == OBJECT)] = UNKNOWN
     return labels
+
+
+def _doubted(state: _State) -> Bool[np.ndarray, "h w"]:
+    """Pixels close to the object that it may be, by their colours."""
+    return state.alike & segmentation.dilated(state.inside, 2 * segmentation.search_radius(state.inside))

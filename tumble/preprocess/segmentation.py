@@ -96,6 +96,9 @@ class Masks:
     """Overlap (IoU) of predicted and final mask; 0 where the object was not found."""
     uncertain: Bool[np.ndarray, " t"]
     """Frames whose mask should be checked by eye."""
+    doubted: Bool[np.ndarray, "t h w"] | None = None
+    """Pixels that may be object where the labels say background, because both have the same colours there; None if there
+    are none."""
 
 
 @dataclass(frozen=True)

@@ -224,8 +224,9 @@ def _write(
         shown, mask = (image, mask) if behind is None else settle_border(image, mask, *behind)
         if not (mask == OBJECT).any():
             continue
+        # Doubted background is black like all background, which tells it from what may hide the object.
         files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), shown))
-        files.write_png(out / "masks" / name, mask[..., None])
+        files.write_png(out / "masks" / name, _without_doubted(survey, i, mask, window)[..., None])
         # Masks of a held object may contain background; what is around the object shows its contour in stage 1, and
         # after it which parts of the masks are background.
         if held:
@@ -282,6 +283,17 @@ def _output_mask(
     coarse = _at_output(survey.masks.labels[i], survey, window, (h, w), cv2.INTER_NEAREST)
     factor = 1 / (survey.scale * max(width / w, height / h))
     return coarse if factor < 1.3 else segmentation.refine_mask(image, coarse, max(2, math.ceil(1.5 * factor)))
+
+
+def _without_doubted(
+    survey: Survey, i: int, mask: UInt8[np.ndarray, "h w"], window: tuple[int, int, int, int]
+) -> UInt8[np.ndarray, "h w"]:
+    """A frame's mask at the output size with its doubted background unknown."""
+    if survey.masks.doubted is None:
+        return mask
+    size = mask.shape[0], mask.shape[1]
+    doubted = _at_output(survey.masks.doubted[i].astype(np.uint8), survey, window, size, cv2.INTER_NEAREST) > 0
+    return np.where((mask == BACKGROUND) & doubted, np.uint8(UNKNOWN), mask)
 
 
 def _output_background(
