@@ -41,7 +41,7 @@ def reduced(capture: Capture) -> Capture:
 
 
 def _without_doubt(capture: Capture) -> Capture:
-    """The capture with doubted background as background: what is unknown, but black in images of a photo that is not."""
+    """The capture with doubted background as background: unknown pixels black there but not in the full image."""
     if capture.full_images is None:
         return capture
     black = (capture.images == 0).all(-1) & (capture.full_images > 0).any(-1)

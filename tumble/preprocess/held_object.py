@@ -219,7 +219,7 @@ def _segment_seed(
 def _track(
     start: _Frame, frames: Iterable[_Frame], first: _State, background: Background, colours: ColourModel
 ) -> Iterator[tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"], float, bool]]:
-    """Mask of consecutive frames, its doubted background, its overlap with the prediction, and whether it is uncertain."""
+    """Mask of consecutive frames, doubted background, overlap with the prediction, whether the mask is uncertain."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     state, area, gray = first, int(first.inside.sum()), cv2.cvtColor(start.image, cv2.COLOR_RGB2GRAY)
     for frame in frames:

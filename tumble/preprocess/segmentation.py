@@ -97,8 +97,8 @@ class Masks:
     uncertain: Bool[np.ndarray, " t"]
     """Frames whose mask should be checked by eye."""
     doubted: Bool[np.ndarray, "t h w"] | None = None
-    """Pixels that may be object where the labels say background, because both have the same colours there; None if there
-    are none."""
+    """Pixels that may be object where the labels say background, because both have the same colours there; None: none.
+    """
 
 
 @dataclass(frozen=True)
