@@ -75,3 +75,15 @@ def test_lost_poses_at_the_ends_repeat_the_closest() -> None:
     interpolated = interpolate_lost(T, torch.tensor([True, False, True, False]))
     torch.testing.assert_close(interpolated.wxyz[0], T.wxyz[1])
     torch.testing.assert_close(interpolated.xyz[2], (T.xyz[1] + T.xyz[3]) / 2)
+
+
+def test_parts_that_share_few_points_are_named() -> None:
+    ties = torch.tensor([torch.inf, 300, 200, torch.inf, 20, 30, 200, 100, 90, 80])
+    loose = replace(GOOD, ties=ties)
+    assert loose.loose_from == 4
+    assert loose.rating == "warn"
+    assert loose.sentence.startswith("Rotations are accurate to about 0.5 degrees. But hardly any point")
+    assert "before and after frame 4:" in loose.sentence
+    tied = replace(GOOD, ties=ties.clamp_min(50))
+    assert tied.loose_from is None
+    assert tied.sentence == GOOD.sentence

@@ -31,6 +31,9 @@ MIN_ROTATION_RANGE = math.radians(10)
 """Rotation range below which the object counts as not having rotated [radians]."""
 MAX_LOST_FRACTION = 0.5
 """Largest fraction of lost frames with which the remaining poses are still usable."""
+MIN_TIES = 50
+"""Number of surface points seen before and after an instant below which contours, rather than these, tell how the
+object is turned from one part of the film to the other."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +101,19 @@ class PoseQuality:
     rotation_range: Float[Tensor, ""]
     """Largest angle between the rotations of two frames [radians]."""
     observability: Observability
+    ties: Float[Tensor, " t"] | None = None
+    """Number of surface points that are seen before a frame and from then on; infinite for the first frame and lost
+    ones. None: nothing hides the object, so that its contours tell how it is turned."""
 
     def __len__(self) -> int:
         return len(self.residual)
+
+    @property
+    def loose_from(self) -> int | None:
+        """The frame from which on poses are hardly tied to those before it by what they show; None if there is none."""
+        if self.ties is None or float(self.ties.min()) >= MIN_TIES:
+            return None
+        return int(self.ties.argmin())
 
     @property
     def stationary(self) -> bool:
@@ -130,7 +143,8 @@ class PoseQuality:
             or lost > MAX_LOST_FRACTION
         ):
             return "bad"
-        return "warn" if lost > 0 or self.uncertainty > MAX_GOOD_UNCERTAINTY else "good"
+        doubtful = lost > 0 or self.uncertainty > MAX_GOOD_UNCERTAINTY or self.loose_from is not None
+        return "warn" if doubtful else "good"
 
     @property
     def sentence(self) -> str:
@@ -149,7 +163,19 @@ class PoseQuality:
             )
         lost = int(self.lost.sum())
         accuracy = f"Rotations are accurate to about {_degrees(self.uncertainty)} degrees."
-        return f"{accuracy} {lost} of {len(self)} frames are inconsistent with the others." if lost else accuracy
+        contradicted = f" {lost} of {len(self)} frames are inconsistent with the others." if lost else ""
+        return accuracy + contradicted + self._about_ties
+
+    @property
+    def _about_ties(self) -> str:
+        """What to know, and to do, where two parts of the film share little; empty if none do."""
+        if self.loose_from is None:
+            return ""
+        return (
+            f" But hardly any point of the object is seen both before and after frame {self.loose_from}: only contours "
+            "tell how it is turned from one part to the other, which may be wrong by tens of degrees. When you change "
+            "your grip, show the same side before and after."
+        )
 
 
 @dataclass(frozen=True)

@@ -274,3 +274,15 @@ def test_the_sentence_of_an_observable_object() -> None:
     fine = Observability(torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.005, 0.004, 0.003]))
     assert not fine.axis_unobservable
     assert fine.sentence == "Rotations are observable about every axis, to about 0.3 degrees about the worst axis."
+
+
+def test_ties_count_the_points_seen_before_and_after() -> None:
+    """Points 0 and 1 are seen in frames 1 to 4, point 2 before and after the gap, point 3 in lost frames only."""
+    frames, points = [1, 4, 2, 4, 1, 6, 0, 5], [0, 0, 1, 1, 2, 2, 3, 3]
+    tracks = Tracks(torch.tensor(frames), torch.tensor(points), torch.zeros(8, 2, dtype=torch.float64))
+    lost = torch.tensor([True, False, False, False, False, True, False])
+    seen = torch.ones(8, dtype=torch.bool)
+    inf = math.inf
+    assert finalize._ties(tracks, seen, lost).tolist() == [inf, inf, 2, 3, 3, inf, 1]
+    seen[5] = False
+    assert finalize._ties(tracks, seen, lost).tolist() == [inf, inf, 1, 2, 2, inf, 0]

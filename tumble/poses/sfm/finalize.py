@@ -144,10 +144,28 @@ def pose_result(
         observability = _observability_from_symmetry(observability, mirror_symmetry)
     disagreement = solution.rotation_disagreement.float()
     rotation_range = angle_between(T.rotation[:, None], T.rotation).max().float()
+    ties = None if solution.confirmed is None else _ties(tracks, is_inlier & reliable[tracks.point], lost)
     quality = PoseQuality(
-        median.float(), inliers.float(), gap.float(), overlap, disagreement, lost, rotation_range, observability
+        median.float(), inliers.float(), gap.float(), overlap, disagreement, lost, rotation_range, observability, ties
     )
     return _upright(PoseResult(trajectory, points.float(), colours, quality, camera))
+
+
+def _ties(tracks: Tracks, seen: Bool[Tensor, " o"], lost: Bool[Tensor, " t"]) -> Float[Tensor, " t"]:
+    """Number of points that are seen before a frame and from then on; infinite for the first frame and lost ones.
+
+    Args:
+        seen: Observations that agree with a surface point.
+    """
+    n, some = len(lost), seen & ~lost[tracks.frame]
+    frame, point = tracks.frame[some], tracks.point[some]
+    first = torch.full((tracks.n,), n).scatter_reduce_(0, point, frame, "amin")
+    last = torch.full((tracks.n,), -1).scatter_reduce_(0, point, frame, "amax")
+    k = torch.arange(n)[:, None]
+    ties = ((first < k) & (last >= k)).sum(1).float()
+    exempt = lost.clone()
+    exempt[: int((~lost).int().argmax()) + 1] = True
+    return ties.masked_fill(exempt, torch.inf)
 
 
 def _upright(result: PoseResult) -> PoseResult:
