@@ -78,12 +78,14 @@ def test_lost_poses_at_the_ends_repeat_the_closest() -> None:
 
 
 def test_parts_that_share_few_points_are_named() -> None:
-    ties = torch.tensor([torch.inf, 300, 200, torch.inf, 20, 30, 200, 100, 90, 80])
+    ties = torch.tensor([torch.inf, 300, 200, 6, torch.inf, 4, 20, 100, 7, 80])
     loose = replace(GOOD, ties=ties)
-    assert loose.loose_from == 4
+    assert loose.loose_from == [5, 8], "frame 4 is lost"
     assert loose.rating == "warn"
     assert loose.sentence.startswith("Rotations are accurate to about 0.5 degrees. But hardly any point")
-    assert "before and after frame 4:" in loose.sentence
-    tied = replace(GOOD, ties=ties.clamp_min(50))
-    assert tied.loose_from is None
+    assert "before and after frame 5 or 8:" in loose.sentence
+    tied = replace(GOOD, ties=ties.clamp_min(8))
+    assert not tied.loose_from
+    many = replace(GOOD, ties=torch.tensor([torch.inf, 5, 90, 3, 90, 1, 90, 4, 90, 90]))
+    assert many.loose_from == [3, 5, 7]
     assert tied.sentence == GOOD.sentence

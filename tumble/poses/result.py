@@ -31,9 +31,11 @@ MIN_ROTATION_RANGE = math.radians(10)
 """Rotation range below which the object counts as not having rotated [radians]."""
 MAX_LOST_FRACTION = 0.5
 """Largest fraction of lost frames with which the remaining poses are still usable."""
-MIN_TIES = 50
-"""Number of surface points seen before and after an instant below which contours, rather than these, tell how the
-object is turned from one part of the film to the other."""
+MIN_TIES = 8
+"""Number of surface points seen before and after an instant below which contours tell how the object is turned from one
+part of the film to the other: a pose needs as many (`registration.MIN_CORRESPONDENCES`)."""
+MAX_NAMED = 3
+"""Number of such instants that are named, the weakest ones."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +111,20 @@ class PoseQuality:
         return len(self.residual)
 
     @property
-    def loose_from(self) -> int | None:
-        """The frame from which on poses are hardly tied to those before it by what they show; None if there is none."""
-        if self.ties is None or float(self.ties.min()) >= MIN_TIES:
-            return None
-        return int(self.ties.argmin())
+    def loose_from(self) -> list[int]:
+        """Frames from which on poses are hardly tied to earlier ones by what they show.
+
+        Of consecutive ones the weakest, and up to `MAX_NAMED`, in order of time.
+        """
+        if self.ties is None:
+            return []
+        weak = torch.nonzero(self.ties < MIN_TIES)[:, 0].tolist()
+        runs: list[list[int]] = []
+        for k in weak:
+            before = bool(runs) and bool((self.ties[runs[-1][-1] + 1 : k].isinf()).all())
+            runs[-1].append(k) if before else runs.append([k])
+        weakest = [min(run, key=self.ties.__getitem__) for run in runs]
+        return sorted(sorted(weakest, key=self.ties.__getitem__)[:MAX_NAMED])
 
     @property
     def stationary(self) -> bool:
@@ -143,7 +154,7 @@ class PoseQuality:
             or lost > MAX_LOST_FRACTION
         ):
             return "bad"
-        doubtful = lost > 0 or self.uncertainty > MAX_GOOD_UNCERTAINTY or self.loose_from is not None
+        doubtful = lost > 0 or self.uncertainty > MAX_GOOD_UNCERTAINTY or bool(self.loose_from)
         return "warn" if doubtful else "good"
 
     @property
@@ -169,12 +180,13 @@ class PoseQuality:
     @property
     def _about_ties(self) -> str:
         """What to know, and to do, where two parts of the film share little; empty if none do."""
-        if self.loose_from is None:
+        if not self.loose_from:
             return ""
+        frames = " or ".join(map(str, self.loose_from))
         return (
-            f" But hardly any point of the object is seen both before and after frame {self.loose_from}: only contours "
-            "tell how it is turned from one part to the other, which may be wrong by tens of degrees. When you change "
-            "your grip, show the same side before and after."
+            f" But hardly any point of the object is seen both before and after frame {frames}: only contours tell how "
+            "it is turned from one part to the other, which may be wrong by tens of degrees. When you change your "
+            "grip, show the same side before and after."
         )
 
 
