@@ -1,10 +1,7 @@
-"""The capture from which poses of an object that is hidden in part are estimated: with smaller images, if it is large,
-and with doubted background as background.
+"""The images from which poses of an object that is hidden in part are estimated: smaller ones, if its capture is large.
 
 Segments and their joints have limits in pixels, and contours of such films err by a pixel or two of the images on which
-these were chosen. Where the object has the colours of what is behind it, its contour is doubted: a single wrong one
-carves its shape. But poses need contours, and follow from so many that a wrong one does no harm. Stages 2 and 3 see the
-capture itself.
+these were chosen. Stages 2 and 3 see the capture itself.
 """
 
 from dataclasses import replace
@@ -16,7 +13,7 @@ from torch.nn import functional
 
 from tumble.maths import resize_area, resize_srgb8
 from tumble.poses.result import PoseResult
-from tumble.poses.sfm import is_hidden
+from tumble.poses.sfm import is_hidden, without_doubt
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Capture
 
 SIDE = 256
@@ -25,30 +22,20 @@ SIDE = 256
 
 def reduced(capture: Capture) -> Capture:
     """The capture from which poses are estimated: with smaller images if something hides a part of the object."""
-    capture = _without_doubt(capture)
     scale = SIDE / max(capture.camera.height, capture.camera.width)
     if scale >= 1:
         return capture
     h, w = (max(round(side * scale), 1) for side in (capture.camera.height, capture.camera.width))
-    masks = torch.stack([_majority(mask, h, w) for mask in capture.masks])
+    settled = without_doubt(capture)
+    masks, shown = (torch.stack([_majority(mask, h, w) for mask in x.masks]) for x in (capture, settled))
     if not is_hidden(masks):
         return capture
     full_images = None if capture.full_images is None else resize_srgb8(capture.full_images, h, w)
     # At the border of the object the mean of its own colours and black is darker than the photo.
     images = resize_srgb8(capture.images, h, w) if full_images is None else full_images
     camera = capture.camera.resized(h, w)
-    return replace(capture, images=images, masks=masks, camera=camera, full_images=full_images).with_masks(masks)
-
-
-def _without_doubt(capture: Capture) -> Capture:
-    """The capture with doubted background as background: unknown pixels black there but not in the full image."""
-    if capture.full_images is None:
-        return capture
-    black = (capture.images == 0).all(-1) & (capture.full_images > 0).any(-1)
-    doubted = black & (capture.masks == UNKNOWN)
-    if not bool(doubted.any()):
-        return capture
-    return capture.with_masks(capture.masks.masked_fill(doubted, BACKGROUND))
+    small = replace(capture, images=images, masks=masks, camera=camera, full_images=full_images)
+    return small.with_masks(shown).with_masks(masks)
 
 
 def enlarged(result: PoseResult, whole: Capture, small: Capture) -> PoseResult:

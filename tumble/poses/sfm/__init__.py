@@ -7,6 +7,7 @@ silhouettes, and relocalization; before them, the motion of a turntable (`circul
 """
 
 from tumble.poses.sfm import stage
+from tumble.poses.sfm.observations import without_doubt
 from tumble.poses.sfm.stage import Config, assess, gather, is_hidden, shown
 
-__all__ = ["Config", "assess", "gather", "is_hidden", "shown", "stage"]
+__all__ = ["Config", "assess", "gather", "is_hidden", "shown", "stage", "without_doubt"]

@@ -73,21 +73,26 @@ def gather(capture: Capture, matches: Sequence[Match], *, hidden: bool = False) 
     Raises:
         ValueError: No frame shows the object.
     """
-    capture = replace(capture, masks=frontier_points.fill_boundary_bands(capture.masks))
-    if hidden:
-        capture = replace(capture, masks=frontier_points.without_scraps(capture.masks))
+    settled = without_doubt(capture)
+    capture = replace(capture, masks=_clear(capture.masks, hidden=hidden))
     silhouettes = relative_pose.silhouettes(capture)
     if not bool(silhouettes.visible.any()):
         raise ValueError("no mask has an object pixel: poses need masks that show the object")
     sure = [on_object(match, capture.masks) for match in matches] if hidden else matches
     tracks = tracks_of(sure, silhouettes, capture)
-    contours = frontier_points.convex_contours(capture)
+    contours = frontier_points.convex_contours(replace(settled, masks=_clear(settled.masks, hidden=hidden)))
     failed = relative_pose.failed_masks(silhouettes)
     contours = replace(contours, reliable=contours.reliable & ~failed[:, None])
     silhouettes = relative_pose.replace_failed(silhouettes, failed)
     radius = RADIUS_MARGIN * float(silhouettes.radius[silhouettes.visible].median())
     mirror = mirror_symmetry(capture.masks)
     return Inputs(capture, sure, silhouettes, contours, tracks, radius, failed, mirror, matches if hidden else ())
+
+
+def _clear(masks: UInt8[Tensor, "t h w"], *, hidden: bool) -> UInt8[Tensor, "t h w"]:
+    """Masks without bands of unknown pixels along silhouettes and, of a hidden object, without scraps."""
+    masks = frontier_points.fill_boundary_bands(masks)
+    return frontier_points.without_scraps(masks) if hidden else masks
 
 
 def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Capture) -> Tracks:
@@ -110,8 +115,22 @@ def is_hidden(masks: UInt8[Tensor, "t h w"]) -> bool:
     return bool(fractions) and float(np.median(fractions)) > MAX_HIDDEN_RIM
 
 
+def without_doubt(capture: Capture) -> Capture:
+    """The capture with doubted background as background: unknown pixels black there but not in the full image.
+
+    Where the object has the colours of what is behind it, a single wrong contour carves its shape. But poses need
+    contours, and follow from so many that a wrong one does little harm.
+    """
+    if capture.full_images is None:
+        return capture
+    black = (capture.images == 0).all(-1) & (capture.full_images > 0).any(-1)
+    doubted = black & (capture.masks == UNKNOWN)
+    return capture.with_masks(capture.masks.masked_fill(doubted, BACKGROUND))
+
+
 def shown(capture: Capture) -> Capture:
     """The capture with everything that is not background in its masks: the object and what hides it."""
+    capture = without_doubt(capture)
     masks = torch.where(capture.masks == BACKGROUND, capture.masks, torch.full_like(capture.masks, OBJECT))
     return replace(capture, masks=masks)
 
