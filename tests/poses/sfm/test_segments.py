@@ -178,6 +178,25 @@ def test_what_hides_the_object_is_matched_as_well(scene: Tumble) -> None:
     assert not (capture.masks == UNKNOWN).any()
 
 
+def test_doubted_background_has_contours_beside_it_but_stays_unknown(scene: Tumble) -> None:
+    """It is unknown, and black in images of a photo that is not."""
+    certain = hidden(scene)
+    photos = torch.where(certain.masks[..., None] == BACKGROUND, 200, certain.images)
+    certain = replace(certain.with_masks(certain.masks), full_images=photos)
+    upper = torch.arange(certain.masks.shape[1])[:, None] < certain.masks.shape[1] // 2
+    masks = certain.masks.masked_fill(upper & (certain.masks == BACKGROUND), UNKNOWN)
+    doubted = replace(certain, masks=masks)
+    found, same = (stage.gather(each, [], hidden=True) for each in (doubted, certain))
+    assert torch.equal(found.contours.reliable, same.contours.reliable)
+    assert torch.equal(found.contours.vertices, same.contours.vertices)
+    assert same.contours.reliable.any()
+    assert ((found.capture.masks == UNKNOWN) == (masks == UNKNOWN)).float().mean() > 0.98, "but for scraps"
+    assert torch.equal(shown(doubted).masks, shown(certain).masks)
+    seen = replace(doubted, images=photos)
+    without = stage.gather(seen, [], hidden=True).contours.reliable
+    assert int(without.sum()) < 0.7 * int(same.contours.reliable.sum()), "what may hide the object"
+
+
 def test_a_correspondence_needs_one_end_on_the_object(scene: Tumble) -> None:
     masks = torch.full((2, 4, 4), BACKGROUND, dtype=torch.uint8)
     masks[:, :, 2:], masks[0, 1, 1] = UNKNOWN, OBJECT
