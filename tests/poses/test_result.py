@@ -82,8 +82,9 @@ def test_parts_that_share_few_points_are_named() -> None:
     loose = replace(GOOD, ties=ties)
     assert loose.loose_from == [5, 8], "frame 4 is lost"
     assert loose.rating == "warn"
-    assert loose.sentence.startswith("Rotations are accurate to about 0.5 degrees. But hardly any point")
+    assert loose.sentence.startswith("Rotations are accurate to about 0.5 degrees. Hardly any point")
     assert "before and after frame 5 or 8:" in loose.sentence
+    assert "before and after frame 5 or 8:" in replace(loose, overlap=0.64 * ONES).sentence
     tied = replace(GOOD, ties=ties.clamp_min(8))
     assert not tied.loose_from
     many = replace(GOOD, ties=torch.tensor([torch.inf, 5, 90, 3, 90, 1, 90, 4, 90, 90]))

@@ -171,6 +171,7 @@ class PoseQuality:
             return (
                 "The silhouettes are inconsistent at these poses: the object changed its shape, or its rotations were "
                 "not found. Record it alone, with smaller rotations between frames and with more texture."
+                f"{self._about_ties}"
             )
         lost = int(self.lost.sum())
         accuracy = f"Rotations are accurate to about {_degrees(self.uncertainty)} degrees."
@@ -184,7 +185,7 @@ class PoseQuality:
             return ""
         frames = " or ".join(map(str, self.loose_from))
         return (
-            f" But hardly any point of the object is seen both before and after frame {frames}: only contours tell how "
+            f" Hardly any point of the object is seen both before and after frame {frames}: only contours tell how "
             "it is turned from one part to the other, which may be wrong by tens of degrees. When you change your "
             "grip, show the same side before and after."
         )
