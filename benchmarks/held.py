@@ -165,7 +165,8 @@ def mask_scores(survey: Survey, path: Path) -> dict[str, float]:
     """Scores of the masks over all frames; the band of unknown pixels along the silhouette counts as neither."""
     overlaps, hands, unknown = [], 0, []
     pixels = 0
-    for i, labels in zip(survey.numbers, capture_labels(survey), strict=True):
+    for k, i in enumerate(survey.numbers):
+        labels = survey.masks.with_doubt(k)
         there, hand = (true_mask(path, kind, int(i), labels.shape) for kind in ("object", "hand"))
         inside, decided = labels == OBJECT, (labels == OBJECT) | (labels == BACKGROUND)
         certain = decided & ((there > CERTAIN) | (there < 1 - CERTAIN))
@@ -182,12 +183,6 @@ def mask_scores(survey: Survey, path: Path) -> dict[str, float]:
     }
 
 
-def capture_labels(survey: Survey) -> np.ndarray:
-    """Masks of all frames as they are in a capture: doubted background is unknown."""
-    labels, doubted = survey.masks.labels, survey.masks.doubted
-    return labels if doubted is None else np.where(doubted & (labels == BACKGROUND), np.uint8(UNKNOWN), labels)
-
-
 def true_mask(path: Path, kind: str, number: int, shape: tuple[int, ...]) -> np.ndarray:
     """Fraction of every pixel that shows the object or the hand."""
     mask = files.read_image(path / "truth" / f"film_{kind}_mask" / f"{number:04d}.png")[..., 0]
@@ -198,7 +193,7 @@ def contact_sheet(survey: Survey, path: Path) -> np.ndarray:
     """Frames with the object green, unknown pixels red, and the true outline of the object white."""
     tiles = []
     for i in np.linspace(0, len(survey.images) - 1, DRAWN).round().astype(int):
-        image, labels = survey.images[i].copy(), capture_labels(survey)[i]
+        image, labels = survey.images[i].copy(), survey.masks.with_doubt(i)
         for value, colour in ((OBJECT, (0, 255, 0)), (UNKNOWN, (255, 0, 0))):
             where = labels == value
             image[where] = (0.6 * image[where] + 0.4 * np.array(colour)).astype(np.uint8)

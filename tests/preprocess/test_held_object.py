@@ -13,7 +13,7 @@ from tumble.preprocess import held_object
 from tumble.preprocess.background import estimate_background
 from tumble.preprocess.colour_model import BACKGROUND_CLASS, UNIFORM_DENSITY, hand_colours
 from tumble.preprocess.hands import Hand
-from tumble.preprocess.segmentation import Masks, Seed, opened, overlap, search_radius
+from tumble.preprocess.segmentation import Masks, Seed, opened, overlap, search_radius, with_doubt
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
 PRINT = (196, 140, 112)
@@ -134,17 +134,25 @@ def test_a_label_in_the_colour_of_the_hand_is_object_beside_the_hand() -> None:
 
 def test_background_that_may_as_well_be_the_object_beside_it_is_doubted() -> None:
     """A side in the colours of the wall behind it: neighbours err alike, so that all of them are called background."""
-    inside, side, far = np.zeros((3, 60, 90), bool)
+    wall, inside, side, far = np.zeros((60, 90, 3), np.uint8), *np.zeros((3, 60, 90), bool)
     inside[10:40, 20:50], side[15:35, 50:60], far[15:35, 78:88] = True, True, True
     likelihood = np.zeros((3, 60, 90), np.float32)
     likelihood[BACKGROUND_CLASS] = np.where(inside, -5, np.where(side | far, 2, 6))
     alike = held_object._alike(likelihood, ~inside)
     assert alike[side].mean() > 0.7
     assert not alike[:, :48].any()
-    probabilities = np.stack([inside, np.zeros_like(inside), ~inside]).astype(np.float32)
-    doubted = held_object._doubted(held_object._State(probabilities, inside, np.zeros_like(inside), alike))
-    assert doubted[18:32, 52:54].all()
-    assert not doubted[far].any()
+    background = estimate_background(np.repeat(wall[None], 3, 0), np.zeros((3, 60, 90), bool))
+    empty = np.zeros_like(inside)
+    sampled = np.zeros(inside.shape, np.float32)
+    frame = held_object._Frame(wall, wall, empty, sampled, empty, ~empty, empty, None, empty, empty, empty)
+    probabilities = np.stack([inside, empty, ~inside]).astype(np.float32)
+    state = held_object._State(probabilities, inside, empty, alike)
+    doubted = held_object._doubted(state)
+    labels = with_doubt(held_object._labels(frame, state, background), doubted)
+    assert (labels[18:32, 52:54] == UNKNOWN).all()
+    assert (labels[alike & far] == BACKGROUND).all()
+    labels = held_object._labels(frame, state, background)
+    assert (labels[18:32, 52:54] == BACKGROUND).all(), "what the background is estimated from"
 
 
 def test_what_may_be_a_hand_that_was_not_detected_is_unknown() -> None:

@@ -1,5 +1,6 @@
 """Quality of estimated poses, per frame and for the whole capture, and the result of stage 1."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -118,13 +119,11 @@ class PoseQuality:
         """
         if self.ties is None:
             return []
-        weak = torch.nonzero(self.ties < MIN_TIES)[:, 0].tolist()
-        runs: list[list[int]] = []
-        for k in weak:
-            before = bool(runs) and bool((self.ties[runs[-1][-1] + 1 : k].isinf()).all())
-            runs[-1].append(k) if before else runs.append([k])
-        weakest = [min(run, key=self.ties.__getitem__) for run in runs]
-        return sorted(sorted(weakest, key=self.ties.__getitem__)[:MAX_NAMED])
+        ties = self.ties.tolist()
+        tied = [k for k, count in enumerate(ties) if math.isfinite(count)]
+        runs = [list(run) for weak, run in itertools.groupby(tied, lambda k: ties[k] < MIN_TIES) if weak]
+        weakest = sorted((min(run, key=ties.__getitem__) for run in runs), key=ties.__getitem__)
+        return sorted(weakest[:MAX_NAMED])
 
     @property
     def stationary(self) -> bool:

@@ -26,8 +26,7 @@ def reduced(capture: Capture) -> Capture:
     if scale >= 1:
         return capture
     h, w = (max(round(side * scale), 1) for side in (capture.camera.height, capture.camera.width))
-    settled = without_doubt(capture)
-    masks, shown = (torch.stack([_majority(mask, h, w) for mask in x.masks]) for x in (capture, settled))
+    masks = _majority(capture.masks, h, w)
     if not is_hidden(masks):
         return capture
     full_images = None if capture.full_images is None else resize_srgb8(capture.full_images, h, w)
@@ -35,7 +34,9 @@ def reduced(capture: Capture) -> Capture:
     images = resize_srgb8(capture.images, h, w) if full_images is None else full_images
     camera = capture.camera.resized(h, w)
     small = replace(capture, images=images, masks=masks, camera=camera, full_images=full_images)
-    return small.with_masks(shown).with_masks(masks)
+    settled = without_doubt(capture)
+    # Doubted background stays known by its black image.
+    return (small if settled is capture else small.with_masks(_majority(settled.masks, h, w))).with_masks(masks)
 
 
 def enlarged(result: PoseResult, whole: Capture, small: Capture) -> PoseResult:
@@ -62,11 +63,11 @@ def with_masks(whole: Capture, small: Capture, masked: Capture) -> Capture:
     return replace(whole, full_images=full_images).with_masks(torch.where(changed, new, whole.masks))
 
 
-def _majority(mask: UInt8[Tensor, "i j"], h: int, w: int) -> UInt8[Tensor, "{h} {w}"]:
-    """The mask with the value of most of what a pixel covers."""
-    values = torch.tensor([BACKGROUND, OBJECT, UNKNOWN], dtype=mask.dtype)
-    shares = resize_area((mask[..., None] == values).float(), h, w)
-    return values[shares.argmax(-1)]
+def _majority(masks: UInt8[Tensor, "t i j"], h: int, w: int) -> UInt8[Tensor, "t {h} {w}"]:
+    """The masks with the value of most of what a pixel covers."""
+    values = torch.tensor([BACKGROUND, OBJECT, UNKNOWN], dtype=masks.dtype)
+    shares = (resize_area((mask[..., None] == values).float(), h, w) for mask in masks)
+    return torch.stack([values[each.argmax(-1)] for each in shares])
 
 
 def _at_nearest(x: Shaped[Tensor, "t h w"], height: int, width: int) -> Shaped[Tensor, "t {height} {width}"]:

@@ -100,6 +100,10 @@ class Masks:
     """Pixels that may be object where the labels say background, because both have the same colours there; None: none.
     """
 
+    def with_doubt(self, i: int) -> UInt8[np.ndarray, "h w"]:
+        """The labels of a frame as they are in a capture: doubted background is unknown."""
+        return self.labels[i] if self.doubted is None else with_doubt(self.labels[i], self.doubted[i])
+
 
 @dataclass(frozen=True)
 class _Segmentation:
@@ -222,6 +226,11 @@ def possible_object(labels: UInt8[np.ndarray, "t h w"]) -> Bool[np.ndarray, "t h
     """Pixels of the object, and unknown ones within its convex hull: these may be a print in a hand's colours."""
     pixels = (np.argwhere(mask == OBJECT)[:, ::-1].astype(np.int32, order="C") for mask in labels)
     return np.stack([filled_hull(each, labels.shape[1:]) for each in pixels]) & (labels != BACKGROUND)
+
+
+def with_doubt(labels: UInt8[np.ndarray, "h w"], doubted: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Labels in which doubted background is unknown."""
+    return np.where((labels == BACKGROUND) & doubted, np.uint8(UNKNOWN), labels)
 
 
 def refine_mask(

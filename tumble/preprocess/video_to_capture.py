@@ -183,7 +183,7 @@ def write_preview(survey: Survey, path: Path, kept: list[int]) -> None:
         UNCERTAIN_EDGE if uncertain else KEPT_EDGE if i in kept else DROPPED_EDGE
         for i, uncertain in enumerate(survey.masks.uncertain)
     ]
-    overlays = map(mask_overlay, survey.images, survey.masks.labels, edges)
+    overlays = map(mask_overlay, survey.images, map(survey.masks.with_doubt, range(len(edges))), edges)
     video.write_clip(path, overlays, quality=24)
 
 
@@ -226,7 +226,7 @@ def _write(
             continue
         # Doubted background is black like all background, which tells it from what may hide the object.
         files.write_png(out / "images" / name, np.where(mask[..., None] == BACKGROUND, np.uint8(0), shown))
-        files.write_png(out / "masks" / name, _without_doubted(survey, i, mask, window)[..., None])
+        files.write_png(out / "masks" / name, _with_doubt(survey, i, mask, window)[..., None])
         # Masks of a held object may contain background; what is around the object shows its contour in stage 1, and
         # after it which parts of the masks are background.
         if held:
@@ -285,7 +285,7 @@ def _output_mask(
     return coarse if factor < 1.3 else segmentation.refine_mask(image, coarse, max(2, math.ceil(1.5 * factor)))
 
 
-def _without_doubted(
+def _with_doubt(
     survey: Survey, i: int, mask: UInt8[np.ndarray, "h w"], window: tuple[int, int, int, int]
 ) -> UInt8[np.ndarray, "h w"]:
     """A frame's mask at the output size with its doubted background unknown."""
@@ -293,7 +293,7 @@ def _without_doubted(
         return mask
     size = mask.shape[0], mask.shape[1]
     doubted = _at_output(survey.masks.doubted[i].astype(np.uint8), survey, window, size, cv2.INTER_NEAREST) > 0
-    return np.where((mask == BACKGROUND) & doubted, np.uint8(UNKNOWN), mask)
+    return segmentation.with_doubt(mask, doubted)
 
 
 def _output_background(

@@ -18,7 +18,7 @@ from tumble.poses.sfm import bundle_adjustment, relocalization
 from tumble.poses.sfm.frontier_points import Contours, EpipolarTangencies, epipolar_tangencies, tracks_at
 from tumble.poses.sfm.relocalization import ContourConstraints
 from tumble.poses.sfm.symmetry import MirrorSymmetry, texture_information
-from tumble.poses.sfm.tracks import Tracks
+from tumble.poses.sfm.tracks import Tracks, crossings
 from tumble.scene import BACKGROUND, UNKNOWN, Camera, Capture, Trajectory, visual_hull
 
 INLIER_THRESHOLD = 1.5
@@ -157,15 +157,9 @@ def _ties(tracks: Tracks, seen: Bool[Tensor, " o"], lost: Bool[Tensor, " t"]) ->
     Args:
         seen: Observations that agree with a surface point.
     """
-    n, some = len(lost), seen & ~lost[tracks.frame]
-    frame, point = tracks.frame[some], tracks.point[some]
-    first = torch.full((tracks.n,), n).scatter_reduce_(0, point, frame, "amin")
-    last = torch.full((tracks.n,), -1).scatter_reduce_(0, point, frame, "amax")
-    k = torch.arange(n)[:, None]
-    ties = ((first < k) & (last >= k)).sum(1).float()
-    exempt = lost.clone()
-    exempt[: int((~lost).int().argmax()) + 1] = True
-    return ties.masked_fill(exempt, torch.inf)
+    ties = crossings(tracks.select(seen & ~lost[tracks.frame]), len(lost)).float()
+    first = int((~lost).int().argmax())
+    return ties.masked_fill(lost | (torch.arange(len(lost)) == first), torch.inf)
 
 
 def _upright(result: PoseResult) -> PoseResult:

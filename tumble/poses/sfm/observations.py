@@ -73,14 +73,15 @@ def gather(capture: Capture, matches: Sequence[Match], *, hidden: bool = False) 
     Raises:
         ValueError: No frame shows the object.
     """
-    settled = without_doubt(capture)
-    capture = replace(capture, masks=_clear(capture.masks, hidden=hidden))
+    settled, original = without_doubt(capture), capture
+    capture = _cleared(capture, hidden=hidden)
     silhouettes = relative_pose.silhouettes(capture)
     if not bool(silhouettes.visible.any()):
         raise ValueError("no mask has an object pixel: poses need masks that show the object")
     sure = [on_object(match, capture.masks) for match in matches] if hidden else matches
     tracks = tracks_of(sure, silhouettes, capture)
-    contours = frontier_points.convex_contours(replace(settled, masks=_clear(settled.masks, hidden=hidden)))
+    contoured = capture if settled is original else _cleared(settled, hidden=hidden)
+    contours = frontier_points.convex_contours(contoured)
     failed = relative_pose.failed_masks(silhouettes)
     contours = replace(contours, reliable=contours.reliable & ~failed[:, None])
     silhouettes = relative_pose.replace_failed(silhouettes, failed)
@@ -89,10 +90,10 @@ def gather(capture: Capture, matches: Sequence[Match], *, hidden: bool = False) 
     return Inputs(capture, sure, silhouettes, contours, tracks, radius, failed, mirror, matches if hidden else ())
 
 
-def _clear(masks: UInt8[Tensor, "t h w"], *, hidden: bool) -> UInt8[Tensor, "t h w"]:
-    """Masks without bands of unknown pixels along silhouettes and, of a hidden object, without scraps."""
-    masks = frontier_points.fill_boundary_bands(masks)
-    return frontier_points.without_scraps(masks) if hidden else masks
+def _cleared(capture: Capture, *, hidden: bool) -> Capture:
+    """The capture without bands of unknown pixels along silhouettes and, of a hidden object, without scraps."""
+    masks = frontier_points.fill_boundary_bands(capture.masks)
+    return replace(capture, masks=frontier_points.without_scraps(masks) if hidden else masks)
 
 
 def tracks_of(matches: Sequence[Match], silhouettes: Silhouettes, capture: Capture) -> Tracks:
@@ -116,7 +117,7 @@ def is_hidden(masks: UInt8[Tensor, "t h w"]) -> bool:
 
 
 def without_doubt(capture: Capture) -> Capture:
-    """The capture with doubted background as background: unknown pixels black there but not in the full image.
+    """The capture with doubted background as background: unknown pixels that are black, but not in the full image.
 
     Where the object has the colours of what is behind it, a single wrong contour carves its shape. But poses need
     contours, and follow from so many that a wrong one does little harm.
@@ -125,6 +126,8 @@ def without_doubt(capture: Capture) -> Capture:
         return capture
     black = (capture.images == 0).all(-1) & (capture.full_images > 0).any(-1)
     doubted = black & (capture.masks == UNKNOWN)
+    if not bool(doubted.any()):
+        return capture
     return capture.with_masks(capture.masks.masked_fill(doubted, BACKGROUND))
 
 

@@ -18,7 +18,7 @@ from tumble.poses.sfm.adjustment import adjust_round
 from tumble.poses.sfm.bundle_adjustment import BundleState
 from tumble.poses.sfm.observations import Inputs
 from tumble.poses.sfm.schedule import BaseConfig
-from tumble.poses.sfm.tracks import Keypoints, Tracks
+from tumble.poses.sfm.tracks import Keypoints, Tracks, crossings
 from tumble.scene import OBJECT
 
 TOLERANCE = 3.0
@@ -223,9 +223,8 @@ def cut(observed: Observed, part: Partial, tolerance: float, min_points: int) ->
     """The pieces of a part between which fewer than `min_points` surface points are seen before and after."""
     tracks, _ = joined_tracks(observed, part, tolerance)
     seen = tracks.select(_triangulated(observed, part, tracks)[1])
-    first = torch.full((seen.n,), len(part)).scatter_reduce_(0, seen.point, seen.frame, "amin")
-    last = torch.zeros(seen.n, dtype=torch.long).scatter_reduce_(0, seen.point, seen.frame, "amax")
-    cuts = [k for k in range(1, len(part)) if int(((first < k) & (last >= k)).sum()) < min_points]
+    count = crossings(seen, len(part)).tolist()
+    cuts = [k for k in range(1, len(part)) if count[k] < min_points]
     return [part.select(range(a, b)) for a, b in itertools.pairwise((0, *cuts, len(part)))]
 
 

@@ -77,6 +77,14 @@ NO_TRACKS = Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.
 """No tracks at all."""
 
 
+def crossings(tracks: Tracks, n: int) -> Int64[Tensor, " {n}"]:
+    """Number of points that are seen both before each of n frames and from then on."""
+    first = torch.full((tracks.n,), n).scatter_reduce_(0, tracks.point, tracks.frame, "amin")
+    last = torch.full((tracks.n,), -1).scatter_reduce_(0, tracks.point, tracks.frame, "amax")
+    k = torch.arange(n)[:, None]
+    return ((first < k) & (last >= k)).sum(1)
+
+
 def concatenate(*parts: Tracks) -> Tracks:
     """Union of tracks of distinct points, numbered in the order of the parts."""
     point, n_points = [], 0

@@ -243,7 +243,7 @@ def _overlay(survey: Survey, masks: Masks, i: int) -> bytes:
     image, labels = survey.images[i].copy(), masks.labels[i]
     inside = segmentation.dilated(labels == OBJECT, 1)
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    shown = mask_overlay(image, labels, EDGE)
+    shown = mask_overlay(image, masks.with_doubt(i), EDGE)
     return _jpeg(cv2.drawContours(shown, contours, -1, CONTOUR, 1))
 
 
