@@ -106,7 +106,8 @@ class PoseQuality:
     observability: Observability
     ties: Float[Tensor, " t"] | None = None
     """Number of surface points that are seen before a frame and from then on; infinite for the first frame and lost
-    ones. None: nothing hides the object, so that its contours tell how it is turned."""
+    ones, except where one side was lost because the hull contradicts how both are joined. None: nothing hides the
+    object, so that its contours tell how it is turned."""
 
     def __len__(self) -> int:
         return len(self.residual)

@@ -122,6 +122,29 @@ def test_a_long_run_of_wrong_frames_is_rejected_from_its_middle_to_its_ends(monk
     assert not bool(lost[angle == 0].any())
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.9])
+def test_of_two_parts_joined_against_the_hull_the_larger_is_kept(turn: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No point is seen both in the first 20 frames and in the last 12, and a hand hides some of the background."""
+    monkeypatch.setattr(finalize, "HULL_RESOLUTION", 24)  # for speed
+    scene, rng, n, first = tumbling(32), torch.Generator().manual_seed(0), 32, 20
+    pairs = [(t - k, t) for k in (1, 2) for t in range(k, n) if (t < first) == (t - k < first)]
+    tracks = chain_matches([scene.match(i, j, rng, wrong=0.0) for i, j in pairs], torch.full((n,), 5.0))
+    R = scene.T_cam_obj.rotation.matrix().clone()
+    R[first:] = R[first:] @ SO3.exp(turn * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)).matrix()
+    masks = scene.capture.masks.clone()
+    masks[:, :, :40][masks[:, :, :40] == BACKGROUND] = UNKNOWN
+    capture, confirmed = replace(scene.capture, masks=masks), torch.ones(n, dtype=torch.bool)
+    solution = Solution(R, scene.T_cam_obj.xyz / DISTANCE, 0.9 / DISTANCE, torch.zeros(n), confirmed)
+    contours = frontier_points.convex_contours(capture)
+    quality = finalize.pose_result(capture, tracks, contours, mirror_symmetry(capture.masks), solution).quality
+    if turn == 0:
+        assert not bool(quality.lost.any())
+    else:
+        assert quality.lost.tolist() == [k >= first for k in range(n)]
+    assert quality.loose_from == [first], "named, whether its joint is refused or not"
+    assert quality.overlap[~quality.lost].median() > 0.88, "at this resolution"
+
+
 def test_up_is_up_in_the_first_frame_that_is_not_lost(result: PoseResult) -> None:
     """Its camera is at +z, with +y up in the image; points move with the frame."""
     opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0]))

@@ -88,7 +88,7 @@ from tumble.poses.sfm.schedule import (
 from tumble.poses.sfm.tracks import NO_TRACKS, Tracks, concatenate
 from tumble.scene import Trajectory
 
-VERSION = 48
+VERSION = 49
 RELOCALIZATION_COST_RATIO = 1.5
 """Robust cost of a frame's tangency gaps above which the frame is relocalized [median over all frames].
 
