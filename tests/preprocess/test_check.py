@@ -68,6 +68,15 @@ def test_an_object_that_does_not_rotate_does_not_pass(tmp_path: Path) -> None:
     assert results["rotation"].rating == "stop"
 
 
+def test_an_object_that_is_turned_to_and_fro_is_not_good(tmp_path: Path) -> None:
+    """It adds up to much, but shows no other side."""
+    n = len(scene().pictures)
+    there = [*range(6), *range(6, 0, -1)]
+    results = findings(scene().pictures[(there * n)[:n]], tmp_path, OPTIONS)
+    assert results["rotation"].rating != "good"
+    assert "no two frames are more than about" in results["rotation"].state
+
+
 def test_an_object_at_the_border_does_not_pass(tmp_path: Path) -> None:
     """The image is cropped through the middle of the object."""
     left, top, width, height = scene().box()

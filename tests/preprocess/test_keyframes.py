@@ -58,6 +58,34 @@ def test_rotations_add_up_along_the_path() -> None:
     assert (np.diff(total) >= 0).all()
 
 
+def test_an_object_that_is_turned_to_and_fro_does_not_come_round() -> None:
+    """Three times 0.5 radians and back."""
+    there = [*np.linspace(0, 0.5, 9)[:-1], *np.linspace(0.5, 0, 9)[:-1]]
+    spheres = [sphere(yaw) for yaw in [*there, *there, *there, 0.0]]
+    images, inside = (np.stack(each) for each in zip(*spheres, strict=True))
+    assert keyframes.rotation_range(images, inside) == pytest.approx(0.5, rel=0.3)
+    assert keyframes.cumulative_rotation(images, inside)[-1] == pytest.approx(3.0, rel=0.25)
+
+
+def test_an_object_that_goes_on_turning_comes_round() -> None:
+    spheres = [sphere(yaw) for yaw in np.linspace(0, 2.4, 41)]
+    images, inside = (np.stack(each) for each in zip(*spheres, strict=True))
+    assert keyframes.rotation_range(images, inside) == pytest.approx(2.4, rel=0.25)
+    plain = np.full_like(images, 90)
+    assert keyframes.rotation_range(plain, inside) == math.pi, "not measured"
+
+
+@pytest.mark.parametrize("yaw", [-0.06, 0.06])
+def test_the_sign_of_a_fitted_rotation_is_that_of_the_camera_frame(yaw: float) -> None:
+    """Yaw moves points in front of the sphere to the right: x is right, y down, z away, so it is about -y."""
+    (a, inside), (b, _) = sphere(0.0), sphere(yaw)
+    shifted, shifted_mask = np.roll(b, 2, 1), np.roll(inside, 2, 1)
+    grays = cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(shifted, cv2.COLOR_RGB2GRAY)
+    turn = keyframes._fitted_rotation(DIS, *grays, inside, shifted_mask)
+    assert turn is not None
+    assert turn == pytest.approx([0, -yaw, 0], abs=0.015)
+
+
 def test_a_frame_without_texture_does_not_end_the_rotation() -> None:
     """The hand of the first frame hides the texture; that frame counts as an average one."""
     spheres = [sphere(yaw) for yaw in np.linspace(0, 0.6, 13)]

@@ -8,7 +8,7 @@ the first number is larger, small values are bad.
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.picker import pick_box
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey_footage
+from tumble.scene import OBJECT
 
 SOURCE_FILE = "check.json"
 """File beside the preview that names the footage that it is of."""
@@ -52,7 +53,7 @@ REPROJECTION_ERROR = (1.0, 3.0)
 RAY_DISTANCE = (0.4, 0.8)
 """Limits of the median distance of the rays through the mask centres from a common point [radius of a mask]."""
 VIEW_ANGLE = (math.radians(90), math.radians(30))
-"""Limits of the largest angle between two views of the object [radians]."""
+"""Limits of the largest angle between two views of the object, of photographs or of a film [radians]."""
 
 MAX_HAND_COLOURED = 0.08
 """Fraction of a mask with the colours of a hand above which a part of a hand is probably taken for the object."""
@@ -243,10 +244,16 @@ def _size(survey: Survey) -> Finding:
 def _rotation(survey: Survey, kept: list[int]) -> list[Finding]:
     total = float(survey.rotation[-1])
     state = f"about {math.degrees(total):.0f} degrees in total"
+    ratings: list[CheckRating] = [_rate(total, TOTAL_ROTATION)]
+    if not survey.footage.images:
+        widest = keyframes.rotation_range(survey.images, survey.masks.labels == OBJECT)
+        ratings.append(_rate(widest, VIEW_ANGLE))
+        if ratings[-1] != "good":
+            state += f"; no two frames are more than about {math.degrees(widest):.0f} degrees apart"
     advice = (
         "turn the object by 360 degrees twice, and tilt it; the rotation of a surface without texture is not measured"
     )
-    findings = [_finding("rotation", _rate(total, TOTAL_ROTATION), state, advice)]
+    findings = [_finding("rotation", max(ratings, key=get_args(CheckRating).index), state, advice)]
     if survey.footage.images:
         return findings
     spacing = np.maximum(np.diff(survey.numbers), 1)

@@ -5,6 +5,9 @@ axis, the median displacement over its disc is r angle / sqrt(2): about an axis 
 angle * depth, about the optical axis it is angle * distance from the centre, and over a disc both depth and distance
 have the median r / sqrt(2). So the median flow inside the silhouette, minus the translation of the silhouette, measures
 the angle. It is a rough measure: a long or flat object is no sphere, and there is no flow on a surface without texture.
+
+An object that is turned to and fro adds up to a large angle, but hardly shows other sides. How far it comes round is
+found by fitting the rotation of that sphere, and a translation, to the same flow.
 """
 
 import math
@@ -31,6 +34,12 @@ MIN_LAPLACIAN = 1e-3
 """Minimum mean squared Laplacian of a region with edges; below it there are only rounding errors."""
 MIN_PIXELS = 30
 """Minimum number of pixels from which a rotation is estimated."""
+MIN_DEPTH = 0.3
+"""Least depth of the sphere's surface where its rotation is fitted [radius]: objects are thicker at their border."""
+FITS = 10
+"""Number of times that the rotation is fitted, each with smaller weights for flow that contradicts the fit before."""
+HUBER = 1.5
+"""Deviation from which the weight of flow decreases (Huber) [median deviation]."""
 
 
 def cumulative_rotation(
@@ -54,6 +63,29 @@ def cumulative_rotation(
     return increase.cumsum()
 
 
+def rotation_range(images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]) -> float:
+    """Largest angle by which the object is turned in one frame against another [radians], at most pi.
+
+    Errors add up along the path: a fast motion seems to come farther round than it does. Pi where too little texture
+    shows to measure it in half of the frames.
+    """
+    from scipy.spatial.transform import Rotation
+
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    turned, anchor, unmeasured = [Rotation.identity()], 0, 0
+    for i in range(1, len(images)):
+        turn = _fitted_rotation(dis, grays[anchor], grays[i], inside[anchor], inside[i])
+        unmeasured += turn is None
+        turned.append(turned[anchor] if turn is None else Rotation.from_rotvec(turn) * turned[anchor])
+        if turn is None or np.linalg.norm(turn) > ANCHOR_ROTATION:
+            anchor = i
+    if 2 * unmeasured >= len(images):
+        return math.pi
+    quaternions = Rotation.concatenate(turned).as_quat()
+    return 2 * math.acos(float(np.abs(quaternions @ quaternions.T).min().clip(0, 1)))
+
+
 def rotation_between(
     dis: cv2.DISOpticalFlow,
     gray_a: UInt8[np.ndarray, "h w"],
@@ -64,15 +96,61 @@ def rotation_between(
     """Small rotation of the object between two frames [radians]; NaN with too little texture in the first one, or too
     few pixels of the object in the second, to measure it.
     """
+    measured = _textured_flow(dis, gray_a, gray_b, inside_a, inside_b)
+    if measured is None:
+        return math.nan
+    _, flow, radius = measured
+    return float(np.median(np.linalg.norm(flow, axis=-1))) * math.sqrt(2) / radius
+
+
+def _textured_flow(
+    dis: cv2.DISOpticalFlow,
+    gray_a: UInt8[np.ndarray, "h w"],
+    gray_b: UInt8[np.ndarray, "h w"],
+    inside_a: Bool[np.ndarray, "h w"],
+    inside_b: Bool[np.ndarray, "h w"],
+) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 2"], float] | None:
+    """Pixels with texture relative to the silhouette's centre, their flow relative to its translation, and the radius
+    of a disc of the silhouette's area [pixels]; None if there are too few.
+    """
     x, y = cv2.Sobel(gray_a, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray_a, cv2.CV_32F, 0, 1, scale=1 / 8)
     core = cv2.erode(inside_a.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     textured = core & (np.hypot(x, y) > MIN_GRADIENT)
     if min(textured.sum(), inside_b.sum()) < MIN_PIXELS:
-        return math.nan
+        return None
     flow = dis.calc(gray_a, gray_b, np.zeros((*gray_a.shape, 2), np.float32))[textured]
+    pixels = np.argwhere(textured)[:, ::-1].astype(np.float32)
     shift = _centre(inside_b) - _centre(inside_a)
-    radius = math.sqrt(float(inside_a.sum()) / math.pi)
-    return float(np.median(np.linalg.norm(flow - shift, axis=-1))) * math.sqrt(2) / radius
+    return pixels - _centre(inside_a), flow - shift, math.sqrt(float(inside_a.sum()) / math.pi)
+
+
+def _fitted_rotation(
+    dis: cv2.DISOpticalFlow,
+    gray_a: UInt8[np.ndarray, "h w"],
+    gray_b: UInt8[np.ndarray, "h w"],
+    inside_a: Bool[np.ndarray, "h w"],
+    inside_b: Bool[np.ndarray, "h w"],
+) -> Float64[np.ndarray, "3"] | None:
+    """Rotation vector of a sphere, camera frame, whose flow beside a translation is closest to that of the object
+    [radians]; None where it cannot be measured. Robust linear least squares.
+    """
+    measured = _textured_flow(dis, gray_a, gray_b, inside_a, inside_b)
+    if measured is None:
+        return None
+    pixels, flow, radius = measured
+    (x, y), flow = pixels.T.astype(np.float64) / radius, flow.T.ravel().astype(np.float64) / radius
+    depth = np.sqrt(
+        (1 - x * x - y * y).clip(MIN_DEPTH**2)
+    )  # The camera looks along +z: points in front have z = -depth.
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    columns = np.array([[zero, depth], [-depth, zero], [-y, x], [one, zero], [zero, one]]).reshape(5, -1)
+    weight, motion = np.ones_like(flow), np.zeros(5)
+    for _ in range(FITS):
+        motion = np.linalg.lstsq(columns * weight @ columns.T, columns * weight @ flow, rcond=None)[0]
+        deviation = np.abs(flow - motion @ columns)
+        limit = HUBER * np.median(deviation)
+        weight = limit / np.maximum(deviation, max(limit, np.finfo(np.float64).tiny))
+    return motion[:3]
 
 
 def edge_energy(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 2"]:

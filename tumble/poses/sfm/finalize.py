@@ -77,8 +77,8 @@ MIN_HULL_CELLS = 50
 """Smallest number of cells of a visual hull around which a sphere is drawn."""
 MAX_JOINT_DEFICIT = 0.04
 """Mean loss of overlap by joining two parts of a film, above which the visual hull contradicts the joint (IoU). On a
-rendered film of a soup can and the film `SM2` right joints cost -0.02 to 0.013, those turned by 45 degrees 0.05 to 0.17
-unless about an axis of symmetry."""
+rendered film of a soup can and the film `SM2` right joints cost -0.02 to 0.02, those turned by 45 degrees 0.05 to 0.3
+unless about nearly the axis of the object."""
 
 Sphere = tuple[Float[Tensor, "3"], Float[Tensor, ""]]
 """Centre and radius of a sphere around the object [mean distance]."""
