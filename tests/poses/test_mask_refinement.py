@@ -66,6 +66,16 @@ def test_more_matches_outweigh_a_lost_frame_but_not_many_nor_a_rating(scene: Tum
     assert not mask_refinement.explains_more(contradicting, old)
 
 
+def test_few_accurate_poses_outweigh_more_that_are_inconsistent_if_these_are_not_many_more(scene: Tumble) -> None:
+    few, fewer = (result(scene, overlap=0.93, lost=lost) for lost in (14, 20))
+    inconsistent = result(scene, overlap=0.8, lost=8)
+    assert {each.quality.rating for each in (few, fewer, inconsistent)} == {"bad"}
+    assert mask_refinement.explains_more(few, inconsistent)
+    assert not mask_refinement.explains_more(inconsistent, few)
+    assert not mask_refinement.explains_more(fewer, inconsistent)
+    assert mask_refinement.explains_more(inconsistent, fewer)
+
+
 def test_a_frame_without_pose_keeps_its_mask(scene: Tumble) -> None:
     capture, arm = with_arm(scene.capture)
     trimmed = mask_refinement.trim_masks(capture, result(scene, lost=2))

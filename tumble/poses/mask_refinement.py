@@ -17,7 +17,7 @@ from torch import Tensor
 from tumble.engine import run
 from tumble.maths import SE3
 from tumble.poses import working_size
-from tumble.poses.result import PoseResult
+from tumble.poses.result import MAX_USABLE_UNCERTAINTY, PoseResult
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture
 
 RESOLUTION = 96
@@ -101,17 +101,22 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
 
 
 def explains_more(new: PoseResult, old: PoseResult) -> bool:
-    """Whether poses from trimmed masks are better: by their rating, else by the number of frames with a pose if that
-    differs clearly, else by the number of matches that agree with them.
+    """Whether poses from trimmed masks are better: by their rating, else by their accuracy if only one result is usable
+    by that and has no less than half of the frames, else by the number of frames with a pose if that differs clearly,
+    else by the number of matches that agree with them.
 
     A few frames do not count: better poses of all would be refused for the sake of a single one. Many do: where frames
-    are lost, more frames are matched by a network, so that the others have more matches.
+    are lost, more frames are matched by a network, so that the others have more matches. Poses of less than half of the
+    frames are rated bad, as inconsistent ones are, but give an asset of what these frames show.
     """
     order = ("bad", "warn", "good")
     ratings = [order.index(each.quality.rating) for each in (new, old)]
     if ratings[0] != ratings[1]:
         return ratings[0] > ratings[1]
     frames = [int((~each.quality.lost).sum()) for each in (new, old)]
+    accurate = [each.quality.uncertainty <= MAX_USABLE_UNCERTAINTY for each in (new, old)]
+    if accurate[0] != accurate[1] and 2 * frames[accurate.index(True)] >= frames[accurate.index(False)]:
+        return accurate[0]
     if abs(frames[0] - frames[1]) > FEW_FRAMES * len(new.quality.lost):
         return frames[0] > frames[1]
     matches = [float(each.quality.inliers[~each.quality.lost].sum()) for each in (new, old)]
