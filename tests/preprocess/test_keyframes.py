@@ -81,9 +81,9 @@ def test_the_sign_of_a_fitted_rotation_is_that_of_the_camera_frame(yaw: float) -
     (a, inside), (b, _) = sphere(0.0), sphere(yaw)
     shifted, shifted_mask = np.roll(b, 2, 1), np.roll(inside, 2, 1)
     grays = cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(shifted, cv2.COLOR_RGB2GRAY)
-    turn = keyframes._fitted_rotation(DIS, *grays, inside, shifted_mask)
-    assert turn is not None
-    assert turn == pytest.approx([0, -yaw, 0], abs=0.015)
+    measured = keyframes._textured_flow(DIS, *grays, inside, shifted_mask)
+    assert measured is not None
+    assert keyframes._fitted_rotation(*measured) == pytest.approx([0, -yaw, 0], abs=0.015)
 
 
 def test_a_frame_without_texture_does_not_end_the_rotation() -> None:

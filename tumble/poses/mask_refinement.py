@@ -102,8 +102,8 @@ def trim_masks(capture: Capture, result: PoseResult) -> Capture:
 
 def explains_more(new: PoseResult, old: PoseResult) -> bool:
     """Whether poses from trimmed masks are better: by their rating, else by their accuracy if only one result is usable
-    by that and has no less than half of the frames, else by the number of frames with a pose if that differs clearly,
-    else by the number of matches that agree with them.
+    by that and has at least half as many frames as the other, else by the number of frames with a pose if that differs
+    clearly, else by the number of matches that agree with them.
 
     A few frames do not count: better poses of all would be refused for the sake of a single one. Many do: where frames
     are lost, more frames are matched by a network, so that the others have more matches. Poses of less than half of the

@@ -75,7 +75,8 @@ def rotation_range(images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     turned, anchor, unmeasured = [Rotation.identity()], 0, 0
     for i in range(1, len(images)):
-        turn = _fitted_rotation(dis, grays[anchor], grays[i], inside[anchor], inside[i])
+        measured = _textured_flow(dis, grays[anchor], grays[i], inside[anchor], inside[i])
+        turn = None if measured is None else _fitted_rotation(*measured)
         unmeasured += turn is None
         turned.append(turned[anchor] if turn is None else Rotation.from_rotvec(turn) * turned[anchor])
         if turn is None or np.linalg.norm(turn) > ANCHOR_ROTATION:
@@ -125,31 +126,22 @@ def _textured_flow(
 
 
 def _fitted_rotation(
-    dis: cv2.DISOpticalFlow,
-    gray_a: UInt8[np.ndarray, "h w"],
-    gray_b: UInt8[np.ndarray, "h w"],
-    inside_a: Bool[np.ndarray, "h w"],
-    inside_b: Bool[np.ndarray, "h w"],
-) -> Float64[np.ndarray, "3"] | None:
+    pixels: Float32[np.ndarray, "n 2"], flow: Float32[np.ndarray, "n 2"], radius: float
+) -> Float64[np.ndarray, "3"]:
     """Rotation vector of a sphere, camera frame, whose flow beside a translation is closest to that of the object
-    [radians]; None where it cannot be measured. Robust linear least squares.
+    [radians]. Robust linear least squares; the arguments are those that `_textured_flow` returns.
     """
-    measured = _textured_flow(dis, gray_a, gray_b, inside_a, inside_b)
-    if measured is None:
-        return None
-    pixels, flow, radius = measured
     (x, y), flow = pixels.T.astype(np.float64) / radius, flow.T.ravel().astype(np.float64) / radius
-    depth = np.sqrt(
-        (1 - x * x - y * y).clip(MIN_DEPTH**2)
-    )  # The camera looks along +z: points in front have z = -depth.
+    # The camera looks along +z: points in front of the sphere's centre have z = -depth.
+    depth = np.sqrt((1 - x * x - y * y).clip(MIN_DEPTH**2))
     zero, one = np.zeros_like(x), np.ones_like(x)
     columns = np.array([[zero, depth], [-depth, zero], [-y, x], [one, zero], [zero, one]]).reshape(5, -1)
     weight, motion = np.ones_like(flow), np.zeros(5)
     for _ in range(FITS):
         motion = np.linalg.lstsq(columns * weight @ columns.T, columns * weight @ flow, rcond=None)[0]
         deviation = np.abs(flow - motion @ columns)
-        limit = HUBER * np.median(deviation)
-        weight = limit / np.maximum(deviation, max(limit, np.finfo(np.float64).tiny))
+        limit = max(HUBER * float(np.median(deviation)), np.finfo(np.float64).tiny)
+        weight = limit / np.maximum(deviation, limit)
     return motion[:3]
 
 

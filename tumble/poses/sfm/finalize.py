@@ -205,8 +205,8 @@ def _consistent_side(capture: Capture, result: PoseResult) -> tuple[int, float, 
     def overlap(side: Bool[Tensor, " t"]) -> Float[Tensor, " t"]:
         return _best_hull_overlap(capture, result.trajectory, ~side)
 
-    def preference(side: Bool[Tensor, " t"], overlap: Float[Tensor, " t"]) -> tuple[bool, int]:
-        uncertainty = replace(quality, lost=~side, overlap=overlap).overlap_uncertainty
+    def preference(side: Bool[Tensor, " t"], alone: Float[Tensor, " t"]) -> tuple[bool, int]:
+        uncertainty = replace(quality, lost=~side, overlap=alone).overlap_uncertainty
         return uncertainty <= MAX_USABLE_UNCERTAINTY, int(side.sum())
 
     joined, found = overlap(~quality.lost), []
