@@ -41,8 +41,8 @@ CREASE = 25.0
 PROJ = 0.1
 """Stage 2's weight of the projection term; the paper's weight of 1 fills grooves."""
 
-MASK = 3.0
-"""Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised."""
+MASK = 1.0
+"""Stage 3's weight of the mask term, which keeps the silhouette while geometry is optimised; more costs albedo."""
 
 DIAMETER = 107.0
 """Diameter of the object's sphere in the captures of 128 x 128 pixels on which the numbers of Gaussians were chosen
