@@ -34,7 +34,8 @@ UNKNOWN = Background(plain(WALL), np.full(SHAPE, 2, np.float32), np.zeros(SHAPE,
 
 def odds(colour: tuple[int, int, int], background: Background, prior: float = 0.5) -> float:
     flat, nowhere = np.full(SHAPE, prior, np.float32), np.zeros(SHAPE, bool)
-    return float(np.median(colour_model.object_log_odds(plain(colour), flat, nowhere, background, learnt_colours())))
+    ratio = colour_model.object_log_ratio(plain(colour), nowhere, background, learnt_colours())
+    return float(np.median(colour_model.object_log_odds(ratio, flat, nowhere)))
 
 
 def test_densities_integrate_to_one_over_all_colours() -> None:
@@ -77,8 +78,12 @@ def test_the_log_odds_of_the_prior_are_added() -> None:
 def test_a_pixel_marked_as_hand_is_never_object() -> None:
     nowhere, everywhere = np.zeros(SHAPE, bool), np.ones(SHAPE, bool)
     prior = np.full(SHAPE, 0.98, np.float32)
-    unmarked = colour_model.object_log_odds(plain(RED), prior, nowhere, KNOWN, learnt_colours())
-    marked = colour_model.object_log_odds(plain(RED), prior, everywhere, KNOWN, learnt_colours())
+    unmarked, marked = (
+        colour_model.object_log_odds(
+            colour_model.object_log_ratio(plain(RED), hand, KNOWN, learnt_colours()), prior, hand
+        )
+        for hand in (nowhere, everywhere)
+    )
     assert unmarked.min() > 0
     assert marked.max() <= -1
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, UInt8
 from tests.films import Scene, scene
 from tumble.preprocess import held_object
 from tumble.preprocess.background import estimate_background
-from tumble.preprocess.colour_model import BACKGROUND_CLASS, UNIFORM_DENSITY, hand_colours
+from tumble.preprocess.colour_model import UNIFORM_DENSITY, hand_colours, is_alike
 from tumble.preprocess.hands import Hand
 from tumble.preprocess.segmentation import Masks, Seed, opened, overlap, search_radius, with_doubt
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
@@ -136,9 +136,8 @@ def test_background_that_may_as_well_be_the_object_beside_it_is_doubted() -> Non
     """A side in the colours of the wall behind it: neighbours err alike, so that all of them are called background."""
     wall, inside, side, far = np.zeros((60, 90, 3), np.uint8), *np.zeros((3, 60, 90), bool)
     inside[10:40, 20:50], side[15:35, 50:60], far[15:35, 78:88] = True, True, True
-    likelihood = np.zeros((3, 60, 90), np.float32)
-    likelihood[BACKGROUND_CLASS] = np.where(inside, -5, np.where(side | far, 2, 6))
-    alike = held_object._alike(likelihood, ~inside)
+    ratio = np.where(inside, np.float32(-5), np.where(side | far, np.float32(2), np.float32(6)))
+    alike = is_alike(ratio, ~inside)
     assert alike[side].mean() > 0.7
     assert not alike[:, :48].any()
     background = estimate_background(np.repeat(wall[None], 3, 0), np.zeros((3, 60, 90), bool))

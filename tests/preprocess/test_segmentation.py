@@ -1,11 +1,13 @@
 """Masks from a box on one frame, compared with the true masks of synthetic videos."""
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.films import Scene, scene
 from tumble.preprocess import segmentation
 from tumble.preprocess.background import Background, estimate_background, fill_unknown
+from tumble.preprocess.colour_model import initial_colours
 from tumble.preprocess.segmentation import Masks, Seed, make_trimap, overlap
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
@@ -64,6 +66,27 @@ def test_a_skin_coloured_texture_belongs_to_the_object() -> None:
         pictures[i][painted[i]] = (110, 35, 30)
     masks, _ = segmented(Scene(pictures, video.object, video.hand, video.background), Seed(0, video.box()))
     assert (masks.labels[painted] == OBJECT).mean() > 0.95
+
+
+def test_a_side_of_the_object_before_a_wall_of_nearly_its_colour_is_doubted() -> None:
+    """A red object whose right side is a little brighter than the grey wall behind it."""
+    noise = np.random.default_rng(0).normal(0, 1.5, (120, 140, 3))
+    wall, known = np.full((120, 140, 3), 150, np.uint8), np.ones((120, 140), bool)
+    inside, side, picture = np.zeros_like(known), np.zeros_like(known), wall + noise
+    inside[10:110, 20:120], side[10:110, 110:120] = True, True
+    picture[inside] = (160, 40, 40) + noise[inside]
+    picture[side] = 156 + noise[side]
+    picture = picture.round().astype(np.uint8)
+    colours = initial_colours().updated(
+        cv2.cvtColor(picture, cv2.COLOR_RGB2LAB), object=inside, hand=~known, background=~inside
+    )
+    background = Background(wall, np.full(known.shape, 2, np.float32), known)
+    prior = np.where(inside & ~side, np.float32(0.9), np.float32(0.1))
+    found = segmentation._segment_frame(picture, prior, inside & ~side, background, colours)
+    lost = side & ~found.inside
+    assert lost[side].mean() > 0.5
+    assert found.alike[lost].mean() > 0.6
+    assert found.alike[~inside].mean() < 0.02
 
 
 def test_a_wall_in_the_learnt_hand_colours_is_not_a_hand() -> None:

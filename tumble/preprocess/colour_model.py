@@ -69,6 +69,11 @@ MEAN_FIELD_ITERATIONS = 6
 """Number of mean-field iterations."""
 SMOOTHNESS = 1.2
 """Coupling: log odds that each of the four neighbours contributes if it has the same colour."""
+MIN_BACKGROUND_LOG_RATIO = 3.0
+"""Mean log likelihood ratio of background to object among neighbouring pixels, below which background close to the
+object is doubted: where the object has the colours of what is behind it, all pixels err alike."""
+BACKGROUND_WINDOW = 5
+"""Side of the square of pixels over which this ratio is averaged."""
 CONTRAST = 12.0
 """Standard deviation of the colour difference over which the coupling of neighbours decays [code values]."""
 
@@ -112,17 +117,15 @@ def initial_colours() -> ColourModel:
     return ColourModel(empty, _skin_density(), empty)
 
 
-def object_log_odds(
+def object_log_ratio(
     image: UInt8[np.ndarray, "h w 3"],
-    prior: Float32[np.ndarray, "h w"],
     hand: Bool[np.ndarray, "h w"],
     background: Background,
     colours: ColourModel,
 ) -> Float32[np.ndarray, "h w"]:
-    """Log odds of the object against hand and background, per pixel.
+    """Log likelihood ratio of the object to hand and background, per pixel.
 
     Args:
-        prior: Prior probability of the object, inside (0, 1).
         hand: Pixels that are hand although they match the static background, which contains a hand that holds still.
     """
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
@@ -132,9 +135,30 @@ def object_log_odds(
     log_hand = _log_density(colours.hand, HAND_NOVELTY, lab)
     log_background += np.where(background.known, 0, np.log(UNKNOWN_BACKGROUND_PRIOR)).astype(np.float32)
     log_other = np.logaddexp(np.log1p(-HAND_PRIOR) + log_background, np.log(HAND_PRIOR) + log_hand)
-    odds = _log_density(colours.object, OBJECT_NOVELTY, lab) - log_other + np.log(prior) - np.log1p(-prior)
+    return (_log_density(colours.object, OBJECT_NOVELTY, lab) - log_other).astype(np.float32)
+
+
+def object_log_odds(
+    log_ratio: Float32[np.ndarray, "h w"], prior: Float32[np.ndarray, "h w"], hand: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Log odds of the object against hand and background, per pixel, from `object_log_ratio`.
+
+    Args:
+        prior: Prior probability of the object, inside (0, 1).
+    """
+    odds = log_ratio + np.log(prior) - np.log1p(-prior)
     odds[hand] = np.minimum(odds[hand], -1)
     return odds.clip(-MAX_LOG_ODDS, MAX_LOG_ODDS).astype(np.float32)
+
+
+def is_alike(log_ratio: Float32[np.ndarray, "h w"], background: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the background at which the object is hardly less likely, by the mean over those of a window.
+
+    Args:
+        log_ratio: Log likelihood ratio of background to object.
+    """
+    log_ratio = log_ratio.clip(-MAX_LOG_ODDS, MAX_LOG_ODDS)
+    return background & (local_mean(log_ratio, background, BACKGROUND_WINDOW) < MIN_BACKGROUND_LOG_RATIO)
 
 
 def mean_field_probability(

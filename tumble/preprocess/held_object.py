@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from tumble.preprocess import segmentation
-from tumble.preprocess.background import NO_SAMPLE_LOG_LIKELIHOOD, Background, BackgroundSamples, local_mean
+from tumble.preprocess.background import NO_SAMPLE_LOG_LIKELIHOOD, Background, BackgroundSamples
 from tumble.preprocess.colour_model import (
     BACKGROUND_CLASS,
     HAND_CLASS,
@@ -29,6 +29,7 @@ from tumble.preprocess.colour_model import (
     ColourModel,
     class_probabilities,
     hand_colours,
+    is_alike,
     log_likelihoods,
     skin_coloured,
     trim_rim,
@@ -60,11 +61,6 @@ MIN_ISLAND_LOG_RATIO = 1.0
 belongs to an island where no hand was detected."""
 MAX_AVERAGED_LOG_RATIO = 4.0
 """Limit of the log likelihood ratios of object to hand that are averaged over pixels."""
-MIN_BACKGROUND_LOG_RATIO = 3.0
-"""Mean log likelihood ratio of background to object among neighbouring pixels, below which background close to the
-object is doubted: where the object has the colours of what is behind it, all pixels err alike."""
-BACKGROUND_WINDOW = 5
-"""Side of the square of pixels over which this ratio is averaged."""
 MAX_HOLE_FRACTION = 0.3
 """Maximum area of a hole in the object that may be its print, as a fraction of the object's."""
 MIN_SKIN_FRACTION = 0.1
@@ -366,16 +362,9 @@ def _segment_frame(
     inside = _with_print(inside, label == HAND_CLASS, frame.surroundings)
     if frame.surroundings is None:  # what the object surrounds is its print
         doubtful = segmentation.touching(doubtful & inside, ~segmentation.eroded(inside, 1))
-    alike = _alike(log_likelihood, label == BACKGROUND_CLASS)
+    background_ratio = log_likelihood[BACKGROUND_CLASS] - log_likelihood[OBJECT_CLASS]
+    alike = is_alike(background_ratio, label == BACKGROUND_CLASS)
     return _State(np.where(inside, probabilities, _without_object(probabilities)), inside, doubtful, alike)
-
-
-def _alike(
-    log_likelihood: Float32[np.ndarray, "3 h w"], background: Bool[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the background at which the object is hardly less likely, by the mean over those of a window."""
-    log_ratio = (log_likelihood[BACKGROUND_CLASS] - log_likelihood[OBJECT_CLASS]).clip(-MAX_LOG_RATIO, MAX_LOG_RATIO)
-    return background & (local_mean(log_ratio, background, BACKGROUND_WINDOW) < MIN_BACKGROUND_LOG_RATIO)
 
 
 def _connected(mask: Bool[np.ndarray, "h w"], predicted: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

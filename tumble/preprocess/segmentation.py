@@ -25,8 +25,10 @@ from tumble.preprocess.colour_model import (
     SEED_WEIGHT,
     ColourModel,
     initial_colours,
+    is_alike,
     mean_field_probability,
     object_log_odds,
+    object_log_ratio,
     skin_coloured,
     trim_rim,
 )
@@ -115,6 +117,8 @@ class _Segmentation:
     """Other pixels that are not certainly background: moving ones, hands, undecided ones."""
     probability: Float32[np.ndarray, "h w"]
     """Probability of the object; 0 far from it."""
+    alike: Bool[np.ndarray, "h w"]
+    """Pixels close to the object that are rather background, but whose colours the object may have, too."""
 
 
 def segment(images: UInt8[np.ndarray, "t h w 3"], background: Background, seed: Seed) -> Masks:
@@ -126,14 +130,15 @@ def segment(images: UInt8[np.ndarray, "t h w 3"], background: Background, seed: 
     first, colours = _segment_seed(images[seed.index], background, seed)
     if first.inside.sum() < MIN_PIXELS:
         raise ValueError(f"shows no object in the box, or at the click, on frame {seed.index}")
-    labels = np.zeros(images.shape[:3], np.uint8)
+    labels, doubted = np.zeros(images.shape[:3], np.uint8), np.zeros(images.shape[:3], bool)
     confidence, uncertain = np.ones(len(images), np.float32), np.zeros(len(images), bool)
     labels[seed.index] = make_trimap(trim_rim(first.inside, images[seed.index], background), first.unknown, 1)
+    doubted[seed.index] = first.alike
     for order in (range(seed.index + 1, len(images)), range(seed.index - 1, -1, -1)):
         for i, current, agreement, is_uncertain in _track(images, order, seed.index, first, background, colours):
             labels[i] = make_trimap(trim_rim(current.inside, images[i], background), current.unknown, 1)
-            confidence[i], uncertain[i] = agreement, is_uncertain
-    return Masks(labels, confidence, uncertain)
+            doubted[i], confidence[i], uncertain[i] = current.alike, agreement, is_uncertain
+    return Masks(labels, confidence, uncertain, doubted)
 
 
 def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h w 3"], seed: Seed) -> Background:
@@ -286,7 +291,7 @@ def _segment_seed(image: np.ndarray, background: Background, seed: Seed) -> tupl
     trimap[hand & (trimap == cv2.GC_PR_FGD)] = cv2.GC_PR_BGD
     if not (trimap & 1).any() or (trimap & 1).all():
         empty = np.zeros(moving.shape, bool)
-        return _Segmentation(empty, empty, empty.astype(np.float32)), initial
+        return _Segmentation(empty, empty, empty.astype(np.float32), empty), initial
     rough = main_components(grabcut(image, trimap, 5), inside)
     around = (moving | hand) & ~inside
     colours = initial_colours().updated(
@@ -322,7 +327,8 @@ def _track(
         agreement, new_area = overlap(predicted, current.inside), int(current.inside.sum())
         if is_lost(agreement, new_area):
             empty = np.zeros(predicted.shape, bool)
-            current, agreement = _Segmentation(empty, current.unknown | current.inside, empty.astype(np.float32)), 0.0
+            unknown = current.unknown | current.inside
+            current, agreement = _Segmentation(empty, unknown, empty.astype(np.float32), empty), 0.0
         else:
             lab = cv2.cvtColor(images[i], cv2.COLOR_RGB2LAB)
             outside = ~dilated(current.inside | current.unknown, 2)
@@ -339,20 +345,24 @@ def _segment_frame(
 ) -> _Segmentation:
     """Segmentation of a frame, given the prior and the predicted mask."""
     moving = opened(background.differs(image), 1)
-    probability = np.zeros(predicted.shape, np.float32)
+    probability, alike = np.zeros(predicted.shape, np.float32), _empty_like(predicted)
     if predicted.sum() < MIN_PIXELS:
-        return _Segmentation(_empty_like(predicted), moving, probability)
+        return _Segmentation(alike, moving, probability, alike)
     log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
     hand = _hand_mask(log_ratio, predicted, moving, background)
     window = _window(predicted, 4 * search_radius(predicted))
     cropped = Background(background.image[window], background.noise[window], background.known[window])
-    odds = object_log_odds(image[window], prior[window], hand[window], cropped, colours)
+    ratio = object_log_ratio(image[window], hand[window], cropped, colours)
+    odds = object_log_odds(ratio, prior[window], hand[window])
     probability[window] = mean_field_probability(odds, image[window])
     inside = main_components(probability > 0.5, predicted)
     probability = np.where(inside, np.maximum(probability, np.float32(0.5)), np.minimum(probability, np.float32(0.3)))
     # Near the object, where the static background is unknown, colour alone is not enough to label a pixel background.
     undecided = dilated(predicted, search_radius(predicted)) & ~background.known
-    return _Segmentation(inside, (moving | hand | undecided) & ~inside, probability)
+    unknown = (moving | hand | undecided) & ~inside
+    alike[window] = is_alike(-ratio, ~(inside | unknown)[window])
+    alike &= dilated(inside, 2 * search_radius(inside))
+    return _Segmentation(inside, unknown, probability, alike)
 
 
 def _hand_mask(log_ratio: np.ndarray, expected: np.ndarray, moving: np.ndarray, background: Background) -> np.ndarray:
