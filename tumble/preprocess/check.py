@@ -19,7 +19,6 @@ from tumble.preprocess.options import FootageOptions
 from tumble.preprocess.picker import pick_box
 from tumble.preprocess.source import input_kind
 from tumble.preprocess.survey import Survey, survey_footage
-from tumble.scene import OBJECT
 
 SOURCE_FILE = "check.json"
 """File beside the preview that names the footage that it is of."""
@@ -246,10 +245,9 @@ def _rotation(survey: Survey, kept: list[int]) -> list[Finding]:
     state = f"about {math.degrees(total):.0f} degrees in total"
     ratings: list[CheckRating] = [_rate(total, TOTAL_ROTATION)]
     if not survey.footage.images:
-        widest = keyframes.rotation_range(survey.images, survey.masks.labels == OBJECT)
-        ratings.append(_rate(widest, VIEW_ANGLE))
+        ratings.append(_rate(survey.rotation_range, VIEW_ANGLE))
         if ratings[-1] != "good":
-            state += f"; no two frames are more than about {math.degrees(widest):.0f} degrees apart"
+            state += f"; no two frames are more than about {math.degrees(survey.rotation_range):.0f} degrees apart"
     advice = (
         "turn the object by 360 degrees twice, and tilt it; the rotation of a surface without texture is not measured"
     )

@@ -4,13 +4,15 @@ The rotation is estimated from optical flow. When a sphere with radius r [pixels
 axis, the median displacement over its disc is r angle / sqrt(2): about an axis in the image plane the displacement is
 angle * depth, about the optical axis it is angle * distance from the centre, and over a disc both depth and distance
 have the median r / sqrt(2). So the median flow inside the silhouette, minus the translation of the silhouette, measures
-the angle. It is a rough measure: a long or flat object is no sphere, and there is no flow on a surface without texture.
+the angle; where a hand covers more and more of an object, only the silhouette moves, and less flow is left without
+that. It is a rough measure: a long or flat object is no sphere, and there is no flow on a surface without texture.
 
 An object that is turned to and fro adds up to a large angle, but hardly shows other sides. How far it comes round is
 found by fitting the rotation of that sphere, and a translation, to the same flow.
 """
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -42,77 +44,86 @@ HUBER = 1.5
 """Deviation from which the weight of flow decreases (Huber) [median deviation]."""
 
 
-def cumulative_rotation(
+def measured_rotation(
     images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]
-) -> Float64[np.ndarray, " t"]:
-    """Angle by which the object has rotated since the first frame, summed along the path [radians]; never decreases.
+) -> tuple[Float64[np.ndarray, " t"], float]:
+    """Angle by which the object has rotated since the first frame, summed along the path [radians], which never
+    decreases; and the largest angle by which it is turned in one frame against another [radians], at most pi.
 
-    Where too little texture shows to measure it, the object is assumed to rotate as fast as in the median frame.
-    """
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    increase, anchor, since = np.zeros(len(images)), 0, 0.0
-    grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-    for i in range(1, len(images)):
-        angle = rotation_between(dis, grays[anchor], grays[i], inside[anchor], inside[i])
-        increase[i] = np.maximum(angle - since, 0.0)
-        since = np.fmax(since, angle)
-        if math.isnan(angle) or angle > ANCHOR_ROTATION:
-            anchor, since = i, 0.0
-    measured = ~np.isnan(increase)
-    increase[~measured] = np.median(increase[measured])
-    return increase.cumsum()
-
-
-def rotation_range(images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]) -> float:
-    """Largest angle by which the object is turned in one frame against another [radians], at most pi.
-
-    Errors add up along the path: a fast motion seems to come farther round than it does. Pi where too little texture
-    shows to measure it in half of the frames.
+    Where too little texture shows to measure it, the object is assumed to rotate as fast as in the median frame. In the
+    largest angle errors add up along the path: a fast motion seems to come farther round than it does. It is pi where
+    half of the frames are not measured.
     """
     from scipy.spatial.transform import Rotation
 
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-    turned, anchor, unmeasured = [Rotation.identity()], 0, 0
+    increase, turned, anchor, since = np.zeros(len(images)), [Rotation.identity()], 0, 0.0
     for i in range(1, len(images)):
-        measured = _textured_flow(dis, grays[anchor], grays[i], inside[anchor], inside[i])
-        turn = None if measured is None else _fitted_rotation(*measured)
-        unmeasured += turn is None
-        turned.append(turned[anchor] if turn is None else Rotation.from_rotvec(turn) * turned[anchor])
-        if turn is None or np.linalg.norm(turn) > ANCHOR_ROTATION:
-            anchor = i
-    if 2 * unmeasured >= len(images):
-        return math.pi
+        flow = textured_flow(dis, grays[anchor], grays[i], inside[anchor], inside[i])
+        angle, turn = (math.nan, np.zeros(3)) if flow is None else (flow.angle, flow.fitted_rotation())
+        increase[i] = np.maximum(angle - since, 0.0)
+        since = np.fmax(since, angle)
+        turned.append(Rotation.from_rotvec(turn) * turned[anchor])
+        if flow is None or max(angle, np.linalg.norm(turn)) > ANCHOR_ROTATION:
+            anchor, since = i, 0.0
+    unmeasured = np.isnan(increase)
+    increase[unmeasured] = np.median(increase[~unmeasured])
+    if 2 * unmeasured.sum() >= len(images):
+        return increase.cumsum(), math.pi
     quaternions = Rotation.concatenate(turned).as_quat()
-    return 2 * math.acos(float(np.abs(quaternions @ quaternions.T).min().clip(0, 1)))
+    return increase.cumsum(), 2 * math.acos(float(np.abs(quaternions @ quaternions.T).min().clip(0, 1)))
 
 
-def rotation_between(
+@dataclass(frozen=True)
+class TexturedFlow:
+    """Optical flow of the object's pixels with texture."""
+
+    pixels: Float32[np.ndarray, "n 2"]
+    """Positions relative to the silhouette's centre [pixels]."""
+    flow: Float32[np.ndarray, "n 2"]
+    """Displacements [pixels]."""
+    shift: Float32[np.ndarray, "2"]
+    """Translation of the silhouette's centre [pixels]."""
+    radius: float
+    """Radius of a disc of the silhouette's area [pixels]."""
+
+    @property
+    def angle(self) -> float:
+        """Small rotation of a sphere with this flow beside the silhouette's translation or, if that leaves less, beside
+        none [radians]."""
+        left = min(float(np.median(np.linalg.norm(self.flow - shift, axis=-1))) for shift in (self.shift, 0.0))
+        return left * math.sqrt(2) / self.radius
+
+    def fitted_rotation(self) -> Float64[np.ndarray, "3"]:
+        """Rotation vector of a sphere, camera frame, whose flow beside a translation is closest to this [radians].
+
+        Robust linear least squares.
+        """
+        x, y = self.pixels.T.astype(np.float64) / self.radius
+        flow = self.flow.T.ravel().astype(np.float64) / self.radius
+        # The camera looks along +z: points in front of the sphere's centre have z = -depth.
+        depth = np.sqrt((1 - x * x - y * y).clip(MIN_DEPTH**2))
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        columns = np.array([[zero, depth], [-depth, zero], [-y, x], [one, zero], [zero, one]]).reshape(5, -1)
+        weight, motion = np.ones_like(flow), np.zeros(5)
+        for _ in range(FITS):
+            motion = np.linalg.lstsq(columns * weight @ columns.T, columns * weight @ flow, rcond=None)[0]
+            deviation = np.abs(flow - motion @ columns)
+            limit = max(HUBER * float(np.median(deviation)), np.finfo(np.float64).tiny)
+            weight = limit / np.maximum(deviation, limit)
+        return motion[:3]
+
+
+def textured_flow(
     dis: cv2.DISOpticalFlow,
     gray_a: UInt8[np.ndarray, "h w"],
     gray_b: UInt8[np.ndarray, "h w"],
     inside_a: Bool[np.ndarray, "h w"],
     inside_b: Bool[np.ndarray, "h w"],
-) -> float:
-    """Small rotation of the object between two frames [radians]; NaN with too little texture in the first one, or too
-    few pixels of the object in the second, to measure it.
-    """
-    measured = _textured_flow(dis, gray_a, gray_b, inside_a, inside_b)
-    if measured is None:
-        return math.nan
-    _, flow, radius = measured
-    return float(np.median(np.linalg.norm(flow, axis=-1))) * math.sqrt(2) / radius
-
-
-def _textured_flow(
-    dis: cv2.DISOpticalFlow,
-    gray_a: UInt8[np.ndarray, "h w"],
-    gray_b: UInt8[np.ndarray, "h w"],
-    inside_a: Bool[np.ndarray, "h w"],
-    inside_b: Bool[np.ndarray, "h w"],
-) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 2"], float] | None:
-    """Pixels with texture relative to the silhouette's centre, their flow relative to its translation, and the radius
-    of a disc of the silhouette's area [pixels]; None if there are too few.
+) -> TexturedFlow | None:
+    """Flow of the object between two frames; None with too little texture in the first one, or too few pixels of the
+    object in the second, to measure a rotation.
     """
     x, y = cv2.Sobel(gray_a, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray_a, cv2.CV_32F, 0, 1, scale=1 / 8)
     core = cv2.erode(inside_a.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -120,29 +131,8 @@ def _textured_flow(
     if min(textured.sum(), inside_b.sum()) < MIN_PIXELS:
         return None
     flow = dis.calc(gray_a, gray_b, np.zeros((*gray_a.shape, 2), np.float32))[textured]
-    pixels = np.argwhere(textured)[:, ::-1].astype(np.float32)
-    shift = _centre(inside_b) - _centre(inside_a)
-    return pixels - _centre(inside_a), flow - shift, math.sqrt(float(inside_a.sum()) / math.pi)
-
-
-def _fitted_rotation(
-    pixels: Float32[np.ndarray, "n 2"], flow: Float32[np.ndarray, "n 2"], radius: float
-) -> Float64[np.ndarray, "3"]:
-    """Rotation vector of a sphere, camera frame, whose flow beside a translation is closest to that of the object
-    [radians]. Robust linear least squares; the arguments are those that `_textured_flow` returns.
-    """
-    (x, y), flow = pixels.T.astype(np.float64) / radius, flow.T.ravel().astype(np.float64) / radius
-    # The camera looks along +z: points in front of the sphere's centre have z = -depth.
-    depth = np.sqrt((1 - x * x - y * y).clip(MIN_DEPTH**2))
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    columns = np.array([[zero, depth], [-depth, zero], [-y, x], [one, zero], [zero, one]]).reshape(5, -1)
-    weight, motion = np.ones_like(flow), np.zeros(5)
-    for _ in range(FITS):
-        motion = np.linalg.lstsq(columns * weight @ columns.T, columns * weight @ flow, rcond=None)[0]
-        deviation = np.abs(flow - motion @ columns)
-        limit = max(HUBER * float(np.median(deviation)), np.finfo(np.float64).tiny)
-        weight = limit / np.maximum(deviation, limit)
-    return motion[:3]
+    pixels, centre = np.argwhere(textured)[:, ::-1].astype(np.float32), _centre(inside_a)
+    return TexturedFlow(pixels - centre, flow, _centre(inside_b) - centre, math.sqrt(float(inside_a.sum()) / math.pi))
 
 
 def edge_energy(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 2"]:
@@ -178,7 +168,7 @@ def select_keyframes(
     All usable frames of a video that has hardly more frames than windows, or as many as may be.
 
     Args:
-        rotation: From `cumulative_rotation` [radians].
+        rotation: From `measured_rotation` [radians].
         blurs: From `edge_blur`.
         usable: Frames with a reliable mask.
         n_frames: Maximum number of keyframes; the windows widen accordingly.

@@ -90,6 +90,8 @@ class Survey:
     """Motion of the background, not a number if that is too plain to show any [longer side of the image]."""
     rotation: Float64[np.ndarray, " t"]
     """Angle by which the object has rotated since the first frame, summed along the path [radians]."""
+    rotation_range: float
+    """Largest angle by which the object is turned in one frame against another [radians]."""
 
     @property
     def inside(self) -> Bool[np.ndarray, "t h w"]:
@@ -143,6 +145,7 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
     size = (scan.energy.shape[2], scan.energy.shape[1])
     resized = [cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in inside]
     blurs = np.array([keyframes.edge_blur(energy, mask) for energy, mask in zip(scan.energy, resized, strict=True)])
+    rotation, rotation_range = keyframes.measured_rotation(images, inside)
     return Survey(
         footage=footage,
         lens=scan.lens,
@@ -160,7 +163,8 @@ def survey_footage(path: Path, options: FootageOptions) -> Survey:
         blurs=blurs,
         still_camera=still_camera,
         camera_motion=motion,
-        rotation=keyframes.cumulative_rotation(images, inside),
+        rotation=rotation,
+        rotation_range=rotation_range,
     )
 
 
