@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("trimesh", reason="needs the extra `synth`")
@@ -50,3 +51,27 @@ def test_a_stopped_benchmark_waits_until_its_run_has_stopped(tmp_path: Path) -> 
         benchmark.kill()
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             os.kill(int((tmp_path / "started").read_text()), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("beside", "found"), [(40, True), (0, False)])
+def test_a_pose_counts_as_true_only_if_its_mirror_image_in_depth_does_not_agree(beside: int, found: bool) -> None:
+    """A cube that shows a face, of which a long lens tells two poses, and points of the face beside it, or none."""
+    from scipy.spatial.transform import Rotation
+
+    from benchmarks.real import best_pose
+    from tumble.poses.sfm.registration import mirrored
+
+    rng = np.random.default_rng(3)
+    K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    face = np.column_stack([rng.uniform(-0.5, 0.5, (120, 2)), np.full(120, -0.5)])
+    side = np.column_stack([np.full(beside, 0.5), rng.uniform(-0.5, 0.5, (beside, 2))])
+    world = np.concatenate([face, side])
+    R, t = Rotation.from_rotvec([0, 0.35, 0]).as_matrix(), np.array([0.1, 0, 12.0])
+    x = (world @ R.T + t) @ K.T
+    image = x[:, :2] / x[:, 2:] + rng.normal(0, 0.7, (len(world), 2))
+    image[::9] = rng.uniform(0, 400, image[::9].shape)  # wrong matches
+    assert np.degrees(Rotation.from_matrix(mirrored(R, t, face)[0].T @ R).magnitude()) > 30
+    pose = best_pose(world, image, K)
+    assert (pose is not None) == found
+    if pose is not None:
+        assert np.degrees(Rotation.from_matrix(pose[0].T @ R).magnitude()) < 2
