@@ -108,7 +108,7 @@ MAX_ERROR = 3.0
 MIN_COST_DIFFERENCE = 20.0
 """Difference of the costs of a pose and of its mirror image in depth, below which neither counts as true [pixels^2].
 Where a face of the cube fills most of the view, the search found the mirror image, 33 to 76 degrees off, in frames in
-which the other pose costs 50 to 190 less; errors are about a pixel."""
+which the other pose costs 40 to 200 less; errors are about a pixel."""
 REFINEMENTS = 4
 """Number of times that the correspondences that agree and the pose are found in turn."""
 MIN_FRAMES = 8
