@@ -34,7 +34,6 @@ from benchmarks.poses import line
 from tumble.bench import current_code
 from tumble.datasets import reader_for, save_capture
 from tumble.io import files, video
-from tumble.poses.sfm.registration import mirrored
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN, Camera, Capture, Trajectory, Truth
 from tumble.synthetic import SynthOptions, render_capture
 
@@ -362,13 +361,24 @@ def best_pose(world: np.ndarray, image: np.ndarray, K: np.ndarray) -> tuple[np.n
     if not good or inliers is None or len(inliers) < MIN_INLIERS:
         return None
     start = cv2.Rodrigues(rvec)[0], t[:, 0]
-    other = mirrored(*start, world[np.asarray(inliers, int).ravel()])
+    other = mirror_image(*start, world[np.asarray(inliers, int).ravel()])
     (cost, R, t, sigma), (other_cost, other_R, *_) = sorted(
         (refined_pose(world, image, K, each) for each in (start, other)), key=lambda each: each[0]
     )
     apart = math.degrees(Rotation.from_matrix(R.T @ other_R).magnitude())
     ambiguous = apart > MAX_SIGMA and other_cost - cost < MIN_COST_DIFFERENCE
     return None if ambiguous or sigma > MAX_SIGMA else (R, t)
+
+
+def mirror_image(R: np.ndarray, t: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pose in which the normal of the plane closest to the points is mirrored in the line of sight."""
+    middle = world.mean(0)
+    centre, normal = R @ middle + t, R @ np.linalg.svd(world - middle, full_matrices=False)[2][2]
+    ray = centre / np.linalg.norm(centre)
+    axis = np.cross(normal, 2 * (normal @ ray) * ray - normal)
+    angle = 2 * math.acos(min(abs(float(normal @ ray)), 1.0))
+    turn = Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle).as_matrix()
+    return turn @ R, centre - turn @ (R @ middle)
 
 
 def refined_pose(

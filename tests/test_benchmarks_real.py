@@ -58,8 +58,7 @@ def test_a_pose_counts_as_true_only_if_its_mirror_image_in_depth_does_not_agree(
     """A cube that shows a face, of which a long lens tells two poses, and points of the face beside it, or none."""
     from scipy.spatial.transform import Rotation
 
-    from benchmarks.real import best_pose
-    from tumble.poses.sfm.registration import mirrored
+    from benchmarks.real import best_pose, mirror_image
 
     rng = np.random.default_rng(3)
     K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
@@ -70,7 +69,7 @@ def test_a_pose_counts_as_true_only_if_its_mirror_image_in_depth_does_not_agree(
     x = (world @ R.T + t) @ K.T
     image = x[:, :2] / x[:, 2:] + rng.normal(0, 0.7, (len(world), 2))
     image[::9] = rng.uniform(0, 400, image[::9].shape)  # wrong matches
-    assert np.degrees(Rotation.from_matrix(mirrored(R, t, face)[0].T @ R).magnitude()) > 30
+    assert np.degrees(Rotation.from_matrix(mirror_image(R, t, face)[0].T @ R).magnitude()) > 30
     pose = best_pose(world, image, K)
     assert (pose is not None) == found
     if pose is not None:

@@ -211,7 +211,7 @@ def solutions(
     X_in, uv_in = X[inlier], uv[inlier]
     R = cv2.Rodrigues(r)[0]
     kept: list[tuple[Solution, int]] = []
-    for start_R, start_t in ((R, t[:, 0]), mirrored(R, t[:, 0], X_in)):
+    for start_R, start_t in ((R, t[:, 0]), _mirrored(R, t[:, 0], X_in)):
         r, t = cv2.solvePnPRefineLM(X_in, uv_in, K, None, cv2.Rodrigues(start_R)[0], start_t[:, None].copy())
         new_R, new_t = cv2.Rodrigues(r)[0], t[:, 0]
         cosines = [(np.trace(new_R.T @ old) - 1) / 2 for (old, _), _ in kept]
@@ -221,7 +221,7 @@ def solutions(
     return [each for each in kept if each[1] >= MIN_CORRESPONDENCES]
 
 
-def mirrored(R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"], X: Float[np.ndarray, "c 3"]) -> Solution:
+def _mirrored(R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"], X: Float[np.ndarray, "c 3"]) -> Solution:
     """The pose in which the plane through points that lie about in one has the mirrored normal (Necker reversal)."""
     middle = X.mean(0)
     ray = R @ middle + t
