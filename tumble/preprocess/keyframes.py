@@ -176,13 +176,22 @@ def select_keyframes(
     count = max(round(float(rotation[-1] - rotation[0]) / KEYFRAME_STEP) + 1, 1)
     candidates = [int(i) for i in np.nonzero(usable)[0]]
     if len(candidates) <= FRAMES_PER_WINDOW * count:
-        if len(candidates) <= n_frames:
-            return candidates
-        count *= FRAMES_PER_WINDOW
+        return _thinned(rotation, blurs, candidates, n_frames)
     # Where the object turns fast, windows are empty: more of them than keyframes may fit.
     while len(kept := _sharpest_of_windows(rotation, blurs, usable, count)) > n_frames:
         count = count * n_frames // len(kept)
     return kept
+
+
+def _thinned(
+    rotation: Float64[np.ndarray, " t"], blurs: Float64[np.ndarray, " t"], candidates: list[int], n_frames: int
+) -> list[int]:
+    """At most `n_frames` of the candidates, without those that are blurred and whose neighbours are close."""
+    kept = np.array(candidates, int)
+    while len(kept) > max(n_frames, 2):
+        gap = rotation[kept[2:]] - rotation[kept[:-2]]
+        kept = np.delete(kept, 1 + np.argmin(gap / blurs[kept[1:-1]]))
+    return kept[:n_frames].tolist()
 
 
 def _sharpest_of_windows(
