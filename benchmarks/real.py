@@ -371,7 +371,10 @@ def best_pose(world: np.ndarray, image: np.ndarray, K: np.ndarray) -> tuple[np.n
 
 
 def mirror_image(R: np.ndarray, t: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pose in which the normal of the plane closest to the points is mirrored in the line of sight."""
+    """The pose in which the normal of the plane closest to the points is mirrored in the line of sight.
+
+    Not that of `tumble.poses.sfm.registration`, which is part of what is measured here.
+    """
     middle = world.mean(0)
     centre, normal = R @ middle + t, R @ np.linalg.svd(world - middle, full_matrices=False)[2][2]
     ray = centre / np.linalg.norm(centre)
