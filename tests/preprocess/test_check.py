@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.films import scene, written
-from tests.preprocess.test_held_object import landmarks
+from tests.preprocess.test_propagation import landmarks
 from tumble import cli
 from tumble.io import BadFile, files
 from tumble.preprocess import check as checking

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from tests.films import Scene, scene, written
-from tumble.preprocess import segmentation
+from tumble.preprocess import propagation, segmentation
 from tumble.preprocess.background import Background, estimate_background
 from tumble.preprocess.clicks import Click, correct_masks
 from tumble.preprocess.hands import Hand
@@ -34,7 +34,7 @@ def with_blob() -> tuple[Scene, np.ndarray, Background, Masks]:
     background = estimate_background(pictures, video.object | blob)
     rows, columns = np.nonzero((video.object | blob)[0])
     box = int(columns.min()) - 3, int(rows.min()) - 3, int(np.ptp(columns)) + 7, int(np.ptp(rows)) + 7
-    return film, blob, background, segmentation.segment(pictures, background, Seed(0, box))
+    return film, blob, background, propagation.segment(pictures, background, Seed(0, box), NO_HANDS)
 
 
 def on(mask: np.ndarray) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.films import HEIGHT, WIDTH, scene, written
-from tests.preprocess.test_held_object import landmarks
+from tests.preprocess.test_propagation import landmarks
 from tumble.datasets import folder
 from tumble.demo import bundled_folder
 from tumble.io import files, video

@@ -39,10 +39,6 @@ SHADOW_PENALTY = 5.0
 """Penalty of the log likelihood for explaining a pixel by a shadow on the background."""
 MIN_SHADOW_RATIO = 0.55
 """Darkest shadow: minimum ratio of a shaded code value to the unshaded one."""
-HAND_PRIOR = 0.15
-"""Prior probability of hand among the pixels that are not object."""
-UNKNOWN_BACKGROUND_PRIOR = 0.35
-"""Prior probability of background where the static background is unknown: mostly something covers it."""
 MAX_LOG_ODDS = 8.0
 """Limit of the absolute log odds of a single pixel."""
 LEARNING_RATE = 0.05
@@ -109,46 +105,6 @@ class ColourModel:
             _log_density(self.object, OBJECT_NOVELTY, lab),
         )
         return cv2.blur(log_hand - log_object, (3, 3))
-
-
-def initial_colours() -> ColourModel:
-    """The model before the first frame: a broad density of skin for the hand, nothing for the other classes."""
-    empty = np.zeros(BINS, np.float32)
-    return ColourModel(empty, _skin_density(), empty)
-
-
-def object_log_ratio(
-    image: UInt8[np.ndarray, "h w 3"],
-    hand: Bool[np.ndarray, "h w"],
-    background: Background,
-    colours: ColourModel,
-) -> Float32[np.ndarray, "h w"]:
-    """Log likelihood ratio of the object to hand and background, per pixel.
-
-    Args:
-        hand: Pixels that are hand although they match the static background, which contains a hand that holds still.
-    """
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-    log_background = _log_density(colours.background, OBJECT_NOVELTY, lab)
-    static = background.known & ~hand
-    log_background[static] = _background_log_density(image, background)[static]
-    log_hand = _log_density(colours.hand, HAND_NOVELTY, lab)
-    log_background += np.where(background.known, 0, np.log(UNKNOWN_BACKGROUND_PRIOR)).astype(np.float32)
-    log_other = np.logaddexp(np.log1p(-HAND_PRIOR) + log_background, np.log(HAND_PRIOR) + log_hand)
-    return (_log_density(colours.object, OBJECT_NOVELTY, lab) - log_other).astype(np.float32)
-
-
-def object_log_odds(
-    log_ratio: Float32[np.ndarray, "h w"], prior: Float32[np.ndarray, "h w"], hand: Bool[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w"]:
-    """Log odds of the object against hand and background, per pixel, from `object_log_ratio`.
-
-    Args:
-        prior: Prior probability of the object, inside (0, 1).
-    """
-    odds = log_ratio + np.log(prior) - np.log1p(-prior)
-    odds[hand] = np.minimum(odds[hand], -1)
-    return odds.clip(-MAX_LOG_ODDS, MAX_LOG_ODDS).astype(np.float32)
 
 
 def is_alike(log_ratio: Float32[np.ndarray, "h w"], background: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -1,17 +1,11 @@
-"""Video object segmentation from a box or a click on one frame, without trained weights.
+"""Parts of the segmentation of a video that concern one frame: where the object is marked, its mask, the mask's parts.
 
-The camera stands still, so pixels that differ from the static *background* are the object or the hand that holds it. On
-the *seed* frame GrabCut finds the object in the box. From there the mask is propagated forwards and backwards by
-optical flow (DIS): the warped mask is the prior of the next frame, and the colour model and the static background
-decide (`colour_model`). Moving pixels that are not object are unknown: a hand, a sleeve, a shadow. So is a band of
-pixels along the silhouette.
-
-Limits: a hand of the object's colour is not separated from it; there is no edge between object and background of one
-colour where the background is unknown; a hand in front of the object from the first frame on is found only by the
-colour of skin. The *confidence* of a frame is the overlap of the mask predicted by flow with the final mask.
+The camera stands still, so pixels that differ from the static *background* are the object or a hand that holds it. A
+mask has three values: pixels that are neither object nor certainly background are unknown, as is a band along the
+silhouette. The masks of all frames are in `preprocess.propagation`. The *confidence* of a frame is the overlap of the
+mask predicted by optical flow with the final mask.
 """
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -21,17 +15,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from tumble.maths import filled_hull, iou
 from tumble.preprocess.background import MIN_DIFFERENCE, Background, channel_max
-from tumble.preprocess.colour_model import (
-    SEED_WEIGHT,
-    ColourModel,
-    initial_colours,
-    is_alike,
-    mean_field_probability,
-    object_log_odds,
-    object_log_ratio,
-    skin_coloured,
-    trim_rim,
-)
+from tumble.preprocess.colour_model import skin_coloured
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
 CERTAIN_OVERLAP = 0.85
@@ -44,21 +28,8 @@ MIN_PIXELS = 30
 """Minimum area of the object; a smaller mask cannot be tracked [pixels]."""
 SEARCH_FRACTION = 0.06
 """Maximum distance of a silhouette from its prediction, as a fraction of the square root of its area."""
-MIN_PRIOR = 0.01
-"""Lower limit of the prior probability, because optical flow alone is not conclusive."""
-MAX_PRIOR = 0.98
-"""Upper limit of the prior probability."""
-MIN_HAND_LOG_RATIO = 1.5
-"""Minimum log likelihood ratio of hand to object colours of a pixel that may be hand."""
-MAX_HAND_GAP = 3
-"""Maximum distance of a hand from the object [pixels]."""
 MIN_MOVED_FRACTION = 0.03
 """Minimum fraction of pixels that differ from the background in a hand that holds still: its edges."""
-MIN_FRACTION_OUTSIDE = 0.1
-"""Minimum fraction of a hand that lies outside the region in which the object is expected."""
-MAX_COVER_OUTSIDE = 0.5
-"""Maximum fraction of the image outside the region in which the object is expected that one hand covers; a wall covers
-more."""
 MIN_MOVING_FRACTION = 0.1
 """Minimum fraction of the box that differs from the background, or has none that is known; with less, the background
 inside the box is not used."""
@@ -107,40 +78,6 @@ class Masks:
         return self.labels[i] if self.doubted is None else with_doubt(self.labels[i], self.doubted[i])
 
 
-@dataclass(frozen=True)
-class _Segmentation:
-    """Segmentation of one frame."""
-
-    inside: Bool[np.ndarray, "h w"]
-    """Pixels of the object."""
-    unknown: Bool[np.ndarray, "h w"]
-    """Other pixels that are not certainly background: moving ones, hands, undecided ones."""
-    probability: Float32[np.ndarray, "h w"]
-    """Probability of the object; 0 far from it."""
-    alike: Bool[np.ndarray, "h w"]
-    """Pixels close to the object that are rather background, but whose colours the object may have, too."""
-
-
-def segment(images: UInt8[np.ndarray, "t h w 3"], background: Background, seed: Seed) -> Masks:
-    """Masks of all frames from a box or a click on one.
-
-    Raises:
-        ValueError: No object was found at the seed.
-    """
-    first, colours = _segment_seed(images[seed.index], background, seed)
-    if first.inside.sum() < MIN_PIXELS:
-        raise ValueError(f"shows no object in the box, or at the click, on frame {seed.index}")
-    labels, doubted = np.zeros(images.shape[:3], np.uint8), np.zeros(images.shape[:3], bool)
-    confidence, uncertain = np.ones(len(images), np.float32), np.zeros(len(images), bool)
-    labels[seed.index] = make_trimap(trim_rim(first.inside, images[seed.index], background), first.unknown, 1)
-    doubted[seed.index] = first.alike
-    for order in (range(seed.index + 1, len(images)), range(seed.index - 1, -1, -1)):
-        for i, current, agreement, is_uncertain in _track(images, order, seed.index, first, background, colours):
-            labels[i] = make_trimap(trim_rim(current.inside, images[i], background), current.unknown, 1)
-            doubted[i], confidence[i], uncertain[i] = current.alike, agreement, is_uncertain
-    return Masks(labels, confidence, uncertain, doubted)
-
-
 def exclude_possible_object(background: Background, image: UInt8[np.ndarray, "h w 3"], seed: Seed) -> Background:
     """The background for the seed frame, without the pixels that may be the object itself.
 
@@ -180,7 +117,12 @@ def moving_skin(image: UInt8[np.ndarray, "h w 3"], background: Background) -> Bo
     A hand that holds still becomes part of the static background except for its edges, so a few moving pixels suffice.
     A wooden table does not move; an object of the colour of skin is included.
     """
-    return _moved_components(opened(skin_coloured(image), 1), background.differs(image) | ~background.known)
+    count, ids = components(opened(skin_coloured(image), 1))
+    sizes = np.bincount(ids.ravel(), minlength=count)
+    moved = np.bincount(ids[background.differs(image) | ~background.known], minlength=count)
+    keep = moved > MIN_MOVED_FRACTION * sizes
+    keep[0] = False
+    return keep[ids]
 
 
 def find_seed(images: UInt8[np.ndarray, "t h w 3"], background: Background) -> Seed | None:
@@ -272,123 +214,6 @@ def is_uncertain(agreement: float, old_area: int, new_area: int) -> bool:
     return agreement < CERTAIN_OVERLAP or not 1 / MAX_AREA_RATIO < new_area / max(old_area, 1) < MAX_AREA_RATIO
 
 
-# One frame ------------------------------------------------------------------------------------------------------------
-
-
-def _segment_seed(image: np.ndarray, background: Background, seed: Seed) -> tuple[_Segmentation, ColourModel]:
-    """Segmentation of the seed frame, and its colour model; moving pixels outside the box count as hand."""
-    moving, static = opened(background.differs(image), 1), opened(background.same(image), 1)
-    inside = box_mask(moving.shape, seed.box or box_around(seed.click, moving))
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
-    trimap = np.where(inside & ~static, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
-    if seed.click is not None:
-        trimap[disc_around(seed.click, inside)] = cv2.GC_FGD
-    surroundings = ~dilated(inside, 1) & ~moving
-    initial = initial_colours().updated(
-        lab, object=inside & ~static, hand=moving & ~inside, background=surroundings, weight=SEED_WEIGHT
-    )
-    hand = _hand_mask(initial.hand_log_ratio(lab), inside, moving, background)
-    trimap[hand & (trimap == cv2.GC_PR_FGD)] = cv2.GC_PR_BGD
-    if not (trimap & 1).any() or (trimap & 1).all():
-        empty = np.zeros(moving.shape, bool)
-        return _Segmentation(empty, empty, empty.astype(np.float32), empty), initial
-    rough = main_components(grabcut(image, trimap, 5), inside)
-    around = (moving | hand) & ~inside
-    colours = initial_colours().updated(
-        lab, object=rough, hand=around, background=surroundings & ~hand, weight=SEED_WEIGHT
-    )
-    prior = np.where(inside, np.where(rough, np.float32(0.9), np.float32(0.3)), np.float32(MIN_PRIOR))
-    current = _segment_frame(image, prior, rough, background, colours)
-    surroundings &= ~current.unknown
-    return current, initial_colours().updated(
-        lab, object=current.inside, hand=current.unknown & ~inside, background=surroundings, weight=SEED_WEIGHT
-    )
-
-
-def _track(
-    images: np.ndarray,
-    order: Iterable[int],
-    start: int,
-    first: _Segmentation,
-    background: Background,
-    colours: ColourModel,
-) -> Iterator[tuple[int, _Segmentation, float, bool]]:
-    """Index, segmentation, overlap with the prediction and uncertainty of every frame, tracked from `start`."""
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    current, area, gray = first, int(first.inside.sum()), cv2.cvtColor(images[start], cv2.COLOR_RGB2GRAY)
-    for i in order:
-        previous, gray = gray, cv2.cvtColor(images[i], cv2.COLOR_RGB2GRAY)
-        lost = not current.inside.any()
-        probability = (
-            reappearance(images[i], background, colours) if lost else warped(dis, gray, previous, current.probability)
-        )
-        predicted = probability > 0.5
-        current = _segment_frame(images[i], _spread_prior(probability), predicted, background, colours)
-        agreement, new_area = overlap(predicted, current.inside), int(current.inside.sum())
-        if is_lost(agreement, new_area):
-            empty = np.zeros(predicted.shape, bool)
-            unknown = current.unknown | current.inside
-            current, agreement = _Segmentation(empty, unknown, empty.astype(np.float32), empty), 0.0
-        else:
-            lab = cv2.cvtColor(images[i], cv2.COLOR_RGB2LAB)
-            outside = ~dilated(current.inside | current.unknown, 2)
-            # Only pixels that certainly differ from the background, so that a wrong mask does not reinforce itself.
-            certain = current.inside & background.differs(images[i])
-            colours = colours.updated(lab, object=certain, hand=_empty_like(predicted), background=outside)
-        uncertain = lost or is_uncertain(agreement, area, new_area)
-        area = new_area
-        yield i, current, agreement, uncertain
-
-
-def _segment_frame(
-    image: np.ndarray, prior: np.ndarray, predicted: np.ndarray, background: Background, colours: ColourModel
-) -> _Segmentation:
-    """Segmentation of a frame, given the prior and the predicted mask."""
-    moving = opened(background.differs(image), 1)
-    probability, alike = np.zeros(predicted.shape, np.float32), _empty_like(predicted)
-    if predicted.sum() < MIN_PIXELS:
-        return _Segmentation(alike, moving, probability, alike)
-    log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
-    hand = _hand_mask(log_ratio, predicted, moving, background)
-    window = _window(predicted, 4 * search_radius(predicted))
-    cropped = Background(background.image[window], background.noise[window], background.known[window])
-    ratio = object_log_ratio(image[window], hand[window], cropped, colours)
-    odds = object_log_odds(ratio, prior[window], hand[window])
-    probability[window] = mean_field_probability(odds, image[window])
-    inside = main_components(probability > 0.5, predicted)
-    probability = np.where(inside, np.maximum(probability, np.float32(0.5)), np.minimum(probability, np.float32(0.3)))
-    # Near the object, where the static background is unknown, colour alone is not enough to label a pixel background.
-    undecided = dilated(predicted, search_radius(predicted)) & ~background.known
-    unknown = (moving | hand | undecided) & ~inside
-    alike[window] = is_alike(-ratio, ~(inside | unknown)[window])
-    alike &= dilated(inside, 2 * search_radius(inside))
-    return _Segmentation(inside, unknown, probability, alike)
-
-
-def _hand_mask(log_ratio: np.ndarray, expected: np.ndarray, moving: np.ndarray, background: Background) -> np.ndarray:
-    """Components of hand colour that moved, touch the object and extend beyond it (else they are its texture)."""
-    candidates = _moved_components(opened(log_ratio > MIN_HAND_LOG_RATIO, 1), moving | ~background.known)
-    count, ids = components(candidates)
-    touching = np.bincount(ids[dilated(expected, MAX_HAND_GAP)], minlength=count) > 0
-    outside = ~dilated(expected, search_radius(expected))
-    beyond = np.bincount(ids[outside], minlength=count)
-    # Where a silhouette moves past a wall, the colour model learns the wall as hand.
-    touching &= (beyond > MIN_FRACTION_OUTSIDE * np.bincount(ids.ravel(), minlength=count)) & (
-        beyond < MAX_COVER_OUTSIDE * outside.sum()
-    )
-    touching[0] = False
-    return touching[ids]
-
-
-def _moved_components(mask: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Connected components of a mask of which at least `MIN_MOVED_FRACTION` moved."""
-    count, ids = components(mask)
-    sizes = np.bincount(ids.ravel(), minlength=count)
-    keep = np.bincount(ids[moved], minlength=count) > MIN_MOVED_FRACTION * sizes
-    keep[0] = False
-    return keep[ids]
-
-
 def warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, probability: np.ndarray) -> np.ndarray:
     """Probabilities of the previous frame, warped to this one along the optical flow."""
     flow = dis.calc(gray, previous, np.zeros((*gray.shape, 2), np.float32))
@@ -396,21 +221,8 @@ def warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, prob
     return cv2.remap(probability, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
 
 
-def _spread_prior(probability: np.ndarray) -> np.ndarray:
-    """The warped probability, blurred by the uncertainty of flow and rotation."""
-    radius = search_radius(probability > 0.5)
-    spread = 0.5 * probability + 0.5 * cv2.GaussianBlur(probability, (0, 0), radius / 2)
-    return spread.clip(MIN_PRIOR, MAX_PRIOR)
-
-
 def search_radius(mask: np.ndarray) -> int:
     return max(2, round(SEARCH_FRACTION * float(np.sqrt(mask.sum()))))
-
-
-def reappearance(image: np.ndarray, background: Background, colours: ColourModel) -> np.ndarray:
-    """Pixels where a hidden object may have reappeared: moving, and closer in colour to the object than to the hand."""
-    log_ratio = colours.hand_log_ratio(cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
-    return opened(background.differs(image) & (log_ratio < -MIN_HAND_LOG_RATIO), 2).astype(np.float32)
 
 
 def box_mask(shape: tuple[int, ...], box: tuple[int, int, int, int]) -> np.ndarray:
@@ -452,12 +264,6 @@ def grabcut(image: np.ndarray, trimap: np.ndarray, steps: int) -> np.ndarray:
     mixtures = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(image), trimap, (0, 0, 0, 0), *mixtures, steps, cv2.GC_INIT_WITH_MASK)
     return (trimap & 1) > 0
-
-
-def _window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
-    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
-    return slice(top, int(rows[-1]) + margin + 1), slice(left, int(columns[-1]) + margin + 1)
 
 
 def main_components(mask: np.ndarray, expected: np.ndarray) -> np.ndarray:

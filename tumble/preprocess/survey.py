@@ -5,8 +5,8 @@ rotates and how sharp it is. `tumble check` reports them, and the conversion to 
 with them.
 
 Background and masks depend on each other. They are estimated in turn: a background from static pixels without hands,
-masks from it, then gains and background again without the masked pixels, and the masks once more. What such masks leave
-undecided is looked at separately, if no hand is in the film (`background.crossed_background`).
+masks from it, then gains and background again without the masked pixels, and the masks once more. What the first masks
+leave undecided is looked at separately, if no hand is in the film (`background.crossed_background`).
 """
 
 import math
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Integer, UInt8
 
 from tumble.io import BadFile
-from tumble.preprocess import held_object, keyframes, sam, segmentation
+from tumble.preprocess import keyframes, propagation, sam, segmentation
 from tumble.preprocess.background import (
     Background,
     BackgroundSamples,
@@ -223,11 +223,9 @@ def _segment(
     images = _compensated(scan.images, gains)
     background = fill_unknown(estimate_background(images, covered), background)
     if options.segmenter == "grabcut":
-        samples = None
-        if any(hands):
-            samples = sample_background(images, _at_hands(images, hands) | segmentation.possible_object(masks.labels))
-        else:
+        if not any(hands):
             background = crossed_background(images, masks.labels == OBJECT, background)
+        samples = sample_background(images, _at_hands(images, hands) | segmentation.possible_object(masks.labels))
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks, hands)
     return images, gains, background, seed, masks, hands
@@ -370,9 +368,7 @@ def _masks(
         labels = np.stack([segmentation.make_trimap(m, background.differs(p) & ~m, 1) for p, m in pairs])
         return _masks_from_labels(path, labels)
     try:
-        if any(hands):
-            return held_object.segment(images, background, seed, hands, samples)
-        return segmentation.segment(images, background, seed)
+        return propagation.segment(images, background, seed, hands, samples)
     except ValueError as error:
         fix = "the camera must stand still; if it does, give a --box around the whole object"
         raise BadFile(path, str(error), fix) from None

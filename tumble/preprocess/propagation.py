@@ -1,14 +1,18 @@
-"""Segmentation of an object that is held by a hand, from a box or a click on one frame and the landmarks of the hands.
+"""Masks of all frames of a video, from a box or a click on one and the landmarks of the hands, if there are any.
 
-Every pixel has the probabilities of three classes: object, hand (with arm, sleeve and body) and background. From the
-seed frame they are propagated forwards and backwards by optical flow (DIS); in each frame they are the prior, the
-colours and the static background give the likelihood, and the landmarks say where a hand is. The colours of hands, arms
-and sleeves are learnt once, from the whole video; the object's on the seed frame, and later only from pixels that
-certainly differ from the background, so that a wrong mask does not reinforce itself. Foreground that no hand covers and
-that does not reach the border of the image is likely to be the object, so parts of it that a hand had hidden return.
+No trained weights are needed for it. On the seed frame GrabCut finds the object in the box. Every pixel has the
+probabilities of three classes: object, hand (with arm, sleeve and body) and background. From the seed frame they are
+propagated forwards and backwards by optical flow (DIS); in each frame they are the prior, the colours and the static
+background give the likelihood, and the landmarks say where a hand is. The colours of hands, arms and sleeves are learnt
+once, from the whole video; the object's on the seed frame, and later only from pixels that certainly differ from the
+background, so that a wrong mask does not reinforce itself. Foreground that no hand covers and that does not reach the
+border of the image is likely to be the object, so parts of it that a hand had hidden return. Moving pixels that are not
+object are unknown: a hand, a sleeve, a shadow.
 
-Limits: a sleeve of the object's colours that touches the object is segmented as object; what the shape of the object
-contradicts is removed when that is known (`tumble.poses.mask_refinement`).
+Limits: there is no edge between object and background of one colour where the background is unknown; a hand that was
+not detected is told by the colours of skin alone, and is background where it holds still; a sleeve of the object's
+colours that touches the object is segmented as object; what the shape of the object contradicts is removed when that is
+known (`tumble.poses.mask_refinement`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
