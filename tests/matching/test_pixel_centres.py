@@ -4,10 +4,10 @@ A wrong convention in one frame shifts all matches. One that both frames have in
 rotate: a shift c in both moves the residuals of a transformation A by (A - 1) c. So the second frame is rotated as far
 as a matcher follows, or by half a turn. Images are sums of waves evaluated at pixel centres, without interpolation.
 
-Published networks have an offset of their own (docs/method.md, "matching"), which upright pairs, with which they were
-trained, do not show. So ALIKED matches a pair that is not rotated, and networks whose weights are made symmetric mark
-keypoints in a frame that is turned by half. XFeat's own matches are left out: its keypoints gather at one column of
-each cell of 8 pixels, and so move less than the object does.
+Published networks have an offset of their own (docs/experiments/constants.md, "matching"), which upright pairs, with
+which they were trained, do not show. So ALIKED matches a pair that is not rotated, and networks whose weights are made
+symmetric mark keypoints in a frame that is turned by half. XFeat's own matches are left out: its keypoints gather at
+one column of each cell of 8 pixels, and so move less than the object does.
 """
 
 import math

@@ -268,7 +268,7 @@ def build(
     with runtime.stream(means.device):
         gaussians = [x.contiguous() for x in (means, quats, scales, opacity)]
         runtime.launch(tracing.enclose, len(means), *gaussians, record, low, high)
-        # Of Warp's constructors on a GPU that whose trees are traced fastest (docs/method.md).
+        # Of Warp's constructors on a GPU that whose trees are traced fastest (docs/experiments/constants.md).
         boxes = warp.Bvh(warp.from_torch(low, warp.vec3), warp.from_torch(high, warp.vec3), constructor="cubql")
     return WarpBvh(boxes, record, low, high)
 

@@ -25,7 +25,7 @@ MIN_FRAMES = 2
 """Number of frames that must show a vertex; a mask may be wrong in one."""
 MAX_WRONG = 0.05
 """Fraction of the frames with something in front of a vertex whose masks may be wrong there, and do not count. So what
-a hand covers most of the time is seen, too (docs/method.md)."""
+a hand covers most of the time is seen, too (docs/experiments/hands-films.md)."""
 AVERAGING_STEPS = 20
 """Number of times that "seen" is averaged over neighbours, so that wrong pixels of masks leave no spikes."""
 SMOOTHING_STEPS = 10

@@ -29,8 +29,9 @@ def solved(asset: Asset, capture: Capture) -> Asset:
     """The asset with the albedo that explains the photographs best, in linear radiance with a Huber loss.
 
     The first iteration of SART from the albedo of the asset: each corner of a Gaussian moves by the weighted mean of
-    what is missing in the pixels that it contributes to. More iterations fit noise (docs/method.md). Gaussians that no
-    usable pixel shows (`lit_frames.usable_pixels`) keep their albedo.
+    what is missing in the pixels that it contributes to. More iterations fit noise
+    (docs/experiments/absolute-colour.md). Gaussians that no usable pixel shows (`lit_frames.usable_pixels`) keep their
+    albedo.
 
     Args:
         asset: The result of stage 3 in absolute colour.

@@ -311,8 +311,9 @@ def _samples(
 def _find_regions(cfg: Config, inputs: Inputs, state: State) -> None:
     """Give every region its own best roughness when it is due and regions differ.
 
-    Descent finds the roughness of an object, but hardly leaves it for that of a part (docs/method.md). The mean over
-    the pixels stays as it is: that with the least error of all of them together is biased by the blurred light.
+    Descent finds the roughness of an object, but hardly leaves it for that of a part (docs/experiments/materials.md).
+    The mean over the pixels stays as it is: that with the least error of all of them together is biased by the blurred
+    light.
     """
     due = [cfg.steps * i // (cfg.region_trials + 1) for i in range(1, cfg.region_trials + 1)]
     params, material = state.params, state.params.material

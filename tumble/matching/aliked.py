@@ -32,7 +32,8 @@ KEPT_FEATURES = 600
 MIN_PROBABILITY = 0.1
 """Smallest probability of a correspondence (the published threshold)."""
 OFFSET = (0.41, -0.04)
-"""Mean position (x, y) of the network's keypoints beside what they mark [pixels of the window] (docs/method.md)."""
+"""Mean position (x, y) of the network's keypoints beside what they mark [pixels of the window]
+(docs/experiments/constants.md)."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ SURE_PRESENCE = 0.8
 for a hand (median 0.6)."""
 MIN_HAND_FRAMES = 0.25
 """Fraction of frames that certainly show a hand below which no hand counts: in films of hands it is 0.53 to 1, in films
-of prints at most 0.05 (docs/method.md)."""
+of prints at most 0.05 (docs/experiments/hands-masks.md)."""
 
 
 @dataclass(frozen=True)

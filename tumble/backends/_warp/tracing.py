@@ -7,7 +7,7 @@ coordinate of its mean, and its opacity.
 
 Visibility is traced with one ray per thread and 32 directions of one point per warp, which visit the same boxes at
 first; blockers in one direction at many points, which lie in the order of a space-filling curve. Measured on an H200
-(docs/method.md), each is the faster way round for its rays.
+(docs/experiments/constants.md), each is the faster way round for its rays.
 """
 
 import warp as wp
