@@ -177,6 +177,13 @@ def test_the_offset_of_the_surface_is_found(offset: float) -> None:
     assert (moved.vertices[:, :2] == quad().vertices[:, :2]).all()
 
 
+def test_a_faint_texture_does_not_tell_the_offset() -> None:
+    """The losses of a marbled knight, whose minimum comes and goes with the noise, and those of a printed box."""
+    assert photo_texture._lowest([0.02110, 0.02099, 0.02144]) is None
+    assert photo_texture._lowest([0.01775, 0.01793, 0.01860]) is None
+    assert photo_texture._lowest([0.04921, 0.03903, 0.04263]) == pytest.approx(0.31, abs=0.02)
+
+
 def test_the_texture_keeps_what_the_baked_one_has_beyond_the_photographs() -> None:
     """A texture finer than the solved one: its own grain stays, the stripes are added; the gutter is filled."""
     rng, resolution = np.random.default_rng(0), 8 * SIDE

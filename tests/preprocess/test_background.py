@@ -1,5 +1,6 @@
 """The static background is estimated behind moving objects, and its gain drift is measured and compensated."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from tumble.preprocess.background import (
     estimate_background,
     estimate_gains,
     fill_unknown,
+    resting_background,
     sample_background,
 )
 
@@ -111,6 +113,44 @@ def test_a_background_that_is_known_stays_as_it_is() -> None:
     crossed = crossed_background(images, inside, known)
     assert crossed.known.all()
     assert np.array_equal(crossed.image, WALL)
+
+
+def swinging() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A film of a printed square that swings by 16 pixels before a wall, its pixels, and the wall."""
+    blocks = RNG.integers(60, 180, (2, 30, 40, 3)).repeat(2, 1).repeat(2, 2)  # detail that survives a compression
+    wall, board = blocks.astype(np.uint8)
+    images, inside = np.repeat(wall[None], 40, 0), np.zeros((40, 60, 80), bool)
+    for t, left in enumerate((28 + 8 * np.sin(np.arange(40) / 2)).round().astype(int)):
+        images[t, 18:42, left : left + 24] = board[:24, :24]
+        inside[t, 18:42, left : left + 24] = True
+    noise = RNG.integers(-1, 2, images.shape)
+    return (images + noise).astype(np.uint8), inside, wall, board
+
+
+def test_a_wall_in_the_masks_is_found_since_it_rests_while_the_object_moves() -> None:
+    """Masks take in 6 pixels of the wall all around the square, so that no frame shows it beside the object there."""
+    images, inside, wall, _ = swinging()
+    wide = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((13, 13))) > 0 for mask in inside])
+    known = ~wide.any(0)
+    unknown = Background(wall, np.full(known.shape, 2, np.float32), known)
+    found = resting_background(images, wide, unknown)
+    new = found.known & ~known
+    assert new[(wide & ~inside).sum(0) >= 10].mean() > 0.4
+    assert (np.abs(found.image.astype(int) - wall)[new].max(-1) <= 3).mean() > 0.97
+    assert inside.all(0).any()
+    assert not (new & inside.all(0)).any(), "what no frame shows stays unknown"
+
+
+def test_a_plain_part_of_the_object_is_no_wall_although_it_stays_the_same() -> None:
+    """The middle of the square has one colour, and is wider than its path."""
+    images, inside, wall, _ = swinging()
+    for t, mask in enumerate(inside):
+        left = int(np.flatnonzero(mask.any(0))[0])
+        images[t, 22:38, left + 4 : left + 20] = (200, 40, 40)
+    unknown = Background(wall, np.full(wall.shape[:2], 2, np.float32), ~inside.any(0))
+    found = resting_background(images, inside, unknown)
+    red = np.abs(found.image.astype(int) - (200, 40, 40)).max(-1) < 20
+    assert (found.known & inside.any(0) & red).sum() < 0.02 * inside.any(0).sum()
 
 
 def test_the_gain_drift_of_one_channel_is_estimated_and_compensated() -> None:

@@ -11,7 +11,6 @@ normals by the distance at which the photographs agree best (`aligned_surface`),
 rendering much better after a smooth warp by optical flow (Zhou and Koltun 2014) is warped.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -55,6 +54,9 @@ OFFSET_FRAMES = 12
 """Number of frames from which the offset is found."""
 OFFSET_ITERATIONS = 2
 """Iterations of the solution at each offset."""
+MIN_RISE = 0.05
+"""Fraction by which an offset that is wrong by a quarter of a pixel has to raise the loss; else the texture is too
+faint to tell the offset."""
 MAX_SHIFT = 3.0
 """Maximum shift of a pixel of a photograph [pixels]."""
 SMOOTHING = 4.0
@@ -138,7 +140,7 @@ def aligned_surface(
     """The mesh moved along its normals by the distance at which the photographs agree best on its texture.
 
     The mean depth of soft Gaussians lies behind the surface that they draw, by a quarter of a pixel of the photographs.
-    Where no offset makes a texture agree best, it is the one at which the silhouettes do.
+    Where no offset makes a texture agree clearly best, it is the one at which the silhouettes do.
 
     Args:
         mesh: The surface of the Gaussians.
@@ -163,9 +165,11 @@ def aligned_surface(
 
 def _lowest(losses: Sequence[float]) -> float | None:
     """The offset between the first and the last of `OFFSETS` at which a parabola through the losses is lowest, if it is
-    lowest there."""
+    clearly lowest there."""
     a, b, _ = np.polyfit(OFFSETS, losses, 2)
-    lowest = -b / (2 * a) if a > 0 else math.inf
+    if a * OFFSETS[1] ** 2 < MIN_RISE * min(losses):
+        return None
+    lowest = float(-b / (2 * a))
     return lowest if OFFSETS[0] < lowest < OFFSETS[-1] else None
 
 

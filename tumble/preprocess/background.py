@@ -5,6 +5,7 @@ one *gain* per frame and colour channel, in linear light, relative to the median
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -30,6 +31,18 @@ MIN_BESIDE_AGREEMENT = 0.8
 """Minimum fraction of the frames beside the object in which an undecided pixel shows one colour, its background's."""
 MAX_COVERED_AGREEMENT = 0.1
 """Maximum fraction of the frames with the object in front in which such a pixel shows that colour nevertheless."""
+MAX_STILL = 8.0
+"""Maximum change between two frames of a pixel at rest [code values]; over `STILL_SIDE` pixels, as the next two."""
+MIN_MOVED = 6.0
+"""By how much less it must change than if it had moved with the object [code values]."""
+STILL_SIDE = 5
+"""Side of the square whose pixels tell whether one is at rest [pixels]."""
+MIN_STILL = 4
+"""Minimum number of frames in which a pixel has to be at rest for its colour there to be the background's."""
+MAX_STILL_SPREAD = 6.0
+"""Maximum median deviation of these colours from their median [code values]."""
+MOTION_SIGMA = 0.35
+"""Standard deviation of the Gaussian over which the motion of the object is averaged [object size]."""
 MAX_NOISE = 8.0
 """Maximum noise of a static pixel; a pixel of larger noise is unknown [code values]."""
 MIN_NOISE = 1.5
@@ -212,6 +225,60 @@ def crossed_background(
     everywhere[where] = known[0]
     image[everywhere & where], noise[everywhere & where] = found.image[known], found.noise[known]
     return Background(image, noise, everywhere)
+
+
+def resting_background(
+    images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"], background: Background
+) -> Background:
+    """The background, with unknown pixels that were seen at rest while the object moved.
+
+    Where nothing is known of the background, a piece of it may belong to the masks of many frames. But it does not move
+    with the object: from one frame to the next it stays what it was, while the motion of the object would have brought
+    something else. A plain piece of the object stays what it was, too, but then its motion brings the same. An arm may
+    rest as well, so this is for films without hands.
+
+    Args:
+        inside: Pixels that are rather object.
+    """
+    where = ~background.known
+    rests = np.zeros((len(images), int(where.sum())), bool)
+    for t, at_rest in enumerate(_at_rest(images, inside), 1):
+        rests[t] = at_rest[where]
+    enough = rests.sum(0) >= MIN_STILL
+    if not enough.any():
+        return background
+    where[where] = enough
+    hidden = np.repeat(~rests[:, enough][..., None], 3, -1)
+    colours = np.ma.masked_array(images[:, where], hidden).astype(np.float32)
+    colour = np.ma.median(colours, 0).filled(0)
+    spread = channel_max(np.ma.median(np.abs(colours - colour), 0).filled(np.inf))
+    found = spread <= MAX_STILL_SPREAD
+    where[where] = found
+    image, noise = background.image.copy(), background.noise.copy()
+    image[where] = colour[found].round().astype(np.uint8)
+    noise[where] = np.maximum(1.48 * spread[found], MIN_NOISE)  # of a normal distribution
+    return Background(image, noise, background.known | where)
+
+
+def _at_rest(
+    images: UInt8[np.ndarray, "t h w 3"], inside: Bool[np.ndarray, "t h w"]
+) -> Iterator[Bool[np.ndarray, "h w"]]:
+    """For the second and later frames, pixels that stay what they were although the object's motion brings others."""
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    rows, columns = np.indices(gray[0].shape, np.float32)
+    sigma = MOTION_SIGMA * math.sqrt(max(float(np.median(inside.sum((1, 2)))), 1.0))
+    for t in range(1, len(images)):
+        flow = dis.calc(gray[t], gray[t - 1], np.zeros((*gray[t].shape, 2), np.float32))
+        weight = inside[t].astype(np.float32)
+        flow = cv2.GaussianBlur(flow * weight[..., None], (0, 0), sigma)
+        flow /= np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-6)[..., None]
+        moved = cv2.remap(images[t - 1], columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
+        change, expected = (
+            cv2.blur(channel_max(cv2.absdiff(images[t], other)).astype(np.float32), (STILL_SIDE, STILL_SIDE))
+            for other in (images[t - 1], moved)
+        )
+        yield (change < MAX_STILL) & (expected - change > MIN_MOVED)
 
 
 def estimate_gains(

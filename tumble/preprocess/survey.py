@@ -28,6 +28,7 @@ from tumble.preprocess.background import (
     estimate_background,
     estimate_gains,
     fill_unknown,
+    resting_background,
     sample_background,
 )
 from tumble.preprocess.camera_motion import MAX_CAMERA_MOTION, camera_motion
@@ -225,6 +226,7 @@ def _segment(
     if options.segmenter == "grabcut":
         if not any(hands):
             background = crossed_background(images, masks.labels == OBJECT, background)
+            background = resting_background(images, masks.labels == OBJECT, background)
         samples = sample_background(images, _at_hands(images, hands) | segmentation.possible_object(masks.labels))
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks, hands)
