@@ -15,9 +15,10 @@ from tumble.demo import bundled_folder
 from tumble.io import files, video
 from tumble.io.files import BadFile
 from tumble.preprocess import survey, video_to_capture
+from tumble.preprocess.background import Background
 from tumble.preprocess.hands import Hand, track_hands
 from tumble.preprocess.options import FootageOptions
-from tumble.preprocess.segmentation import overlap
+from tumble.preprocess.segmentation import Masks, overlap
 from tumble.preprocess.survey import survey_footage
 from tumble.scene.capture import BACKGROUND, OBJECT, UNKNOWN
 
@@ -89,6 +90,33 @@ def test_only_frames_of_a_held_object_are_kept_with_their_background(made: tuple
     now_unknown = background & (other.masks == UNKNOWN)
     assert torch.equal(other.masks[~now_unknown], capture.masks[~now_unknown])
     assert 0.2 < now_unknown.sum() / background.sum() < 0.8
+
+
+@pytest.mark.parametrize(("known", "expected"), [((0.3, 0.3), 2), ((0.0, 0.3), 3)])
+def test_masks_are_segmented_again_while_much_more_of_the_background_is_known(
+    made: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, known: tuple[float, float], expected: int
+) -> None:
+    """`known` is the background that is known in each round beside that before, as a fraction of the object's area."""
+    runs, rounds = [], iter(known)
+    segment = survey._masks
+    monkeypatch.setattr(survey, "_masks", lambda *arguments: runs.append(segment(*arguments)) or runs[-1])
+
+    def uncovered(images: np.ndarray, masks: Masks, background: Background) -> Background:
+        more = background.known.copy()
+        more.flat[: int(next(rounds) * (masks.labels[0] == OBJECT).sum())] = True
+        return replace(background, known=more)
+
+    def nothing_known_above(*arguments: object) -> Background:
+        found = filled(*arguments)
+        less = found.known.copy()
+        less[: len(less) // 4] = False
+        return replace(found, known=less)
+
+    filled = survey.fill_unknown
+    monkeypatch.setattr(survey, "fill_unknown", nothing_known_above)
+    monkeypatch.setattr(survey, "_uncovered_background", uncovered)
+    survey_footage(made[0], WITH_BOX)
+    assert len(runs) == expected
 
 
 def test_the_window_contains_the_whole_path_of_the_object(made: tuple[Path, Path]) -> None:

@@ -55,6 +55,10 @@ for a hand (median 0.6)."""
 MIN_HAND_FRAMES = 0.25
 """Fraction of frames that certainly show a hand below which no hand counts: in films of hands it is 0.53 to 1, in films
 of prints at most 0.05 (docs/experiments/hands-masks.md)."""
+MAX_ROUNDS = 2
+"""Maximum number of segmentations after the first one, which knows less of the background; a third changes nothing."""
+MIN_UNCOVERED = 0.01
+"""Newly known background for which masks are segmented once more, as a fraction of the object's area."""
 
 
 @dataclass(frozen=True)
@@ -223,14 +227,22 @@ def _segment(
     gains = estimate_gains(scan.images, covered)
     images = _compensated(scan.images, gains)
     background = fill_unknown(estimate_background(images, covered), background)
-    if options.segmenter == "grabcut":
-        if not any(hands):
-            background = crossed_background(images, masks.labels == OBJECT, background)
-            background = resting_background(images, masks.labels == OBJECT, background)
+    for number in range(MAX_ROUNDS if options.segmenter == "grabcut" else 0):
+        found = background if any(hands) else _uncovered_background(images, masks, background)
+        new = (found.known & ~background.known).sum()
+        if number and new <= MIN_UNCOVERED * np.median((masks.labels == OBJECT).sum((1, 2))):
+            break
+        background = found
         samples = sample_background(images, _at_hands(images, hands) | segmentation.possible_object(masks.labels))
         masks = _masks(path, images, background, seed, hands, options, samples)
         masks = correct_masks(images, masks, background, clicks, hands)
     return images, gains, background, seed, masks, hands
+
+
+def _uncovered_background(images: np.ndarray, masks: Masks, background: Background) -> Background:
+    """The background with what the object of a film without hands uncovers as it moves."""
+    inside = masks.labels == OBJECT
+    return resting_background(images, inside, crossed_background(images, inside, background))
 
 
 def _hands(images: UInt8[np.ndarray, "t h w 3"]) -> list[list[Hand]]:
