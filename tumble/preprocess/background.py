@@ -248,16 +248,22 @@ def resting_background(
     if not enough.any():
         return background
     where[where] = enough
-    hidden = np.repeat(~rests[:, enough][..., None], 3, -1)
-    colours = np.ma.masked_array(images[:, where], hidden).astype(np.float32)
-    colour = np.ma.median(colours, 0).filled(0)
-    spread = channel_max(np.ma.median(np.abs(colours - colour), 0).filled(np.inf))
+    at_rest = rests[:, enough][..., None]
+    colours = images[:, where].astype(np.int16)
+    colour = _median(colours, at_rest)
+    spread = channel_max(_median(np.abs(colours - colour), at_rest))
     found = spread <= MAX_STILL_SPREAD
     where[where] = found
     image, noise = background.image.copy(), background.noise.copy()
-    image[where] = colour[found].round().astype(np.uint8)
+    image[where] = colour[found].astype(np.uint8)
     noise[where] = np.maximum(1.48 * spread[found], MIN_NOISE)  # of a normal distribution
     return Background(image, noise, background.known | where)
+
+
+def _median(values: Integer[np.ndarray, "t n 3"], counted: Bool[np.ndarray, "t n 1"]) -> Integer[np.ndarray, "n 3"]:
+    """The lower median over the frames that count."""
+    ordered = np.sort(np.where(counted, values, np.iinfo(values.dtype).max), 0)
+    return np.take_along_axis(ordered, (counted.sum(0, keepdims=True) - 1) // 2, 0)[0]
 
 
 def _at_rest(
