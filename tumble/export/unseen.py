@@ -1,7 +1,8 @@
 """Parts of a mesh that no frame shows, such as those under a hand that never lets go: spanned like soap films.
 
 Nothing is known of such a part, and the surface of the Gaussians has lumps, holes and the outlines of fingers there.
-The smallest surface between what was seen takes its place; the confidence marks it as it marks all that was not seen.
+The smallest surface between what was seen takes its place. The confidence is near 0 where no frame faces it, but what a
+hand covers counts as seen there, since it knows no masks.
 """
 
 from collections.abc import Iterable, Iterator
