@@ -167,7 +167,7 @@ def _lowest(losses: Sequence[float]) -> float | None:
     """The offset between the first and the last of `OFFSETS` at which a parabola through the losses is lowest, if it is
     clearly lowest there."""
     a, b, _ = np.polyfit(OFFSETS, losses, 2)
-    if a * OFFSETS[1] ** 2 < MIN_RISE * min(losses):
+    if a * OFFSETS[1] ** 2 <= MIN_RISE * min(losses):
         return None
     lowest = float(-b / (2 * a))
     return lowest if OFFSETS[0] < lowest < OFFSETS[-1] else None

@@ -272,19 +272,26 @@ def _at_rest(
     """For the second and later frames, pixels that stay what they were although the object's motion brings others."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-    rows, columns = np.indices(gray[0].shape, np.float32)
     sigma = MOTION_SIGMA * math.sqrt(max(float(np.median(inside.sum((1, 2)))), 1.0))
     for t in range(1, len(images)):
         flow = dis.calc(gray[t], gray[t - 1], np.zeros((*gray[t].shape, 2), np.float32))
         weight = inside[t].astype(np.float32)
         flow = cv2.GaussianBlur(flow * weight[..., None], (0, 0), sigma)
         flow /= np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-6)[..., None]
-        moved = cv2.remap(images[t - 1], columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
+        moved = moved_along(flow, images[t - 1])
         change, expected = (
             cv2.blur(channel_max(cv2.absdiff(images[t], other)).astype(np.float32), (STILL_SIDE, STILL_SIDE))
             for other in (images[t - 1], moved)
         )
         yield (change < MAX_STILL) & (expected - change > MIN_MOVED)
+
+
+def moved_along(
+    flow: Float32[np.ndarray, "h w 2"], values: Shaped[np.ndarray, "h w *c"]
+) -> Shaped[np.ndarray, "h w *c"]:
+    """Values of another image where the flow from this one to it leads."""
+    rows, columns = np.indices(flow.shape[:2], np.float32)
+    return cv2.remap(values, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
 
 
 def estimate_gains(

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 
 from tumble.maths import filled_hull, iou
-from tumble.preprocess.background import MIN_DIFFERENCE, Background, channel_max
+from tumble.preprocess.background import MIN_DIFFERENCE, Background, channel_max, moved_along
 from tumble.preprocess.colour_model import skin_coloured
 from tumble.scene import BACKGROUND, OBJECT, UNKNOWN
 
@@ -216,9 +216,7 @@ def is_uncertain(agreement: float, old_area: int, new_area: int) -> bool:
 
 def warped(dis: cv2.DISOpticalFlow, gray: np.ndarray, previous: np.ndarray, probability: np.ndarray) -> np.ndarray:
     """Probabilities of the previous frame, warped to this one along the optical flow."""
-    flow = dis.calc(gray, previous, np.zeros((*gray.shape, 2), np.float32))
-    rows, columns = np.indices(gray.shape, np.float32)
-    return cv2.remap(probability, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
+    return moved_along(dis.calc(gray, previous, np.zeros((*gray.shape, 2), np.float32)), probability)
 
 
 def search_radius(mask: np.ndarray) -> int:
